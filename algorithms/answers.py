@@ -115,7 +115,7 @@ def check_covariance(name: str, covariance: Float64[np.ndarray, "n n"]) -> None:
 
 
 def check_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."] | None:
-    """Validate an array of finite floats of this shape; return a plain ndarray copy. None stays None."""
+    """Validate an array of finite floats of this shape; return a float64 copy. None is valid and returned as None."""
     if value is None:
         return None
     if not isinstance(value, np.ndarray) or value.dtype.kind != "f":
@@ -156,7 +156,7 @@ def has_stream_method(stream: object, method: str) -> bool:
 
 
 class _FormerStream:
-    """A `VelocityStream` whose method `process_image` has its former name."""
+    """Adapter: calls a stream whose image method has its former name as a `VelocityStream`."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -174,7 +174,7 @@ class _FormerStream:
 
 
 def create_streamed(stream: Any) -> StreamedEstimator:
-    """Create the estimator of a stream; the former name of a method is accepted with a warning."""
+    """Wrap a stream as a velocity estimator; the former name of its image method is accepted with a warning."""
     if hasattr(stream, "process_image"):
         return StreamedEstimator(stream)
     warn_deprecated(_FORMER_IMAGE_METHOD, "process_image")

@@ -1,4 +1,7 @@
-"""Reasons why an algorithm returned no usable answer; this module is light, because each worker process imports it."""
+"""Faults: reasons why an algorithm returned no usable answer, and the error that reports them.
+
+This module imports no large packages, because each worker process imports it.
+"""
 
 from __future__ import annotations
 

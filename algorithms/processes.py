@@ -46,6 +46,7 @@ def resident_bytes(processes: Sequence[int]) -> float:
 
 
 def _read_kilobytes(process: int, file: str, fields: str) -> float:
+    """Sum the values of a file in a process's /proc folder whose names match the regular expression `fields`."""
     try:
         text = Path(f"/proc/{process}/{file}").read_text()
     except OSError:

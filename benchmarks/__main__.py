@@ -20,6 +20,7 @@ from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
 
 RESULTS = Path(__file__).parent / "results" / "benchmarks.json"
+#: Packages whose versions are stored with the results.
 PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
 
@@ -27,6 +28,7 @@ def main() -> None:
     """Run all benchmarks, print and store the measurements."""
     argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__).parse_args()
     cv2.setNumThreads(1)
+    # the arguments are numbers of repetitions or of cases
     measurements = [
         # first, because other benchmarks increase the memory of the process
         *images.measure_memory(500),

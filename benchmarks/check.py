@@ -32,6 +32,7 @@ from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.sim.kernel_cache import processor_features
 
+#: File of the stored ratios.
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
 #: Number of runs of each hot path; each run is paired with runs of the reference workload.
 PAIRS = 15
@@ -42,16 +43,19 @@ FALSE_ALARM_RATE = 0.01
 
 
 def _prepare_dimes() -> Callable[[], object]:
+    """Return a function that runs DIMES on a rendered descent."""
     measurements, estimator = record_descents("dimes-smoke", 1)[0].measurements, DimesEstimator()
     return lambda: estimator.estimate(measurements)
 
 
 def _prepare_dense_map() -> Callable[[], object]:
+    """Return a function that runs hazard detection with a grid of 160 x 120 points."""
     measurements, estimator = hda.make_measurements(), HdaEstimator(hda.DENSE)
     return lambda: estimator.estimate(measurements)
 
 
 def _prepare_hazard_maps() -> Callable[[], object]:
+    """Return a function that computes the hazard maps of rough random ground with cells of 0.1 m."""
     elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
     ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
     return lambda: hazard_maps(ground, HdaOptions())

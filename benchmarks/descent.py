@@ -36,7 +36,10 @@ def measure_frame(repeats: int) -> list[Measurement]:
 
 
 def measure_case(repeats: int) -> list[Measurement]:
-    """Measure complete `dimes-gusev` cases over one prepared terrain, their stages and their minimum costs."""
+    """Measure complete `dimes-gusev` cases over one prepared terrain, their stages and their minimum costs.
+
+    The minimum costs are those of the operations that any implementation needs (`benchmarks.minimum_costs`).
+    """
     campaign = load_campaign("dimes-gusev")
     case_numbers = itertools.count()
 

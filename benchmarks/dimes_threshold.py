@@ -21,6 +21,7 @@ from marsyard.reports.statistics.samples import quantile_bounds
 STORED = Path(options.__file__).with_name("imu_threshold.json")
 #: Version of the derivation; increase it if the result changes for the same inputs.
 VERSION = 1
+#: Stored quantiles of the discrepancy between tracks and IMU.
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
 #: Minimum and maximum velocity error of the wrong track, m/s: a constant error, and errors up to the search range.
 WRONG_TRACK_ERRORS_M_S = ((10.0, 10.0), (10.0, 60.0))
@@ -57,6 +58,7 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
             "best combination of two correct tracks in each pair": float(np.mean(results.two_tracks < threshold)),
         },
         "accepted_quantile_m_s": float(np.quantile(results.one_track, inputs.accepted_fraction)),
+        # one-sided bounds at 95 % each
         "accepted_quantile_90_percent_bounds_m_s": quantile_bounds(results.one_track, inputs.accepted_fraction, 0.95),
         "threshold_m_s": threshold,
         "one_wrong_track": wrong_track_outcomes,
@@ -64,10 +66,12 @@ def derive_threshold(inputs: derivation.ThresholdInputs) -> dict[str, Any]:
 
 
 def _quantiles(values: np.ndarray) -> dict[str, float]:
+    """Return the values' `QUANTILES`, by their probability."""
     return {str(quantile): float(np.quantile(values, quantile)) for quantile in QUANTILES}
 
 
 def main() -> None:
+    """Derive, store and print the threshold."""
     record = derive_threshold(derivation.ThresholdInputs())
     STORED.write_text(json.dumps(record, indent=1) + "\n")
     print(json.dumps(record, indent=1))

@@ -1,4 +1,4 @@
-"""Overhead of campaigns: time per case, memory of the parent process, and writing a table of a million rows."""
+"""Measure the overhead of campaigns: time per case, memory of the parent process, writing a table of a million rows."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ COLUMNS = 30
 
 
 class BusyParameters(BaseModel):
+    """Parameters of `BusyScenario`: processor time of a case, s."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     busy_s: float = 0.0
@@ -81,7 +83,7 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class CaseCost:
-    """Wall-clock time per case, its part inside the scenario, and growth of the parent's memory."""
+    """Wall-clock time per case, of which inside the scenario, and growth of the parent process's memory."""
 
     wall_s: float
     inside_case_s: float
@@ -89,7 +91,10 @@ class CaseCost:
 
 
 def measure(repeats: int = 3) -> list[Measurement]:
-    """Measure the overhead of the engine. Ratios compare wall-clock times, because other programs affect both."""
+    """Measure the overhead of the engine, that is the time outside the scenario.
+
+    The overhead is computed from wall-clock times of the same run, so that other programs affect both in the same way.
+    """
     empty = [measure_case_cost(0.0, 2_000, 12_000) for _ in range(repeats)]
     busy = [measure_case_cost(0.05, 20, 140) for _ in range(repeats)]
     long_run = measure_case_cost(0.0, 10_000, 100_000)
@@ -143,6 +148,7 @@ def _measure_empty_campaign(cases: int = 100_000) -> list[Measurement]:
 
 
 def _run_case(campaign: Campaign, case: int) -> CaseResult:
+    """Run one case without the engine."""
     return campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
 
 
@@ -168,7 +174,7 @@ def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
 def measure_speed_up(campaign_name: str = "dimes-smoke", cases: int = 120) -> float:
     """Measure the speed-up of two workers with rendered cases; needs idle cores.
 
-    The measurement excludes the start-up of the workers and the last batches.
+    The first 24 cases (start-up of the workers) and the last 8 (small batches) are excluded.
     """
     first, last = 24, cases - 8
     times = []

@@ -2,8 +2,8 @@
 
 - Core-seconds of a frame as a function of its number of pixels, and of the number of triangles of the mesh
 - Core-seconds of a case as a function of the terrain's number of samples
-- Wall-clock seconds of a campaign as a function of its number of cases, and of the number of local or Dask workers; in
-  the latter the cases wait without computing
+- Wall-clock seconds of a campaign as a function of its number of cases
+- Wall-clock seconds of a campaign as a function of the number of local or Dask workers; its cases only wait
 - Core-seconds of a report as a function of the number of cases
 """
 
@@ -50,14 +50,9 @@ WAITING_S = 0.02
 class Curve:
     """Cost as a function of one size.
 
-    Attributes
-    ----------
-    name
-        Name of the curve.
-    size, cost
-        Labels of the axes with units.
-    points
-        Pairs (size, cost).
+    - name: Name of the curve
+    - size, cost: Labels of the axes with units
+    - points: Pairs (size, cost)
     """
 
     name: str
@@ -99,6 +94,7 @@ def measure_curves() -> list[Curve]:
 
 
 def _measure_image_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure a frame cropped to squares with these sides, pixels."""
     scene, surface = descent_scene()
     camera, pose = camera_optics(CameraParameters()).camera, descent_pose(surface)
     renderer = process_renderer(default_backend())
@@ -111,6 +107,7 @@ def _measure_image_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _measure_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure a frame with square meshes of these numbers of grid lines per axis."""
     scene, surface = descent_scene()
     rays, pose = camera_optics(CameraParameters()).rays, descent_pose(surface)
     renderer = process_renderer(default_backend())
@@ -125,6 +122,7 @@ def _measure_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _measure_terrain_sizes(samples: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure a case over terrains with these numbers of samples per axis."""
     points = []
     for count in samples:
         campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
@@ -136,14 +134,17 @@ def _measure_terrain_sizes(samples: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _measure_case_counts(cases: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure campaigns of empty cases on one worker."""
     return [(float(count), _measure_campaign_s(count, 0.0, ExecutorConfig(1))) for count in cases]
 
 
 def _measure_workers(jobs: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure a campaign of 400 waiting cases on local workers."""
     return [(float(count), _measure_campaign_s(400, WAITING_S, ExecutorConfig(count))) for count in jobs]
 
 
 def _measure_dask_workers(workers: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure a campaign of 400 waiting cases on a local Dask cluster."""
     return [
         (float(count), _measure_campaign_s(400, WAITING_S, ExecutorConfig(cluster=f"local:{count}")))
         for count in workers
@@ -164,6 +165,7 @@ def _measure_campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) 
 
 
 def _measure_reports(cases: Sequence[int]) -> list[tuple[float, float]]:
+    """Measure the report of synthetic campaigns with these numbers of cases."""
     with TemporaryDirectory() as folder:
         runs = [(count, synthetic_campaign(Path(folder, f"of-{count}"), count)) for count in cases]
         return [(float(count), run_marsyard("report", str(run)).core_s) for count, run in runs]

@@ -25,7 +25,7 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
-#: XC-55 camera.
+#: Sony XC-55 that looks down: focal length 6 mm, pixel pitch 7.4 um.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
 #: As in the landing paper: blocks of 73 px give about 59 tracks, a grid of 20 px gives 600 points.
 PAPER = HdaOptions(block_px=73, grid_px=20)
@@ -38,7 +38,8 @@ TEXEL_M = 0.005
 def make_measurements() -> LandingMeasurements:
     """Make two images of textured level ground from a height of 10 m with a baseline of 0.36 m."""
     values = np.random.default_rng(1).standard_normal((2400, 2400)).astype(np.float32)
-    # the standard deviation of smoothed white noise is proportional to 1 / sigma; coarse texture has a larger weight
+    # the standard deviation of smoothed white noise is proportional to 1 / sigma, hence the first factor; the factor
+    # sigma**0.5 gives coarse texture a larger weight
     texture = sum(
         sigma * ndimage.gaussian_filter(values, sigma, mode="wrap", truncate=3.0) * sigma**0.5 for sigma in (4, 12, 36)
     )
@@ -116,6 +117,7 @@ def measure_stages(measurements: LandingMeasurements, repeats: int) -> list[Meas
 
 
 def _measure_estimators(measurements: LandingMeasurements, repeats: int) -> list[Measurement]:
+    """Measure all stages together: with the paper's parameters, with a dense grid, and by semi-global matching."""
     return [
         Measurement(
             "HDA, all stages with the paper's parameters (paper: 0.77 s)",
@@ -135,6 +137,7 @@ def _measure_estimators(measurements: LandingMeasurements, repeats: int) -> list
 
 
 def _measure_large_map(repeats: int) -> Measurement:
+    """Measure the hazard maps of rough random ground with cells of 0.1 m."""
     elevation_m = 0.02 * np.random.default_rng(1).standard_normal((256, 256))
     ground = ElevationMap(elevation_m, np.zeros(2), 0.1)
     return Measurement(

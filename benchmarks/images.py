@@ -29,6 +29,7 @@ from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthe
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 from marsyard.sim.terrain.sites import site
 
+#: Sun of all scenes: azimuth and elevation, radians.
 SUN = Sun(direction(4.0, 0.7))
 
 
@@ -68,6 +69,7 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
         SUN,
         Photometry(),
         objects=Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15),
+        # octaves with equal amplitudes, coarsest 0.1 m (ground) and 0.2 m (rocks)
         ground_texture=Texture(0.1, (0.06,) * 7),
         object_texture=Texture(0.2, (0.06,) * 8),
         mesh_finest_m=0.04,
@@ -75,6 +77,7 @@ def measure_rover_images(repeats: int) -> list[Measurement]:
         mesh_lines=641,
         among_objects=True,
     )
+    # a MER navcam 1.5 m above the ground, whose axis points 18 deg below the horizon
     pinhole = Cahv.from_focal_length(
         focal_m=14.67e-3,
         pixel_pitch_m=12e-6,
@@ -106,8 +109,8 @@ IMAGES_PER_SCENE, ROCKS_EVERY = 5, 4
 def measure_memory(frames: int) -> list[Measurement]:
     """Measure maximum and growth of the memory of this process while it renders many scenes.
 
-    Scenes with and without rocks alternate, so that bodies are loaded and released, and the renderer switches between
-    drawing only the ground and drawing triangle numbers.
+    Every fourth scene has rocks, so that meshes are loaded and released, and the renderer switches between drawing only
+    the ground and drawing triangle numbers. `frames` is the number of images.
     """
     renderer = process_renderer(default_backend())
     _, surface = descent_scene()

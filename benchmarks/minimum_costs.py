@@ -36,15 +36,15 @@ CALLS: Stages = {
 
 
 def measure_minimum_costs(run_case: Callable[[], object], repeats: int) -> list[Measurement]:
-    """Measure the minimum cost of the parts of a case and their sum, in core-seconds."""
+    """Measure the minimum cost of each necessary operation of a case and their sum, in core-seconds."""
     calls = profile_stages(run_case, repeats, CALLS)
-    parts = {
+    operations = {
         "splines for ray intersection and shading": core_seconds(_prepare_splines(), repeats),
         "random numbers of the detector": core_seconds(_prepare_random_numbers(), repeats),
         "one pass over the terrain's heights": core_seconds(_prepare_height_pass(), repeats),
     } | {name: calls[name] for name in CALLS}
-    costs = [Measurement(f"dimes-gusev case, minimum cost: {name}", values) for name, values in parts.items()]
-    total = sum(statistics.median(values) for values in parts.values())
+    costs = [Measurement(f"dimes-gusev case, minimum cost: {name}", values) for name, values in operations.items()]
+    total = sum(statistics.median(values) for values in operations.values())
     return [*costs, Measurement("dimes-gusev case, minimum cost: sum", [total])]
 
 
@@ -59,7 +59,7 @@ def _prepare_splines() -> Callable[[], object]:
 
 @njit(cache=True)
 def _sum_fields(field: Level, scale: float, x: Array, y: Array) -> float:
-    """Sum of heights, slopes and albedos at positions."""
+    """Sum of heights, slopes and albedos at positions, in strips of `STRIP` positions for vector instructions."""
     cells: CellBuffers = allocate_cells()
     lanes = np.arange(STRIP)
     total = 0.0
@@ -71,6 +71,7 @@ def _sum_fields(field: Level, scale: float, x: Array, y: Array) -> float:
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def _sum_strip(cells: CellBuffers) -> float:
+    """Evaluate the splines of one strip."""
     total = 0.0
     for k in range(STRIP):
         height, slope_x, slope_y, albedo = spline(cells[0], cells[1], k)

@@ -1,4 +1,4 @@
-"""Write `docs/performance.md` from the template `performance.md` and the stored measurements."""
+"""Write `docs/performance.md` from the template `benchmarks/performance.md` and the stored measurements."""
 
 from __future__ import annotations
 

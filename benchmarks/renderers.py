@@ -70,7 +70,7 @@ def measure(repeats: int) -> list[Measurement]:
 def _make_descent_mesh() -> dict[str, Any]:
     """Return terrain triangles, camera pose (OpenGL axes, equal to the body axes), focal length and sun direction."""
     scene, surface = descent_scene()
-    offsets = graded_offsets(scene.mesh_half_width_m, 3.0, 1025)
+    offsets = graded_offsets(scene.mesh_half_width_m, 3.0, 1025)  # 1025 lines per axis, 3 m apart in the centre
     mesh = ground_mesh(scene.surface, scene.centre_m[0] + offsets, scene.centre_m[1] + offsets)
     return {
         "mesh": mesh,
@@ -81,6 +81,7 @@ def _make_descent_mesh() -> dict[str, Any]:
 
 
 def _prepare_pyrender(inputs: Mapping[str, Any]) -> Callable[[], None]:
+    """Return a function that renders the mesh with pyrender."""
     import pyrender
 
     scene = pyrender.Scene(ambient_light=(0.1, 0.1, 0.1))
@@ -136,6 +137,7 @@ def _run_renderer(command: list[str], inputs: Mapping[str, Any], repeats: int) -
 
 
 def _prepare_vtk(inputs: Mapping[str, Any]) -> Callable[[], object]:
+    """Return a function that renders the mesh with VTK."""
     import pyvista
 
     plotter = pyvista.Plotter(off_screen=True, window_size=(SIDE_PX, SIDE_PX), lighting=None)

@@ -24,7 +24,7 @@ from benchmarks.timing import Measurement
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
 
-#: Number of additional numeric columns, because a row of `dimes-gusev` has 99 columns.
+#: Number of random columns that are added, so that a row has as many columns (99) as one of `dimes-gusev`.
 ADDITIONAL_COLUMNS = 82
 #: Number of cases that are generated at a time.
 _BLOCK_CASES = 50_000
@@ -93,6 +93,7 @@ def synthetic_campaign(directory: Path, cases: int, seed: int = 1, site: str = "
 
 
 def _draw_rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
+    """Draw the rows of `count` cases from case number `start`; 95 % of them have an answer."""
     valid = rng.random(count) < 0.95
     off_nadir_deg = rng.uniform(0.0, 30.0, count)
     error = rng.normal(0.0, 0.5 + off_nadir_deg[:, None] / 30.0, (count, 2))
@@ -121,6 +122,7 @@ def _draw_rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
 
 
 def _make_record(cases: int, seed: int, site: str) -> dict[str, Any]:
+    """Return the content of `campaign.json`; dates and commits differ between seeds."""
     requirements = [shipped_requirements()[name].model_dump(mode="json") for name in ("DIMES-VEL", "DIMES-HARM")]
     configuration = {"name": f"dimes-{site}", "scenario": "descent", "cases": cases, "seed": seed}
     return {
@@ -138,7 +140,10 @@ def _make_record(cases: int, seed: int, site: str) -> dict[str, Any]:
 
 
 def _copy_campaigns(folder: Path, original_run: Path, campaigns: int) -> Path:
-    """Copy a campaign and its report several times with different records. Returns the folder for the dashboard."""
+    """Copy a campaign and its report several times, with different landing sites and dates.
+
+    The copies are in the folder `runs`. Returns the folder for the dashboard's pages.
+    """
     for number in range(campaigns):
         run = folder / "runs" / f"run-{number:04}"
         shutil.copytree(original_run, run, copy_function=os.link)
@@ -153,6 +158,7 @@ def _copy_campaigns(folder: Path, original_run: Path, campaigns: int) -> Path:
 
 
 def _rename_report(original_run: Path, site: str) -> dict[str, Any]:
+    """Return the content of `report.json` with the campaign's name for this landing site."""
     report: dict[str, Any] = json.loads((original_run / "report.json").read_text(encoding="utf-8"))
     return {**report, "campaign": f"dimes-{site}"}
 
@@ -177,6 +183,7 @@ def run_marsyard(*arguments: str) -> Cost:
     return Cost(core_s, time.perf_counter() - start_s, memory_gb)
 
 
+#: Program that runs a `marsyard` command and prints its exit status, core-seconds and maximum memory (GB).
 _MEASURING_PROGRAM = """
 import json, os, sys
 discard_output = [(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)]

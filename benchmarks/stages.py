@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 
 from benchmarks.timing import Measurement
 
-#: Stage: its functions, each as the end of the file name and the function name. The time of callees is included.
+#: Functions of each stage, by its name: end of the file name, and function name. The time of a function includes that
+#: of the functions that it calls.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 STAGES: Stages = {
     "terrain and rocks": (("descent/exposure.py", "from_parameters"), ("descent/exposure.py", "scene")),

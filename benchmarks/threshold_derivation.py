@@ -183,6 +183,7 @@ def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotatio
 
 
 def _create_view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
+    """Create a view without an image, from a camera in the body frame."""
     centre = np.array([0.0, 0.0, altitude_m])
     return View(_EMPTY_IMAGE, _EMPTY_IMAGE, camera.transform(rigid(attitude, centre)), centre, time_s, _CALIBRATION, 1)
 

@@ -10,7 +10,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Measurement:
-    """Measured values of one quantity and limits of their median, in core-seconds unless the name contains a unit."""
+    """Measured values of one quantity, in core-seconds unless the name contains a unit.
+
+    - limit, minimum: largest and smallest accepted median, or None
+    """
 
     name: str
     values: list[float]

@@ -64,6 +64,7 @@ class HomographyEstimator:
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
+        """Return the shift at the inliers' centroid; None if no homography is found. The score is the inlier count."""
         options, points = self.options, match_features(patches, self.options)
         if points is None:
             return None
@@ -80,7 +81,7 @@ class HomographyEstimator:
         centroid = points[0][is_inlier].mean(axis=0).astype(np.float64)
         homogeneous = homography @ np.array([*centroid, 1.0])
         depth = homogeneous[2]
-        if abs(depth) < 1e-9:
+        if abs(depth) < 1e-9:  # the centroid would be mapped to infinity
             return None
         mapped_point = homogeneous[:2] / depth
         count = int(is_inlier.sum())

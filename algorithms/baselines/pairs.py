@@ -82,6 +82,7 @@ class BaselineDetails:
     matches: tuple[PairMatch | None, ...]
 
 
+#: Function that measures the shift between the patches of a pair; None without a match.
 Matcher = Callable[[PairPatches], PairMatch | None]
 
 
@@ -166,6 +167,7 @@ class PhaseCorrelationEstimator:
         return estimate_by_pairs(measurements, self._match, self.options.common)
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
+        """Return the shift and the response; None if a patch is uniform."""
         first, second = patches.first, patches.second
         if np.ptp(first) == 0.0 or np.ptp(second) == 0.0:
             return None

@@ -31,6 +31,7 @@ from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, 
 
 #: Range of usable camera heights above the ground: from the size of the airbags to above the atmosphere.
 HEIGHT_RANGE_M = (1.0, 1e6)
+#: Number of images of a descent.
 _IMAGE_COUNT = 3
 
 
@@ -44,6 +45,7 @@ class View:
       z = 0 at the measured altitude below the body's origin, and the origin is the camera's nadir point
     - centre: The camera's position in that frame, metres: (0, 0, height)
     - time_s: Time tag at mid-exposure
+    - calibration: Calibration of the detector, for the corrections of `correct_patch`
     - rows_summed: Physical rows in one row of `signal`, binned on the chip and by software
     """
 
@@ -257,8 +259,8 @@ def rectify_patch(
     """Rectify and correct a patch of `side_px` pixels around the ground point `centre` (east, north), counts.
 
     Each pixel is projected with the full camera model, or mapped by the homography of the patch's corners.
-    Points outside the image have the value at its border. Points that the optics cannot image have the value of its
-    upper left pixel. Template candidates contain no such points.
+    Points outside the image get the value of the nearest border pixel. Points that the camera model cannot project get
+    the value of the image's upper left pixel. Template candidates contain no such points.
     """
     lattice = ground_lattice(centre, side_px, gsd_m)
     pixels, visible = pixels_from_ground(view, lattice) if full_camera else homography_lattice(view, lattice)

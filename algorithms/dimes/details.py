@@ -28,7 +28,7 @@ class Track:
     - match: Row and column in `window` of the matched template's centre
     - surface: Correlation at every shift; its centre is zero motion
     - failed: Validity checks that the track failed
-    - velocity_m_s: Mean velocity of the camera over the pair (east, north), also of invalid tracks
+    - velocity_m_s: Mean velocity of the camera over the pair (east, north); also given for invalid tracks
     """
 
     pair: int
@@ -55,7 +55,7 @@ class PairDetails:
     """Intermediate products of one pair of consecutive images.
 
     - overlap_polygon: Outline (u, v) in the earlier image of the later image's footprint at zero horizontal motion
-    - zero_phase_pixels: Centre of the zero-phase spot (u, v) in both images; NaN if invisible
+    - zero_phase_pixels: Anti-solar point (zero phase angle) in both images (u, v); NaN if invisible
     - gsd_m: Ground sample distance of rectified pixels
     - candidates: Number of feasible template positions on the coarse grid
     - tracks: All tracks, valid or not
@@ -89,6 +89,7 @@ class DimesDetails:
         return tuple(track for pair in self.pairs for track in pair.tracks)
 
 
+#: Columns of the stored array `tracks`.
 TRACK_COLUMNS = (
     "pair", "template", "template_u", "template_v", "match_u", "match_v", "contrast", "peak", "peak_width",
     "second_peak_ratio", "valid", "velocity_east_m_s", "velocity_north_m_s", "ground_east_m", "ground_north_m",
@@ -108,7 +109,7 @@ def rectified_lattice(
     Returns (east, north, step), metres, with the upper left point relative to the nadir point and rows running south;
     and the pixels (u, v) of the earlier and the later image at the lattice points, NaN if invisible.
     """
-    footprints = []
+    footprints = []  # ground points of 17 x 17 pixels of each image
     for view in pair.views:
         u, v = np.meshgrid(*(np.linspace(0.0, 1.0, 17) * (size - 1.0) for size in view.size))
         ground, _ = ground_from_pixels(view, np.column_stack([u.ravel(), v.ravel()]), FIGURE_OFF_NADIR_RAD)

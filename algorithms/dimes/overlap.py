@@ -1,6 +1,7 @@
 """Template candidates in the overlap region of two views, and their selection (section II.A).
 
-Sections are those of Johnson et al., "Field Testing of the MER DIMES".
+Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot is the ground around the
+anti-solar point, which the opposition surge brightens; it moves with the lander and is masked.
 """
 
 from __future__ import annotations
@@ -139,7 +140,7 @@ def template_candidates(
 
 
 #: Lower limit of the mean signal before division, as a fraction of the full scale.
-DARK_FRACTION = 0.01
+MIN_SIGNAL_FRACTION = 0.01
 
 
 def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
@@ -148,9 +149,11 @@ def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vec
     The image is not corrected: the frame-transfer smear is smooth along columns and its effect is negligible.
     """
     columns, rows = np.rint(pixels).astype(int).T
-    uu, vv, uv = (part[rows, columns] for part in structure_tensor(view.signal, support))
+    uu, vv, uv = (component[rows, columns] for component in structure_tensor(view.signal, support))
     mean = local_mean(view.signal, support)[rows, columns]
-    return np.asarray(harris_interest(uu, vv, uv) / np.maximum(mean, DARK_FRACTION * view.calibration.full_scale_dn))
+    return np.asarray(
+        harris_interest(uu, vv, uv) / np.maximum(mean, MIN_SIGNAL_FRACTION * view.calibration.full_scale_dn)
+    )
 
 
 def best_candidates(contrasts: Vector, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:

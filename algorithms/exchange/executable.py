@@ -66,7 +66,7 @@ class ExecutableVelocityStream:
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._session = Session(command, limits)
-        self._details = ProgramDetails("", 0.0)
+        self._details = ProgramDetails("", 0.0)  # of all requests of the descent
         self._accepts_inertial = False
 
     def start(self) -> None:
@@ -101,10 +101,12 @@ class ExecutableVelocityStream:
     def _send_without_answer(
         self, action: str, values: Mapping[str, Any], read: AnswerReader[interface.VelocityEstimate | None]
     ) -> None:
+        """Send a request whose answer must contain no estimate."""
         if self._session.send_request(action, values, read) is not None:
             raise bad_answer(f"the answer to '{action}' has an outcome; it must be null")
 
     def _read_start(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
+        """Decode the answer to 'start', whose key `inertial` requests increments and altitudes."""
         accepts_inertial = answer.get("inertial", False)
         if not isinstance(accepts_inertial, bool):
             raise bad_answer(f"inertial is {accepts_inertial!r}; allowed: true, or false")
@@ -112,6 +114,7 @@ class ExecutableVelocityStream:
         return self._read_answer({key: value for key, value in answer.items() if key != "inertial"}, details)
 
     def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
+        """Decode an estimate, or None for the outcome null; add output and time to those of the descent."""
         self._details = ProgramDetails(
             (self._details.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:], self._details.time_s + details.time_s
         )
@@ -145,7 +148,7 @@ class ExecutableTargetTracker:
         self._session = Session(command, limits)
         self._mast: MastCalibration | None = None
         self._mast_count = 0
-        self._folder = self._session.folder
+        self._folder = self._session.folder  # replaced by the folder of the mast's files
 
     @property
     def state(self) -> interface.TrackingState:
@@ -175,13 +178,16 @@ class ExecutableTargetTracker:
         self._state = self._session.send_request("clear", {}, _read_state)
 
     def _write_mast(self, mast: MastCalibration) -> str:
-        """Write the mast's files if the mast changed since the last call; return their folder."""
+        """Write the mast's files if the mast differs from that of the last call; return their folder."""
         if mast is not self._mast:
             self._mast, self._mast_count = mast, self._mast_count + 1
             self._folder = self._session.folder / f"mast_{self._mast_count}"
             self._folder.mkdir()
             write_mast(self._folder, mast)
         return str(self._folder)
+
+
+# Functions that decode an answer; they raise AlgorithmError (BAD_ANSWER) if it does not conform to the exchange format.
 
 
 def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate:

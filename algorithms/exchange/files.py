@@ -47,11 +47,13 @@ FORMAT_VERSION = 1
 #: Supported versions of request lines and answers. From version 2 a request has an `id`, and its answer the same `id`.
 ANSWER_VERSIONS = (1, 2)
 
+#: JSON files of a case and of a single descent image.
 CASE_FILE, FRAME_FILE = "case.json", "frame.json"
 
 #: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
 
+#: Arrays of `ImuIncrements`.
 _INCREMENT_KEYS = ("times_s", "delta_angles_rad", "delta_velocities_m_s")
 
 #: Image file format.
@@ -197,6 +199,7 @@ def read_increments(content: Mapping[str, Any]) -> ImuIncrements:
 
 
 def _encode_length(length_m: float) -> float | None:
+    """Encode a length for JSON; an infinite length or NaN becomes null."""
     return length_m if math.isfinite(length_m) else None
 
 
@@ -205,15 +208,17 @@ def _read_length(length_m: float | None) -> float:
 
 
 def _encode_gravity(gravity_m_s2: float | None) -> dict[str, float]:
-    """Return the key of the gravity, which is known only with inertial increments."""
+    """Return the JSON entry of the gravity; empty without gravity (cases without inertial increments)."""
     return {} if gravity_m_s2 is None else {"gravity_m_s2": gravity_m_s2}
 
 
 def _encode_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
+    """Encode an array of any shape for JSON; None becomes null."""
     return None if value is None else value.tolist()
 
 
 def _read_vector(content: Any) -> Any:
+    """Decode an array; None for null."""
     return None if content is None else np.array(content, dtype=np.float64)
 
 
@@ -268,7 +273,9 @@ def read_counts(path: Path) -> UInt16[np.ndarray, "rows columns"]:
     return np.asarray(counts, dtype=np.uint16)
 
 
+#: JSON files of a mast and of a rover stop.
 MAST_FILE, STOP_FILE = "mast.json", "stop.json"
+#: Fields of `MastGeometry`: offsets between its joints, m, and limits of its angles, rad.
 _OFFSET_KEYS, _LIMIT_KEYS = ("base_m", "elbow_m", "head_m"), ("azimuth_limits_rad", "elevation_limits_rad")
 
 

@@ -31,6 +31,8 @@ _POLL_S = 0.02
 MAX_STDERR_CHARACTERS = 4000
 #: Time for a persistent program to exit after its input is closed, seconds.
 _EXIT_GRACE_S = 0.5
+#: Maximum number of bytes in one read or write of a pipe.
+_CHUNK_BYTES = 1 << 16
 
 #: Linux's `prctl` option for the signal that a process receives when its parent ends.
 _PR_SET_PDEATHSIG = 1
@@ -176,7 +178,7 @@ class RunningProgram:
                 self._process.stdin.close()
 
     def _read(self, is_complete: Callable[[], bool], request: bytes = b"") -> None:
-        """Send a request and read both streams until they end or `is_complete()` is true.
+        """Send a request and read standard output and error until they end or `is_complete()` is true.
 
         The limits on time, memory and size also hold while a program does not read its input. Raises BrokenPipeError
         if the program has closed its input.
@@ -194,15 +196,16 @@ class RunningProgram:
                 self._check_limits()
                 for key, _ in selector.select(_POLL_S):
                     if key.fileobj is self._process.stdin:
-                        request = request[os.write(key.fd, request[: 1 << 16]) :]
+                        request = request[os.write(key.fd, request[:_CHUNK_BYTES]) :]
                         if not request:
                             selector.unregister(key.fileobj)
-                    elif data := os.read(key.fd, 1 << 16):
+                    elif data := os.read(key.fd, _CHUNK_BYTES):
                         key.data.extend(data)
                     else:
                         selector.unregister(key.fileobj)
 
     def _check_limits(self) -> None:
+        """Kill the program and raise AlgorithmError if it exceeds a limit."""
         if time.monotonic() > self._deadline_s:
             raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
@@ -256,7 +259,7 @@ def _read_pending(stream: IO[bytes] | None) -> bytes:
         return b""
     with selectors.DefaultSelector() as selector:
         selector.register(stream, selectors.EVENT_READ)
-        return os.read(stream.fileno(), 1 << 16) if selector.select(0.0) else b""
+        return os.read(stream.fileno(), _CHUNK_BYTES) if selector.select(0.0) else b""
 
 
 def shorten(raw: bytes) -> str:
@@ -266,6 +269,6 @@ def shorten(raw: bytes) -> str:
 
 
 def _decode_tail(raw: bytearray) -> str:
-    """Decode the end of an output as printable text; a character has at most 4 bytes in UTF-8."""
+    """Decode the last `MAX_STDERR_CHARACTERS` of an output (at most 4 bytes each in UTF-8) as printable text."""
     text = bytes(raw[-4 * MAX_STDERR_CHARACTERS :]).decode("utf-8", errors="replace")[-MAX_STDERR_CHARACTERS:]
     return "".join(character if character.isprintable() or character in "\n\t" else "�" for character in text)

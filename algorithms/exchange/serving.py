@@ -45,6 +45,7 @@ def parse_object(output: Output) -> Mapping[str, Any]:
     """Parse the JSON object of an output; raises AlgorithmError (BAD_ANSWER). Keys are not checked."""
     message = f"its output is not one JSON object: {shorten(output.stdout)}"
     try:
+        # NaN and Infinity become floats; `read_numbers` rejects them with a message that names the key
         answer = json.loads(output.stdout.decode("utf-8"), parse_constant=float)
     except (ValueError, RecursionError) as error:
         raise AlgorithmError(Fault.BAD_ANSWER, f"{message} ({error})", output.stderr) from error
@@ -82,7 +83,7 @@ def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
 
 
 def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
-    """Whether a value is a number (empty shape) or a nested list of numbers of this shape."""
+    """Whether a value is a finite number (empty shape) or a nested list of finite numbers of this shape."""
     if not shape:
         return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
     return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(item, shape[1:]) for item in value)
@@ -185,6 +186,7 @@ class Session:
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._command, self._limits = command, limits
         self._server: Server | None = None
+        # releases the program when this session is deleted
         self._release: weakref.finalize[Any, Any] | None = None
         self.folder = Path(tempfile.mkdtemp(prefix="marsyard-session-"))
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)

@@ -94,7 +94,7 @@ def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -
     _, rotation, translation = max(poses, key=lambda pose: pose[0])
     second_from_first = rigid(Rotation.from_matrix(rotation), translation.ravel())
     depths = structure.triangulate(first, second, second_from_first)
-    depths[~(np.abs(depths) > 0.0)] = np.inf
+    depths[~(np.abs(depths) > 0.0)] = np.inf  # no depth: a point at infinity
     positive_depths = depths[np.isfinite(depths) & (depths > 0.0)]
     if len(positive_depths) == 0:
         return None
@@ -165,7 +165,7 @@ def match_disparities(
     rays = rectification.camera.rays(rectification.camera.pixel_grid())[1].reshape(-1, 3)
     images = []
     for view, rotation in zip(views, rotations, strict=True):
-        # 8-bit images, black outside the field of view
+        # 8-bit images, black outside the field of view: (-10, -10) is outside every image
         pixels = np.nan_to_num(view.camera.project(rotation.apply(rays))[0], nan=-10.0).astype(np.float32)
         grey = np.clip(view.counts * (255.0 / full_scale), 0.0, 255.0).astype(np.float32)
         grid = pixels.reshape(rectification.camera.size[1], rectification.camera.size[0], 2)
@@ -179,6 +179,7 @@ def match_disparities(
         blockSize=BLOCK_PX,
         P1=SMALL_STEP_PENALTY,
         P2=LARGE_STEP_PENALTY,
+        # left-right check, uniqueness and speckle filters: usual values (OpenCV's manual)
         disp12MaxDiff=1,
         uniquenessRatio=10,
         speckleWindowSize=100,
@@ -204,6 +205,7 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
         disparities = match_disparities(scene.views, rectification, motion.second_from_first, bounds)
         rays = rectification.rectified_from_first.apply(np.column_stack([coordinates, np.ones(len(coordinates))]))
         column, row = np.rint(rectification.camera.project(rays)[0]).astype(np.int64).T
+        # rays have unit depth in the first camera's frame; disparities give depths in the rectified frame
         depths = rectification.focal_px * rectification.baseline_m / disparities[row, column] / rays[:, 2]
     is_accepted = (depths > bounds[0]) & (depths < bounds[1])
     statuses = np.full(len(pixels), structure.MatchStatus.OUT_OF_BOUNDS, dtype=np.uint8)

@@ -30,6 +30,7 @@ class Ground:
     - surface_from_camera: Rotation from the first camera's frame to the surface frame; both origins are at that camera
     - world_from_surface: Rotation about the vertical from the surface frame to the world frame, from the on-board pose
     - points: The point cloud in the surface frame, metres
+    - elevation, hazards: Elevation map of these points, and its maps of slope, roughness and safety
     - apriori_cell: Row and column of the a-priori site, fractional, possibly outside the map
     - site_cell: Row and column of the selected site; None if no cell is safe
     """
@@ -110,6 +111,7 @@ def hda_products(details: HdaDetails) -> dict[str, Any]:
 
 
 def _ground_products(first: View, ground: Ground) -> dict[str, Any]:
+    """Return the products of Figs. 4, 5 and 7."""
     elevation = ground.elevation
     shape = elevation.elevation_m.shape
     positions = elevation.positions(np.moveaxis(np.indices(shape).astype(np.float64), 0, -1))

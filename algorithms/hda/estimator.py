@@ -102,6 +102,7 @@ def find_site(
 
 
 def _report_failure(outcome: SiteOutcome, scene: LandingScene, details: HdaDetails) -> SiteEstimate:
+    """Return the a-priori site with a failure outcome."""
     return SiteEstimate(outcome, scene.apriori_site_world, details)
 
 
@@ -128,6 +129,7 @@ def check_motion(motion: Motion | None, options: HdaOptions) -> SiteOutcome | No
     """Return the reason why a motion is rejected; None if it is accepted."""
     if motion is None:
         return SiteOutcome.NO_MOTION
+    # at least 6: one more than the five unknowns of a motion without scale
     min_inliers = max(options.min_inlier_fraction * len(motion.inliers), 6)
     if np.count_nonzero(motion.residuals_px <= options.max_residual_px) < min_inliers:
         return SiteOutcome.NO_MOTION
@@ -167,7 +169,7 @@ def plane_normal(points: Points3, seed: int) -> Vector3:
     corners = points[rng.integers(0, len(points), (PLANE_TRIALS, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1)
-    is_valid = lengths > 1e-9 * float(np.mean(points**2))
+    is_valid = lengths > 1e-9 * float(np.mean(points**2))  # excludes triples on one line
     normals, corners = normals[is_valid] / lengths[is_valid, None], corners[is_valid]
     if len(normals) == 0:
         return np.array([0.0, 0.0, -1.0])

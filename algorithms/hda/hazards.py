@@ -113,6 +113,7 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.
     side = max(round(options.lander_diameter_m / ground.cell_m), MIN_SIDE_CELLS)
     shape = ground.elevation_m.shape
     starts = [_square_starts(extent, side) for extent in shape]
+    # random numbers from which the kernel selects three cells in each trial
     triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
     planes = kernels.footprint_planes(
         ground.elevation_m, starts[0], starts[1], side, max(side * side // 2, 4), triples, options.refine_planes

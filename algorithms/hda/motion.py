@@ -1,5 +1,6 @@
-"""Structure from motion: camera motion and feature depths from tracks (section II.B); corrected images and cameras.
+"""Structure from motion: camera motion and feature depths from tracks (section II.B).
 
+The module also corrects the images and transforms cameras and measurements to the camera frame.
 Sections and equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
@@ -132,7 +133,8 @@ START_SCALES_PX = (32.0, 8.0, 3.0)
 #: Maximum number of steps at each scale. Over slopes the initial plane is wrong: of 40 rendered pairs over steep ground
 #: 4 required 60 to 100 steps.
 ITERATIONS = 300
-#: Step length (radians; fraction of the depth) below which the iteration has converged: at `START_SCALES_PX`, and last.
+#: Step length (rotation in radians, translation as a fraction of the median depth) below which the iteration has
+#: converged: at `START_SCALES_PX`, and at the final scale `HdaOptions.robust_px`.
 START_TOLERANCE, TOLERANCE = 1e-4, 1e-9
 #: Largest relative deviation of an inlier's inverse depth from the plane fit.
 MAX_INVERSE_DEPTH_FRACTION = 0.6
@@ -258,7 +260,8 @@ def _has_plausible_depth(first: Points2, inverse_depths: Vector, has_small_resid
             return mask
         plane = design @ np.linalg.lstsq(design[mask], inverse_depths[mask], rcond=None)[0]
         deviations = np.abs(inverse_depths - plane)
-        # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution
+        # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution; the limit is
+        # at least 0.1 % of the median, because the deviations of a perfect plane are rounding errors
         limit = max(3.0 * 1.4826 * float(np.median(deviations[mask])), 1e-3 * float(np.median(inverse_depths[mask])))
         mask = has_small_residual & (inverse_depths > 0.0) & (deviations <= limit)
     return np.asarray((inverse_depths > 0.0) & (deviations <= MAX_INVERSE_DEPTH_FRACTION * np.abs(plane)))

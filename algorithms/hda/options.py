@@ -15,7 +15,8 @@ from marsyard.sim.parameters import Choice
 class SurfaceFrame(Choice):
     """Source of the vertical direction (paper: section II.D). The azimuth always comes from the on-board pose.
 
-    Inclinometers, attitude of the on-board filter, or a robust plane through the points (no mean slope).
+    Inclinometers, attitude of the on-board filter, or the normal of a robust plane through the points. The map of the
+    last source is level on average.
     """
 
     INCLINOMETER = "inclinometers"
@@ -72,7 +73,8 @@ class HdaOptions:
       searches use whole pixels near a line, with errors of up to 0.7 px.
     - min_points: Minimum number of points for an elevation map
     - surface_frame: Source of the vertical direction
-    - lander_diameter_m: Side of the lander's footprint, by which hazards are dilated (section III). Helicopter: 2 m.
+    - lander_diameter_m: Diameter of the lander: side of the squares for plane fits, and unit of the dilation of hazards
+      (section III). Helicopter: 2 m.
     - plane_trials: Random triples of points for the least-median-of-squares plane of a footprint. If half of the points
       are not on the plane, 30 trials find it in 98 % of footprints; if 30 % are not, in all but 3 in a million.
     - refine_planes: Whether each plane is refined by least squares over its inliers (Rousseeuw & Leroy 1987)

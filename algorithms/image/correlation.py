@@ -1,5 +1,6 @@
 """Normalised and pseudo-normalised correlation of a template with a window, and peaks of correlation surfaces.
 
+Target tracking uses the normalised correlation, DIMES the pseudo-normalised correlation.
 Section II.A is that of Johnson et al., "Field Testing of the MER DIMES". The tracking paper is Kim et al., "Targeted
 Driving Using Visual Tracking".
 """
@@ -84,7 +85,7 @@ def second_peak(surface: Raster, peak: Peak, exclusion: float) -> float:
 
 
 def cross_sums(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> Float[np.ndarray, "_ _"]:
-    """Sums of products of the template with the window at every position where the template fits, by FFT.
+    """Cross-correlate without normalisation, by FFT: sums of products at every position where the template fits.
 
     The transform has the window's size: wrap-around affects only positions where the template does not fit.
     """
@@ -160,11 +161,12 @@ def coarse_to_fine_peak(template: Float[np.ndarray, "n m"], window: Raster, leve
 def halve(image: Raster) -> Float[np.ndarray, "_ _"]:
     """Reduce an image to means of 2 x 2 pixels; an odd last row or column is dropped."""
     rows, columns = image.shape[0] // 2, image.shape[1] // 2
-    even_part = np.ascontiguousarray(image[: 2 * rows, : 2 * columns])
-    return np.asarray(cv2.resize(even_part, (columns, rows), interpolation=cv2.INTER_AREA))
+    cropped = np.ascontiguousarray(image[: 2 * rows, : 2 * columns])
+    return np.asarray(cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA))
 
 
 def _check_fit(template: Float[np.ndarray, "_ _"], window: Float[np.ndarray, "_ _"]) -> None:
+    """Raise ValueError if the template is larger than the window."""
     if template.shape[0] > window.shape[0] or template.shape[1] > window.shape[1]:
         raise ValueError(f"a template of {template.shape} pixels does not fit into a window of {window.shape}")
 

@@ -21,6 +21,7 @@ from marsyard.algorithms.arrays import Patch, Raster, Vector2
 from marsyard.algorithms.image.kernels import quintic
 from marsyard.algorithms.image.kernels import registration as kernels
 
+#: Degree of the splines.
 ORDER: Final = 5
 #: Step length below which the shift refinement ends; the next step is smaller by a factor of at least ten.
 ALIGNMENT_TOLERANCE_PX = 1e-3
@@ -126,29 +127,29 @@ class Registration:
 
 
 @dataclass(frozen=True)
-class SplinePart:
-    """Quintic spline of the part of a window around a template, from `start` up to `stop` (row, column), exclusive."""
+class WindowSpline:
+    """Quintic spline of the pixels of a window around a template, from `start` to `stop` (row, column), exclusive."""
 
     start: tuple[int, int]
     stop: tuple[int, int]
     coefficients: Raster
 
 
-def build_spline(window: Raster, corner: Vector2, side: int, previous: SplinePart | None = None) -> SplinePart:
+def build_spline(window: Raster, corner: Vector2, side: int, previous: WindowSpline | None = None) -> WindowSpline:
     """Build the spline around a template of `side` pixels with its upper left pixel at `corner` (row, column).
 
-    Returns `previous`, a spline of the same window, if it covers the same part.
+    Returns `previous`, a spline of the same window, if it covers the same pixels.
     """
     low = np.maximum(np.floor(corner).astype(int) - MARGIN_PX, 0)
     high = np.ceil(corner).astype(int) + side + MARGIN_PX
     start, stop = (int(low[0]), int(low[1])), (int(high[0]), int(high[1]))
     if previous is not None and (previous.start, previous.stop) == (start, stop):
         return previous
-    return SplinePart(start, stop, spline_coefficients(window[start[0] : stop[0], start[1] : stop[1]]))
+    return WindowSpline(start, stop, spline_coefficients(window[start[0] : stop[0], start[1] : stop[1]]))
 
 
 def register_template(
-    template: Patch, window: Raster | SplinePart, corner: Vector2, warp: Warp, limits: Limits = LIMITS
+    template: Patch, window: Raster | WindowSpline, corner: Vector2, warp: Warp, limits: Limits = LIMITS
 ) -> Registration | None:
     """Register a template in a window, or in its spline around `corner`, starting from `corner` (row, column).
 
@@ -159,12 +160,12 @@ def register_template(
     determine the unknowns.
     """
     half = 0.5 * (len(template) - 1)
-    part = window if isinstance(window, SplinePart) else build_spline(window, corner, len(template))
-    low = np.array(part.start)
+    spline = window if isinstance(window, WindowSpline) else build_spline(window, corner, len(template))
+    low = np.array(spline.start)
     start = corner - low + half
     bounds = (limits.shift_px, limits.stretch, limits.steps)
     converged, row, column, score = kernels.register(
-        template, part.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, MIN_PIVOT
+        template, spline.coefficients, start[0], start[1], _ORDERS[warp], bounds, REGISTRATION_TOLERANCE_PX, MIN_PIVOT
     )
     return Registration(np.array([row, column]) - half + low, score) if converged else None
 

@@ -14,9 +14,10 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 
 
 def check_estimate(answer: Any, span_s: tuple[float, float]) -> PositionEstimate:
-    """Validate a `PositionEstimate` within the time tags of the inertial unit; return a copy with plain arrays.
+    """Validate a `PositionEstimate`; return a copy with plain arrays.
 
-    Raises AlgorithmError (BAD_ANSWER) with the reason.
+    `span_s` are the first and the last time of the inertial data, between which the answer's time must lie. Raises
+    AlgorithmError (BAD_ANSWER) with the reason.
     """
     check_type("the answer", answer, PositionEstimate)
     check_type("outcome", answer.outcome, PositionOutcome)

@@ -14,6 +14,9 @@ from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage, binning_factor
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
+#: Largest ratio of the descriptor distances of the best and the second-best match (Lowe's ratio test).
+MAX_DISTANCE_RATIO = 0.8
+
 
 class InertialEstimator:
     """`PositionEstimator` that only propagates the initial state; always VALID."""
@@ -44,6 +47,7 @@ class InertialEstimator:
         return self._answer(self._filter.time_s)
 
     def _answer(self, time_s: float) -> PositionEstimate:
+        """Return the propagated state at a time."""
         return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s))
 
 
@@ -62,17 +66,20 @@ class FeatureEstimator(InertialEstimator):
         pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
         heights = sample_raster(map_product.elevation_m, pixels[:, np.newaxis])[:, 0] if len(pixels) else np.empty(0)
         self._points = np.column_stack([map_product.origin_m + map_product.pixel_m * pixels, heights])
-        self._is_valid = False
+        self._is_valid = False  # whether a pose was found in this descent
         self._altitude_m: float | None = None
 
     def altitude(self, measurement: AltitudeMeasurement) -> None:
-        """Store the altitude, which determines the scale at which an image is matched; ignored as in `image`."""
+        """Store the altitude, which determines the scale at which an image is matched.
+
+        An altitude is ignored if its time is outside the inertial data.
+        """
         if not self._filter.is_stored(measurement.time_s):
             return
         self._altitude_m = measurement.altitude_m
 
     def image(self, image: DetectorImage) -> PositionEstimate:
-        """Estimate the pose from features, and update the position."""
+        """Estimate the pose from features, and update the position. Without a pose, return the propagated state."""
         if not self._filter.is_stored(image.time_s):
             return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)
         state = self._filter.state_at(image.time_s)
@@ -97,7 +104,7 @@ class FeatureEstimator(InertialEstimator):
         good = [
             first
             for first, second in (pair for pair in pairs if len(pair) == 2)
-            if first.distance < 0.8 * second.distance
+            if first.distance < MAX_DISTANCE_RATIO * second.distance
         ]
         if len(good) < self.options.min_matches:
             return None
@@ -114,6 +121,7 @@ class FeatureEstimator(InertialEstimator):
             normalised,
             np.eye(3),
             None,
+            # two pixels of the binned image, in normalised coordinates
             reprojectionError=2.0 * image.pixel_angle_rad * image.camera.size[0] / scaled.camera.size[0],
             iterationsCount=2000,
             confidence=0.999,
@@ -124,6 +132,7 @@ class FeatureEstimator(InertialEstimator):
         return origin - (matrix.T @ translation).ravel(), len(inliers)
 
     def _answer(self, time_s: float, details: LocalisationDetails | None = None) -> PositionEstimate:
+        """Return the state at a time; NO_COARSE_FIX before the first pose."""
         if not self._is_valid:
             return PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s, details=details)
         return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s), details=details)

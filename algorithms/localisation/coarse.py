@@ -3,11 +3,11 @@
 The error of the inertial position is constant over the few seconds between the images. Each patch is rectified with
 the estimated attitude and the altimeter's height, and correlated with the map at every offset of the position:
 
-1. Patches on a horizontal plane give surfaces of correlation over the offset. Candidates are maxima of the sum of the
-   surfaces, each replaced by its maximum within a tolerance, because relief shifts patches differently.
+1. Each patch, rectified to a horizontal plane, gives a correlation surface over the offset. Candidates are maxima of
+   the sum of the surfaces. Before, a maximum filter widens each surface, because relief shifts patches differently.
 2. For each candidate, the patches are rectified again onto the map's elevation there, and matched near the candidate.
-   Patches whose offsets agree within a small tolerance are consistent. The candidate with the largest support is
-   accepted if it has enough consistent patches and no other candidate has a similar support.
+   Patches whose offsets agree within a small tolerance are consistent; the sum of their scores is the support. The
+   candidate with the largest support is accepted if it has enough consistent patches and no other a similar support.
 3. The offsets of the accepted candidate are tested against the errors that the state's covariance allows
    (`consistency`). Patches with a wrong attitude agree on a wrong offset, but not within the stated errors.
 """
@@ -50,12 +50,12 @@ from marsyard.algorithms.localisation.rectification import (
 #: Support of the structure tensor for the contrast of a patch, coarse pixels, and spacing of candidate patches.
 _CONTRAST_SUPPORT_PX = 5
 _PATCH_STEP_PX = 8
-#: Minimum distance of two patches of an image, and fraction of a small footprint's side for one patch.
+#: Minimum distance of two patches of an image, in sides of a patch; largest side of a patch, as a fraction of the side
+#: of the image's footprint.
 _PATCH_SPACING = 0.75
 _FOOTPRINT_FRACTION = 0.4
 #: Minimum standard deviation of a patch relative to its mean: below it, only noise and rounding remain (assumed).
 _MIN_PATCH_CONTRAST = 1e-3
-
 
 #: Correlation over offsets (rows, columns).
 Surface = Float[np.ndarray, "_ _"]
@@ -175,10 +175,10 @@ def find_coarse_position(
     # differences from the mean keep the precision of float32 sums
     appearance = grid.appearance - grid.appearance.mean()
     radius = int(np.ceil(min(options.search_radius_m, options.search_sigmas * sd_m) / grid.pixel_m))
-    surfaces = np.stack([_correlate(patch, appearance, radius) for patch in patches])
+    surfaces = np.stack([_correlate_patch(patch, appearance, radius) for patch in patches])
     peaks = _candidate_offsets(surfaces, radius, grid.pixel_m, options)
-    candidates = [_verify(peak, patches, views, grid, appearance, options) for peak in peaks]
-    return _decide(candidates, patches, views, grid, radius, covariance, options)
+    candidates = [_verify_candidate(peak, patches, views, grid, appearance, options) for peak in peaks]
+    return _accept_best_candidate(candidates, patches, views, grid, radius, covariance, options)
 
 
 def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, options: LvsOptions) -> list[_Patch]:
@@ -205,16 +205,16 @@ def _select_patches(rectified: RectifiedImage, grid: MapProduct, number: int, op
     while len(patches) < options.patches_per_image and scores.max(initial=-1.0) > 0.0:
         i, j = np.unravel_index(int(np.argmax(scores)), scores.shape)
         row, column = int(rows[i]), int(columns[j])
-        part = values[row : row + side, column : column + side]
-        if part.std() >= _MIN_PATCH_CONTRAST * mean:
-            patches.append(_Patch((int(map_columns[j]), int(map_rows[i])), part, number))
+        square = values[row : row + side, column : column + side]
+        if square.std() >= _MIN_PATCH_CONTRAST * mean:
+            patches.append(_Patch((int(map_columns[j]), int(map_rows[i])), square, number))
         near_rows = np.abs(rows - row) < _PATCH_SPACING * side
         near_columns = np.abs(columns - column) < _PATCH_SPACING * side
         scores[near_rows[:, np.newaxis] & near_columns] = -1.0
     return patches
 
 
-def _correlate(patch: _Patch, appearance: Raster, radius: int) -> Float[np.ndarray, "n n"]:
+def _correlate_patch(patch: _Patch, appearance: Raster, radius: int) -> Float[np.ndarray, "n n"]:
     """Normalised correlation of a patch at all offsets up to `radius` (rows, columns); -1 outside map and circle."""
     column, row = patch.corner
     rows, columns = appearance.shape
@@ -247,7 +247,7 @@ def _candidate_offsets(
         limit = max(options.coarse_min_score, options.alternative_score * float(surface.max()))
         values = cv2.dilate(surface, kernel)
         support += np.where(values >= limit, values, np.float32(0.0))
-    # equal support over an area: its centre has the highest mean
+    # where the support is equal over an area, the blurred support selects the area's centre
     smooth = support + 1e-3 * cv2.blur(support, (2 * tolerance + 1, 2 * tolerance + 1))
     offsets: list[Vector2] = []
     rows, columns = np.mgrid[: smooth.shape[0], : smooth.shape[1]]
@@ -258,7 +258,7 @@ def _candidate_offsets(
     return offsets
 
 
-def _verify(
+def _verify_candidate(
     offset_m: Vector2,
     patches: Sequence[_Patch],
     views: Sequence[GroundView],
@@ -284,10 +284,10 @@ def _verify(
         candidate = _find_consensus(candidate.offset_m, offsets, scores, options)
         if not candidate.count:
             return candidate
-    return replace(candidate, repetition=_repetition(surfaces, options.relief_tolerance_m / grid.pixel_m))
+    return replace(candidate, repetition=_compute_repetition(surfaces, options.relief_tolerance_m / grid.pixel_m))
 
 
-def _repetition(surfaces: Sequence[Surface], exclusion_px: float) -> float:
+def _compute_repetition(surfaces: Sequence[Surface], exclusion_px: float) -> float:
     """Ratio of the second-highest local maximum of the mean of surfaces to the maximum; 0 without surfaces."""
     if not surfaces:
         return 0.0
@@ -348,7 +348,7 @@ def _find_consensus(start_m: Vector2, offsets_m: Points2, scores: Vector, option
     return _Candidate(mean, offsets_m, scores, consistent)
 
 
-def _decide(
+def _accept_best_candidate(
     candidates: list[_Candidate],
     patches: Sequence[_Patch],
     views: Sequence[GroundView],
@@ -357,13 +357,13 @@ def _decide(
     covariance: Float[np.ndarray, "9 9"],
     options: LvsOptions,
 ) -> CoarseFix | CoarseRefusal:
-    """Accept the candidate with the largest support, or state why there is none."""
+    """Accept the candidate with the largest support, or return the reason for refusing it."""
     ranked = sorted(candidates, key=lambda candidate: candidate.support, reverse=True)
     if not ranked or ranked[0].count < max(options.min_consistent_patches, 1):
         return CoarseRefusal.NO_CONSENSUS
     best = ranked[0]
     distances = [float(np.linalg.norm(other.offset_m - best.offset_m)) for other in ranked]
-    # a candidate that moved to the same offset is no alternative
+    # candidates that converged to the same offset are not alternatives
     others = [c.support for c, d in zip(ranked, distances, strict=True) if d > 2.0 * options.relief_tolerance_m]
     second = max(others, default=0.0)
     if second > options.max_second_support * best.support or best.repetition > options.alternative_score:
@@ -379,7 +379,7 @@ def _decide(
     best = replace(best, offset_m=mean, consistent=consistent)
     return CoarseFix(
         offset_m=best.offset_m,
-        covariance=_covariance(best, patches, views, grid, options),
+        covariance=_offset_covariance(best, patches, views, grid, options),
         matches=_collect_matches(best, patches, grid),
         support=best.support,
         second_support=second,
@@ -424,16 +424,16 @@ def _matching_sd_m(grid: MapProduct) -> float:
     return grid.pixel_m / float(np.sqrt(12.0))
 
 
-def _covariance(
+def _offset_covariance(
     best: _Candidate, patches: Sequence[_Patch], views: Sequence[GroundView], grid: MapProduct, options: LvsOptions
 ) -> Float[np.ndarray, "2 2"]:
-    """Covariance of the offset. Patches of different images show the same ground: images are not independent."""
+    """Covariance of the offset. Only the patches of one image are independent: all images show the same ground."""
     offsets = best.offsets_m[best.consistent]
     scatter = np.cov(offsets.T) if len(offsets) > 2 else np.eye(2) * options.relief_tolerance_m**2
-    independent = max(len(offsets) / max(len(views), 1), 1.0)
+    patches_per_image = max(len(offsets) / max(len(views), 1), 1.0)
     height = float(np.mean([view.camera.c[2] for view in views]))
     common = (options.attitude_sd_rad * height) ** 2 + grid.distortion_sd_m**2
-    return np.asarray(scatter / independent + (common + _matching_sd_m(grid) ** 2) * np.eye(2))
+    return np.asarray(scatter / patches_per_image + (common + _matching_sd_m(grid) ** 2) * np.eye(2))
 
 
 def _collect_matches(best: _Candidate, patches: Sequence[_Patch], grid: MapProduct) -> CoarseMatches:

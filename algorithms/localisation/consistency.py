@@ -1,4 +1,4 @@
-"""Consistency of the coarse stage's patches with the errors that the covariance of the navigation state allows.
+"""Chi-square test of the coarse stage's patch offsets against the covariance of the navigation state.
 
 An image is rectified with the estimated attitude and position and the measured height. A patch at the ground point G
 lies in the direction d = G - C from the camera, at the height H above it. To first order, with the errors of position
@@ -49,7 +49,7 @@ class PatchGeometry:
 
 @dataclass(frozen=True)
 class OffsetErrors:
-    """Standard deviations of the errors that are no errors of the navigation state.
+    """Standard deviations of the errors that are not in the navigation state.
 
     - height_m: height of each patch's camera above the ground, as measured
     - distortion_m, elevation_m: errors of the map
@@ -74,7 +74,8 @@ def offset_covariance(
     of their area that overlaps.
     """
     count = len(patches.images)
-    tangents = patches.lines_m[:, :2] / -patches.lines_m[:, 2:]
+    tangents = patches.lines_m[:, :2] / -patches.lines_m[:, 2:]  # d_h / H
+    # horizontal shift of a patch by a displacement (east, north, up) of its line of sight
     project = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), tangents[:, :, np.newaxis]], axis=2)
     jacobian = np.zeros((count, _AXES, 9))
     jacobian[:, :, POSITION] = np.eye(2, 3)
@@ -82,26 +83,26 @@ def offset_covariance(
     # e x d = -[d]x e
     jacobian[:, :, ATTITUDE] = project @ -cross_matrix(patches.lines_m)
     flat = jacobian.reshape(-1, 9)
-    radial = (tangents * errors.height_m[:, np.newaxis]).reshape(-1)
+    height = (tangents * errors.height_m[:, np.newaxis]).reshape(-1)
     same_image = (patches.images[:, np.newaxis] == patches.images).astype(np.float64)
     overlap = _overlap(patches)
     elevation = errors.elevation_m * tangents.reshape(-1)
 
-    def spread(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
+    def repeat_for_axes(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
         """Repeat the value of each pair of patches for all pairs of their coordinates."""
         return np.repeat(np.repeat(matrix, _AXES, axis=0), _AXES, axis=1)
 
     return np.asarray(
         flat @ state_covariance @ flat.T
-        + np.outer(radial, radial) * (1.0 + spread(same_image))
-        + np.outer(elevation, elevation) * spread(overlap)
+        + np.outer(height, height) * (1.0 + repeat_for_axes(same_image))
+        + np.outer(elevation, elevation) * repeat_for_axes(overlap)
         + errors.distortion_m**2 * np.kron(overlap, np.eye(_AXES))
         + errors.matching_m**2 * np.eye(_AXES * count)
     )
 
 
 def _overlap(patches: PatchGeometry) -> Float[np.ndarray, "n n"]:
-    """Area that two squares share / geometric mean of their areas: positive semidefinite, as a product of functions."""
+    """Correlation of the map's errors in two squares: their common area / geometric mean of their areas."""
     low, high = (patches.centres_m + sign * 0.5 * patches.sides_m[:, np.newaxis] for sign in (-1.0, 1.0))
     lengths = np.minimum(high[:, np.newaxis], high) - np.maximum(low[:, np.newaxis], low)
     areas = np.prod(np.maximum(lengths, 0.0), axis=2)
@@ -112,8 +113,8 @@ def _overlap(patches: PatchGeometry) -> Float[np.ndarray, "n n"]:
 class Consistency:
     """Result of the test.
 
-    - members: patches that are no outliers
-    - normalised_square, limit: of the members' offsets, and its quantile of chi-square
+    - members: whether each patch is kept (not an outlier)
+    - normalised_square, limit: o' S^-1 o of the members' offsets, and the quantile of chi-square that it must not reach
     - outlier_probability: probability that at least as many wrong patches as removed are near the others by chance
     - false_refusal: probability to refuse correct patches, of each of the two tests
     """
@@ -154,7 +155,8 @@ def check_offsets(
        distribution: the removal of many patches would leave those that agree with a wrong state.
     3. The normalised square of the remaining offsets is compared with the quantile of chi-square.
 
-    - offsets_m: of the patches near each other; distant: number of the other patches, whose offsets are wrong
+    - offsets_m: offsets of the patches that agree with each other
+    - distant: number of the other patches, whose offsets are wrong
     """
     members = np.ones(len(offsets_m), dtype=bool)
     while True:
@@ -164,16 +166,16 @@ def check_offsets(
         weighted = precision @ values
         count = int(np.count_nonzero(members))
         removed = len(members) - count
-        # 1 without a removed patch
+        # binomial probability of at least `removed` agreements by chance; 1 without a removed patch
         chance = float(bdtrc(removed - 1, removed + distant, test.chance_agreement)) if removed else 1.0
         limit = float(chdtri(len(values), test.false_refusal))
         result = Consistency(members, float(values @ weighted), limit, chance, test.false_refusal)
         if count < 2:
             return result
-        # of a Gaussian vector: residual and covariance of one part predicted from the others
+        # normalised square of each patch's residual from its prediction by the others (conditional Gaussian)
         blocks = precision.reshape(count, _AXES, count, _AXES)[np.arange(count), :, np.arange(count), :]
-        parts = weighted.reshape(count, _AXES)
-        squares = np.einsum("ni,ni->n", parts, np.linalg.solve(blocks, parts[..., np.newaxis])[..., 0])
+        vectors = weighted.reshape(count, _AXES)
+        squares = np.einsum("ni,ni->n", vectors, np.linalg.solve(blocks, vectors[..., np.newaxis])[..., 0])
         worst = int(np.argmax(squares))
         if squares[worst] < chdtri(_AXES, test.outlier_probability):
             return result

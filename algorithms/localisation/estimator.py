@@ -4,8 +4,9 @@
 2. The coarse stage matches large patches of the first images over the whole uncertainty of the position.
 3. The fine stage matches landmarks of the map in each further image; they update the filter.
 
-The sources of the steps and of the options are in `marsyard.algorithms.localisation.options`. After a coarse fix whose
-landmarks are inconsistent in several images, the state of inertial navigation returns and the coarse stage is repeated.
+The sources of the steps and of the options are in `marsyard.algorithms.localisation.options`. If the fine stage fails
+in several consecutive images, the fix is discarded: the filter returns to the state of pure inertial navigation, and
+the coarse stage is repeated.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class MapRelativeEstimator:
         """Reset the state for a new descent, and select the landmarks of the map."""
         self._map = map_product
         self._landmarks: Landmarks = select_landmarks(map_product, self.options)
-        # without updates by images: the state to which a wrong coarse fix returns
+        # pure inertial navigation: the filter returns to it when a coarse fix is discarded
         self._inertial = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
         self._filter = self._inertial
         self._has_fix = False
@@ -118,12 +119,13 @@ class MapRelativeEstimator:
     ) -> PositionEstimate:
         """Match landmarks and update the state; after several failures the coarse stage is repeated."""
         options, covariance = self.options, self._filter.state_at(image.time_s).covariance
-        position_sd_m = np.sqrt(np.diag(covariance)[:3])
+        position_sd_m = np.sqrt(np.diag(covariance)[:3])  # east, north, up
         matches = match_landmarks(posed, self._landmarks, self._map, position_sd_m, options)
         if len(matches) == 0:
-            return self._fail(image.time_s, LocalisationDetails("fine", coarse_offset), is_contradicted=False)
+            return self._count_failure(image.time_s, LocalisationDetails("fine", coarse_offset), is_contradicted=False)
         point_sd_m = np.array([self._map.distortion_sd_m, self._map.distortion_sd_m, self._map.elevation_sd_m])
         height_m = max(float(posed.position_m[2]) - elevation_at(self._map, posed.position_m[:2]), 0.0)
+        # error common to all landmarks of an image: of the map, and of the camera's alignment (horizontal)
         common_sd_m = np.hypot(
             options.common_fraction * point_sd_m, height_m * options.calibration_sd_rad * np.array([1.0, 1.0, 0.0])
         )
@@ -147,12 +149,12 @@ class MapRelativeEstimator:
             result.inliers,
         )
         if result.outcome is not UpdateOutcome.APPLIED:
-            return self._fail(image.time_s, details, is_contradicted=True)
+            return self._count_failure(image.time_s, details, is_contradicted=True)
         self._failures, self._is_contradicted, self._last_update_s = 0, False, image.time_s
         return self._answer(image.time_s, details)
 
-    def _fail(self, time_s: float, details: LocalisationDetails, *, is_contradicted: bool) -> PositionEstimate:
-        """Answer to an image without an update: after several of them, the fix is given up.
+    def _count_failure(self, time_s: float, details: LocalisationDetails, *, is_contradicted: bool) -> PositionEstimate:
+        """Count an image without an update, and return its answer; after `max_failures` of them, discard the fix.
 
         Landmarks that contradict the state make its covariance doubtful: no position is reported until the next update.
         """
@@ -190,9 +192,9 @@ class MapRelativeEstimator:
     def _update_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Update the state by an altitude above the map's elevation."""
         sd_m = float(np.hypot(self.options.altitude_sd * measurement.altitude_m, self._map.elevation_sd_m))
-        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, self._ground, sd_m)
+        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, self._ground_height, sd_m)
 
-    def _ground(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
+    def _ground_height(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
         """Elevation of the map and its slope (east, north) at a position."""
         step = _SLOPE_PX * self._map.pixel_m
         height = elevation_at(self._map, position_m)

@@ -47,7 +47,9 @@ from marsyard.algorithms.localisation.interface import (
 )
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 
+#: JSON files of an image and of a map.
 IMAGE_FILE, MAP_FILE = "image.json", "map.json"
+#: Numbers of `MapProduct` in the map file, and allowed keys of an estimate.
 _MAP_KEYS = ("pixel_m", "registration_sd_m", "distortion_sd_m", "elevation_sd_m")
 _ANSWER_KEYS = {"outcome", "time_s", "position_m", "velocity_m_s", "world_from_body_xyzw", "covariance"}
 #: Largest difference of a quaternion's norm from 1 in an answer.
@@ -65,7 +67,7 @@ class ExecutablePositionEstimator:
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         self._session = Session(replace(command, persistent=False), limits)
-        self._total = ProgramDetails("", 0.0)
+        self._total = ProgramDetails("", 0.0)  # standard error and time of all answers of a descent
         self._start_s = -math.inf
         self.request_time_s = 0.0
 
@@ -73,27 +75,29 @@ class ExecutablePositionEstimator:
         """Start a new descent: send the initial state and the map."""
         self._total, self._start_s = ProgramDetails("", 0.0), initial.time_s
         files = {"map": lambda folder: write_map(folder, map_product)}
-        self._session.send_request("start", {"initial": encode_initial(initial)}, self._timed(_read_none), files)
+        self._session.send_request("start", {"initial": encode_initial(initial)}, self._record_time(_read_none), files)
 
     def imu(self, increments: ImuIncrements) -> None:
         """Send the next inertial increments."""
-        self._session.send_request("imu", {"increments": encode_increments(increments)}, self._timed(_read_none))
+        self._session.send_request("imu", {"increments": encode_increments(increments)}, self._record_time(_read_none))
 
     def altitude(self, measurement: AltitudeMeasurement) -> None:
         """Send an altitude."""
-        self._session.send_request("altitude", {"altitude": encode_altitude(measurement)}, self._timed(_read_none))
+        self._session.send_request(
+            "altitude", {"altitude": encode_altitude(measurement)}, self._record_time(_read_none)
+        )
 
     def image(self, image: DetectorImage) -> PositionEstimate:
         """Send the next image; return the program's estimate, with the standard error and time of this answer."""
         files = {"image": lambda folder: write_image(folder, image)}
-        return self._session.send_request("image", {}, self._timed(self._read_estimate), files)
+        return self._session.send_request("image", {}, self._record_time(self._read_estimate), files)
 
     def finish(self) -> PositionEstimate:
         """Return the final estimate; its details contain the standard error and the time of the whole descent."""
-        answer = self._session.send_request("finish", {}, self._timed(self._read_estimate))
+        answer = self._session.send_request("finish", {}, self._record_time(self._read_estimate))
         return replace(answer, details=self._total)
 
-    def _timed(self, read: AnswerReader[Answer]) -> AnswerReader[Answer]:
+    def _record_time(self, read: AnswerReader[Answer]) -> AnswerReader[Answer]:
         """Return a reader that also adds the answer's standard error and time to those of the descent."""
 
         def read_timed(answer: Mapping[str, Any], details: ProgramDetails) -> Answer:
@@ -105,12 +109,14 @@ class ExecutablePositionEstimator:
         return read_timed
 
     def _read_estimate(self, answer: Mapping[str, Any], details: ProgramDetails) -> PositionEstimate:
+        """Decode and validate an estimate."""
         estimate = read_estimate(answer)
         # the end of the inertial data is not known here
         return check_estimate(replace(estimate, details=details), (self._start_s, math.inf))
 
 
 def _read_none(answer: Mapping[str, Any], _details: ProgramDetails) -> None:
+    """Check the answer to a request that expects no estimate."""
     check_keys(answer, {"outcome"})
     if answer.get("outcome", "") is not None:
         raise bad_answer(f"outcome is {answer.get('outcome')!r}; only image and finish have an outcome; allowed: null")

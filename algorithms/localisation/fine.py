@@ -5,6 +5,9 @@ the predicted landmark are intersected with the map's elevation, and the map's a
 Template and image have the working scale: the image is binned so that a pixel at the nadir is about one map pixel.
 Normalised correlation finds the template's displacement in whole pixels, and least-squares registration refines it.
 A common correction of position and attitude explains the displacements of correct matches; others are rejected.
+
+If the uncertainty of the pose requires a large search window, an acquisition step first corrects the pose by fewer
+landmarks, in an image that is binned further.
 """
 
 from __future__ import annotations
@@ -72,11 +75,14 @@ class LandmarkMatches:
 
 
 @dataclass(frozen=True)
-class _Search:
+class _SearchResult:
     """Landmarks searched at one scale.
 
-    - indices: in the map's landmarks; predicted_px and displacements_px: working pixels
-    - accepted: flags of an accepted score and a peak inside the window
+    - indices: in the map's landmarks
+    - predicted_px, displacements_px: predicted position, and measured minus predicted position, pixels of this scale
+    - accepted: whether the score is high enough and the peak inside the window
+    - camera: camera of the binned image in the world frame
+    - factor: pixels of the delivered image per pixel of this scale
     """
 
     indices: Int[np.ndarray, "n"]
@@ -105,32 +111,33 @@ def match_landmarks(
         options.attitude_sd_rad / image.pixel_angle_rad,
     )
     half_px = options.search_sigmas_fine * float(sigma_px) / factor
-    corrected, coarser = image, _acquisition_factor(image, factor, half_px, options)
+    corrected, extra_binning = image, _acquisition_factor(image, factor, half_px, options)
     if half_px > options.min_half_width_px:
-        # templates from a wrong position are distorted and biased: the pose is corrected first, also at full scale
-        half = min(int(np.ceil(half_px / coarser)) + 1, 2 * options.max_half_width_px)
-        search = _search_landmarks(corrected, landmarks, map_product, factor * coarser, half, True, options)
-        fit = _fit(corrected, landmarks, search, prior_sd, _ACQUISITION_TOLERANCE, options)
+        # templates rendered from a wrong position are distorted, which biases the match: correct the pose first, even
+        # if no extra binning is needed
+        half = min(int(np.ceil(half_px / extra_binning)) + 1, 2 * options.max_half_width_px)
+        search = _search_landmarks(corrected, landmarks, map_product, factor * extra_binning, half, True, options)
+        fit = _fit_correction(corrected, landmarks, search, prior_sd, _ACQUISITION_TOLERANCE, options)
         if fit is None:
             return _no_matches(factor, search)
         corrected = corrected.correct(fit.translation_m, fit.rotation_rad)
         half_px = 0.0
     half = int(np.clip(np.ceil(half_px), options.min_half_width_px, options.max_half_width_px))
     search = _search_landmarks(corrected, landmarks, map_product, factor, half, False, options)
-    fit = _fit(corrected, landmarks, search, prior_sd, 1.0, options)
-    return _no_matches(factor, search) if fit is None else _collect(image, corrected, landmarks, search, fit)
+    fit = _fit_correction(corrected, landmarks, search, prior_sd, 1.0, options)
+    return _no_matches(factor, search) if fit is None else _build_matches(image, corrected, landmarks, search, fit)
 
 
 def _acquisition_factor(image: PosedImage, factor: int, half_px: float, options: LvsOptions) -> int:
     """Additional binning that reduces the search half width to the maximum, as far as the image's size permits."""
-    coarser = 1
+    extra_binning = 1
     columns, rows = image.camera.size
-    while half_px / coarser > options.max_half_width_px:
-        total = 2 * coarser * factor
+    while half_px / extra_binning > options.max_half_width_px:
+        total = 2 * extra_binning * factor
         if columns % total or rows % total or min(columns, rows) // total < options.min_working_px:
             break
-        coarser *= 2
-    return coarser
+        extra_binning *= 2
+    return extra_binning
 
 
 def _search_landmarks(
@@ -141,15 +148,18 @@ def _search_landmarks(
     half: int,
     acquisition: bool,
     options: LvsOptions,
-) -> _Search:
-    """Search landmarks in windows of `half` pixels around their predictions, in an image binned by `factor`."""
+) -> _SearchResult:
+    """Search landmarks in windows of half width `half` around their predictions, in an image binned by `factor`.
+
+    An acquisition searches fewer landmarks and omits the least-squares registration.
+    """
     working = image.bin(factor)
     camera = working.world_camera
     ground_m = elevation_at(map_product, image.position_m[:2])
-    reach = options.template_px // 2 + half + 1
+    margin_px = options.template_px // 2 + half + 1
     count = options.acquisition_landmarks if acquisition else options.max_landmarks
     indices, predicted = visible_landmarks(
-        landmarks, working, camera, ground_m, reach, count, options.max_off_nadir_rad
+        landmarks, working, camera, ground_m, margin_px, count, options.max_off_nadir_rad
     )
     corners = np.rint(predicted).astype(np.int64) - options.template_px // 2
     points = landmarks.points_m[indices]
@@ -160,7 +170,7 @@ def _search_landmarks(
         match = _match_template(templates[k], working.radiance, corners[k], half, acquisition, options)
         if match is not None:
             displacements[k], scores[k] = match
-    return _Search(indices, predicted, displacements, scores, scores >= options.min_score, camera, factor)
+    return _SearchResult(indices, predicted, displacements, scores, scores >= options.min_score, camera, factor)
 
 
 def render_templates(
@@ -223,15 +233,19 @@ def _match_template(
     return np.array([column - corner[0], row - corner[1]]), float(registration.score)
 
 
-def _fit(
+def _fit_correction(
     image: PosedImage,
     landmarks: Landmarks,
-    search: _Search,
+    search: _SearchResult,
     prior_sd: Float[np.ndarray, "6"],
     tolerance: float,
     options: LvsOptions,
 ) -> PoseFit | None:
-    """Fit the common correction to the accepted matches; None if too few are consistent."""
+    """Fit the common correction to the accepted matches; None if too few are consistent.
+
+    `prior_sd` are standard deviations of position (m) and attitude (rad); the residual limit is multiplied by
+    `tolerance`.
+    """
     accepted = search.accepted
     count = int(np.count_nonzero(accepted))
     if count < options.min_matches:
@@ -245,15 +259,16 @@ def _fit(
     return fit if enough else None
 
 
-def _collect(
-    image: PosedImage, corrected: PosedImage, landmarks: Landmarks, search: _Search, fit: PoseFit
+def _build_matches(
+    image: PosedImage, corrected: PosedImage, landmarks: Landmarks, search: _SearchResult, fit: PoseFit
 ) -> LandmarkMatches:
+    """Convert the consistent matches to pixels of the delivered image; the correction is relative to `image`."""
     rows = np.flatnonzero(search.accepted)[fit.consistent]
     points = landmarks.points_m[search.indices[rows]]
     factor = search.factor
     working_px = search.predicted_px[rows] + search.displacements_px[rows]
     predicted, _ = image.world_camera.project(points)
-    turn = (corrected.world_from_body * image.world_from_body.inv()).as_rotvec()
+    rotation = (corrected.world_from_body * image.world_from_body.inv()).as_rotvec()
     return LandmarkMatches(
         indices=search.indices[rows],
         points_m=points,
@@ -265,11 +280,12 @@ def _collect(
         attempted=len(search.indices),
         accepted=int(np.count_nonzero(search.accepted)),
         translation_m=corrected.position_m - image.position_m + fit.translation_m,
-        rotation_rad=turn + fit.rotation_rad,
+        rotation_rad=rotation + fit.rotation_rad,
     )
 
 
-def _no_matches(factor: int, search: _Search) -> LandmarkMatches:
+def _no_matches(factor: int, search: _SearchResult) -> LandmarkMatches:
+    """Return the result of a search whose matches are too few or inconsistent."""
     points, pixels = np.empty((0, 3)), np.empty((0, 2))
     accepted = int(np.count_nonzero(search.accepted))
     empty = np.empty(0, dtype=np.int64)

@@ -45,6 +45,8 @@ class ImuErrorModel:
     The defaults are those of an LN-200 (Northrop Grumman's data sheet: bias repeatability from 1 deg/h and from 0.3 mg,
     bias instability, random walks, scale factors, misalignment).
 
+    - gyro_wander_deg_h, gyro_wander_s: standard deviation and correlation time of a Gauss-Markov bias that is added to
+      the constant bias; the same for accelerometer_wander_mg and accelerometer_wander_s
     - sensitivity_correlation_s: time over which rate and force are nearly constant, assumed. An error of scale or
       misalignment s acts like white noise of the density s * force * sqrt(2 * sensitivity_correlation_s).
     """
@@ -126,7 +128,7 @@ class NavigationState:
 
 @dataclass(frozen=True)
 class IncrementHistory:
-    """Consecutive increments between strictly increasing time tags; the other members are those of `ImuIncrements`."""
+    """Consecutive increments between strictly increasing time tags; the fields are those of `ImuIncrements`."""
 
     times_s: Float[np.ndarray, "m"]
     period_s: float
@@ -250,6 +252,7 @@ def symmetrise(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def _accumulate(start: Vector, steps: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Compute the values after 0, 1, 2, ... n steps."""
     return np.cumsum(np.concatenate([start[None], steps]), axis=0)
 
 

@@ -14,7 +14,7 @@ from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.sim.camera import CameraModel
 
-#: Candidates per selected landmark below which cells of the next smaller size are used.
+#: Minimum number of cells in the image's footprint per selected landmark; determines the level of the cells.
 _CANDIDATES_PER_LANDMARK = 6
 
 
@@ -37,7 +37,7 @@ class Landmarks:
 def select_landmarks(map_product: MapProduct, options: LvsOptions) -> Landmarks:
     """Select the pixel with the highest Harris interest in each cell of the map; computed once per map.
 
-    Cells without contrast, and pixels closer to the border than a template's diagonal, have no landmark.
+    Cells without contrast, and pixels closer to the border than a template's side, have no landmark.
     """
     interest = harris_interest(*structure_tensor(map_product.appearance, options.landmark_support_px))
     interest = interest / max(float(np.abs(map_product.appearance.mean())), np.finfo(np.float32).tiny)
@@ -70,9 +70,11 @@ def _best_of_cells(interest: Raster, side: int) -> tuple[Int[np.ndarray, "n"], I
 def _compute_levels(
     rows: Int[np.ndarray, "n"], columns: Int[np.ndarray, "n"], values: Vector, side: int, max_level: int = 6
 ) -> Int[np.ndarray, "n"]:
+    """Compute `Landmarks.levels`: at each level, the best landmark of each doubled cell remains."""
     levels = np.zeros(len(values), dtype=np.int64)
     remaining = np.argsort(-values, kind="stable")
     for level in range(1, max_level + 1):
+        # one integer per cell, from the cell's row and column
         cells = (rows[remaining] // (side << level)) * (1 << 32) + columns[remaining] // (side << level)
         remaining = remaining[np.sort(np.unique(cells, return_index=True)[1])]
         levels[remaining] = level

@@ -6,8 +6,8 @@ the covariance.
 
 The result of an image is available up to a second after its exposure. An update refers to the time tag of its
 measurement: the filter goes back to the stored state before that time, and repeats all later increments and updates.
-Hence the order in which measurements arrive has no effect on the result. Covariances are propagated between the lines
-of a fixed grid of times and the times of updates, therefore the division of increments into calls has no effect either.
+Hence the order in which measurements arrive has no effect on the result. The covariance is propagated in steps that end
+at the times of a fixed grid and of updates; therefore the division of increments into calls has no effect either.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class FilterOptions:
     - gates: limits of the updates
     - altitude_sd_m: standard deviation of an altitude including the map's elevation, if the call gives none
     - pixel_sd: standard deviation of a landmark's pixel per axis, if the call gives none
-    - step_s: time between the lines of the grid on which the covariance is propagated. At 0.5 rad/s a step of 0.1 s
-      neglects rotations of 0.05 rad in the small terms that `compute_transition` names.
+    - step_s: step of the time grid on which the covariance is propagated. At 0.5 rad/s a step of 0.1 s neglects
+      rotations of 0.05 rad in the small terms that `compute_transition` names.
     - memory_s: time for which states and increments are stored for delayed updates
     - max_extrapolation_s: maximum time of a measurement after the last increment, or of an increment's tag from the end
       of the previous ones; a few sample intervals
@@ -139,8 +139,8 @@ class NavigationFilter:
             ramp = _MIN_INTERVAL_S * np.arange(len(tags))
             tags = np.maximum.accumulate(tags - ramp) + ramp
         self._history = IncrementHistory(tags, increments.period_s, angles, velocities)
-        self._advance()
-        self._forget()
+        self._store_checkpoints()
+        self._discard_old_states()
 
     def is_stored(self, time_s: float) -> bool:
         """Whether a time is in the stored history, so that a state exists and a measurement can be processed."""
@@ -155,7 +155,7 @@ class NavigationFilter:
         if not self.is_stored(time_s):
             allowed = f"{self.memory_start_s:.4f} s to {self.time_s:.4f} s"
             raise ValueError(f"time {time_s:.4f} s is outside of the stored history; allowed: {allowed}")
-        return self._run(self._checkpoints[self._last_before(time_s)], time_s)[-1].state
+        return self._propagate_and_update(self._checkpoints[self._last_checkpoint_before(time_s)], time_s)[-1].state
 
     def estimate(
         self, time_s: float
@@ -251,26 +251,26 @@ class NavigationFilter:
         self._checkpoints = [checkpoint for checkpoint in self._checkpoints if checkpoint.state.time_s <= time_s]
         if time_s <= self.time_s:
             self._checkpoints.append(_Checkpoint(state, index + 1))
-            self._advance()
+            self._store_checkpoints()
         return result
 
-    def _last_before(self, time_s: float) -> int:
+    def _last_checkpoint_before(self, time_s: float) -> int:
         """Return the index of the last checkpoint at or before a time."""
         return bisect_right([checkpoint.state.time_s for checkpoint in self._checkpoints], time_s) - 1
 
-    def _advance(self) -> None:
-        """Store checkpoints up to the last line of the grid and the last update within the increments."""
+    def _store_checkpoints(self) -> None:
+        """Store checkpoints up to the last time of the grid and the last update within the increments."""
         options, last = self._options, self._checkpoints[-1]
         pending = self._update_times_s[last.updates : bisect_right(self._update_times_s, self.time_s)]
-        line_s = self._start_s + options.step_s * np.floor((self.time_s - self._start_s) / options.step_s)
-        end_s = max([float(line_s), *pending])
+        grid_time_s = self._start_s + options.step_s * np.floor((self.time_s - self._start_s) / options.step_s)
+        end_s = max([float(grid_time_s), *pending])
         if end_s > last.state.time_s:
-            self._checkpoints += self._run(last, end_s)
+            self._checkpoints += self._propagate_and_update(last, end_s)
 
-    def _run(self, checkpoint: _Checkpoint, end_s: float) -> list[_Checkpoint]:
-        """Propagate from a checkpoint to a time and apply the updates up to it; return the checkpoints on the way.
+    def _propagate_and_update(self, checkpoint: _Checkpoint, end_s: float) -> list[_Checkpoint]:
+        """Propagate from a checkpoint to a time and apply the updates up to it; return the new checkpoints.
 
-        The last one is at the end time. If nothing is to be done, it is the given checkpoint.
+        The last one is at the end time. If the given checkpoint already is, it is returned alone.
         """
         state, count = checkpoint.state, checkpoint.updates
         results = [checkpoint]
@@ -284,19 +284,19 @@ class NavigationFilter:
         return results[1:] if len(results) > 1 else results
 
     def _propagate(self, state: NavigationState, end_s: float) -> list[NavigationState]:
-        """Propagate a state to the lines of the grid before a time, and to that time."""
+        """Propagate a state to the times of the grid before a time, and to that time."""
         if self._history is None or end_s <= state.time_s:
             return []
         first, last = ((time_s - self._start_s) / self._options.step_s for time_s in (state.time_s, end_s))
-        lines = self._start_s + self._options.step_s * np.arange(np.floor(first), np.ceil(last) + 1.0)
-        times = np.append(lines[(lines > state.time_s) & (lines < end_s)], end_s)
+        grid = self._start_s + self._options.step_s * np.arange(np.floor(first), np.ceil(last) + 1.0)
+        times = np.append(grid[(grid > state.time_s) & (grid < end_s)], end_s)
         return propagate_states(state, self._history, times, self._gravity_m_s2, self._options.imu)
 
-    def _forget(self) -> None:
+    def _discard_old_states(self) -> None:
         """Remove states and increments that are older than the memory."""
         history = self._history
         first_s = max(self.time_s - self._options.memory_s, self.memory_start_s)
-        self._checkpoints = self._checkpoints[self._last_before(first_s) :]
+        self._checkpoints = self._checkpoints[self._last_checkpoint_before(first_s) :]
         if history is not None:
             interval = int(np.searchsorted(history.times_s, self.memory_start_s, side="right")) - 1
             start = min(max(interval, 0), len(history.delta_angles_rad) - 1)

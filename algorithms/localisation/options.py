@@ -45,9 +45,9 @@ class LvsOptions:
       sum of the scores of the consistent patches (assumed)
 
     - patch_outlier_probability: Probability to remove a correct patch from the consistent ones, by its residual from
-      the prediction of the others (assumed; that of a landmark in `GateOptions`)
+      the prediction of the others (assumed; the value for a landmark in `GateOptions`)
     - false_refusal: Probability to refuse a correct coarse fix because its patches do not fit the stated errors of
-      state, altitudes and map (assumed; that of a position in `GateOptions`)
+      state, altitudes and map (assumed; the value for a position in `GateOptions`)
 
     Fine stage:
 
@@ -77,7 +77,8 @@ class LvsOptions:
     - coarse_altitudes: Number of last altitudes that update the state after the coarse stage
     - imu: Errors of the inertial unit, for the filter
     - landmark_sd_px: Standard deviation of a landmark per axis, working pixels
-    - common_fraction: Common part of the map's distortion and elevation error in one image / its standard deviation
+    - common_fraction: Standard deviation of the map error that is common to all landmarks of an image, as a fraction of
+      the standard deviations of the map's distortion and elevation
     - calibration_sd_rad: Standard deviation of the error of all lines of sight by the calibration and alignment of the
       camera, per axis: half a pixel of the image centre, and 0.02 deg
     - correlated_images: Number of images whose common errors are equal. The filter treats these errors as independent

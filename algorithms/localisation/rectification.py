@@ -24,8 +24,8 @@ def bin_map(map_product: MapProduct, factor: int) -> MapProduct:
     rows, columns = (extent // factor for extent in map_product.appearance.shape)
 
     def average(raster: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
-        part = np.ascontiguousarray(raster[: rows * factor, : columns * factor])
-        return np.asarray(cv2.resize(part, (columns, rows), interpolation=cv2.INTER_AREA))
+        cropped = np.ascontiguousarray(raster[: rows * factor, : columns * factor])
+        return np.asarray(cv2.resize(cropped, (columns, rows), interpolation=cv2.INTER_AREA))
 
     return replace(
         map_product,
@@ -75,8 +75,8 @@ def view_ground(image: PosedImage, height_above_ground_m: float, pixel_m: float)
 def rectify_to_plane(view: GroundView, grid: MapProduct, max_off_nadir_rad: float) -> RectifiedImage:
     """Resample the whole image to the grid of a map, assuming level ground."""
     height = float(view.camera.c[2])
-    reach = height * np.tan(max_off_nadir_rad)
-    low, high = map_pixels(grid, view.camera.c[:2] - reach), map_pixels(grid, view.camera.c[:2] + reach)
+    radius = height * np.tan(max_off_nadir_rad)
+    low, high = map_pixels(grid, view.camera.c[:2] - radius), map_pixels(grid, view.camera.c[:2] + radius)
     corner = np.floor(low).astype(np.int64)
     nodes = (np.ceil(high).astype(np.int64) - corner) // _NODE_STEP + 2
     columns, rows = corner[0] + _NODE_STEP * np.arange(nodes[0]), corner[1] + _NODE_STEP * np.arange(nodes[1])
@@ -87,10 +87,11 @@ def rectify_to_plane(view: GroundView, grid: MapProduct, max_off_nadir_rad: floa
     )
     pixels, visible = view.camera.project(ground)
     off_nadir = np.hypot(*np.moveaxis(ground[..., :2] - view.camera.c[:2], -1, 0))
-    usable = visible & view.camera.in_frame(pixels) & (off_nadir <= reach)
+    usable = visible & view.camera.in_frame(pixels) & (off_nadir <= radius)
     size = (_NODE_STEP * (len(columns) - 1), _NODE_STEP * (len(rows) - 1))
     positions = np.arange(size[0]) / _NODE_STEP, np.arange(size[1]) / _NODE_STEP
     lattice = np.stack(np.meshgrid(*positions), axis=-1)
+    # image pixels (u, v) of all grid pixels, interpolated between the nodes
     fine = np.stack([sample_raster(pixels[..., k].astype(np.float32), lattice) for k in (0, 1)], axis=-1)
     # a pixel is valid if all nodes around it are
     valid = sample_raster(usable.astype(np.float32), lattice) > 0.999

@@ -43,7 +43,7 @@ GroundModel = Callable[[Float[np.ndarray, "2"]], GroundHeight] | GroundHeight
 _POSITION, _ATTITUDE, _COMMON = slice(0, 3), slice(3, 6), slice(6, 9)
 #: Independent components of the state that one image measures: position and attitude.
 _OBSERVED = 6
-#: Variances of position (100 km) and attitude (10 rad) that do not constrain a motion.
+#: Variances of position (100 km) and attitude (10 rad) that remove the prior knowledge of both if they are added.
 _FREE_VARIANCES = np.zeros(ERRORS)
 _FREE_VARIANCES[POSITION], _FREE_VARIANCES[ATTITUDE] = 1e5**2, 10.0**2
 
@@ -130,7 +130,7 @@ class LandmarkMeasurement:
 class Linearisation:
     """Landmarks linearised at a pose.
 
-    - visible: whether the point has a projection and the measured pixel is finite; zeros in the other members if not
+    - visible: whether the point has a projection and the measured pixel is finite; residual and Jacobian are 0 if not
     - residuals: measured minus expected pixels
     - jacobian: derivatives of the expected pixels with respect to position, attitude error and common error
     - noise: covariance of pixel noise and independent point error
@@ -207,9 +207,9 @@ def update_landmarks(
     1. Landmarks whose innovation is improbable before the update are rejected.
     2. Robust estimation by graduated non-convexity with truncated least squares (Yang et al. 2020, "Graduated
        Non-Convexity for Robust Spatial Perception"): the limit on residuals decreases from the largest to its final
-       value, so that a minimum of all landmarks is followed to that of the inliers.
+       value, so that the solution moves gradually from the fit of all landmarks to that of the inliers.
     3. Ordinary estimation by the inliers, which are selected again from all landmarks by their residuals until they do
-       not change. An improbable common error thereby does not remove the correct landmarks of step 1.
+       not change. Correct landmarks that step 1 rejected because of a large common error are thereby used again.
 
     Each estimation is iterated (Gauss-Newton), hence the update is that of an iterated Kalman filter.
     """
@@ -333,7 +333,7 @@ class _LandmarkProblem:
 def _estimate_robustly(
     problem: _LandmarkProblem, candidates: Bool[np.ndarray, "n"], limit: float, options: GateOptions
 ) -> tuple[Bool[np.ndarray, "n"], Float[np.ndarray, "18"]]:
-    """Find the inliers among the candidates, and the whitened errors, by graduated non-convexity (equation 14)."""
+    """Find the inliers among the candidates, and the whitened errors, by graduated non-convexity (Yang, Eq. 14)."""
     weights = candidates.astype(np.float64)
     solution = problem.solve(weights, np.zeros(ERRORS + 3))
     largest = float(solution.squares[candidates].max())
@@ -347,7 +347,7 @@ def _estimate_robustly(
         solution = problem.solve(weights, solution.whitened, iterations=1)
         if np.all((weights == 0.0) | (weights == 1.0)):
             break
-        control *= 1.4
+        control *= 1.4  # Yang et al., remark 5
     return weights > 0.5, solution.whitened
 
 

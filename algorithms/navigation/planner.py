@@ -6,7 +6,7 @@ Maimone, Leger & Biesiadecki 2007). It is not under test. It uses estimated pose
 
 - A single navcam pair, 45 deg wide, is too narrow to pass a near obstacle; two pairs are enough (section 6). The ground
   directly in front of the cameras is not imaged: the rover drives the first metres of a map over unmapped ground
-  (section 7.3).
+  (section 7.3), which the caller fills with a plane (`TerrainMap.add_plane`).
 - Rocks that wheels can climb are not hazards. The ground around the target is excluded if the target is on a large rock
   (section 6).
 
@@ -34,6 +34,11 @@ AT_GOAL_M = 0.02
 _MAX_HEADING_RAD = np.radians(75.0)
 #: Candidate turns in place, deg, in addition to the turn towards the goal.
 _TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 80.0, -80.0, 100.0, -100.0)
+#: Number of candidate curvatures and of candidate lengths of the first arc, and its maximum length as a fraction of the
+#: distance to the goal.
+_GRID_COUNT, _MAX_FIRST_FRACTION = 9, 0.75
+#: Distance between checked points of a path, metres, and number of points of a returned path.
+_CHECK_STEP_M, _PATH_POINTS = 0.1, 60
 
 
 @dataclass(frozen=True)
@@ -125,10 +130,10 @@ def navigate(
     if np.isnan(goodness.at(position[None])[0]):
         return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), no_path)
     for path in _generate_paths(goal, options):
-        lookahead_distances = np.arange(0.0, min(path.length_m, options.lookahead_m), 0.1)
+        lookahead_distances = np.arange(0.0, min(path.length_m, options.lookahead_m), _CHECK_STEP_M)
         lookahead_points = position + path.points(lookahead_distances) @ world_from_forward.T
         if _is_clear(lookahead_points, goodness, options):
-            path_distances = np.linspace(0.0, path.length_m, 60)
+            path_distances = np.linspace(0.0, path.length_m, _PATH_POINTS)
             path_points = np.asarray(position + path.points(path_distances) @ world_from_forward.T)
             return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), path_points)
     return NavigationPlan(NavigationOutcome.NO_PATH, (), no_path)
@@ -179,6 +184,7 @@ def _arc_positions(curvature_per_m: float, distances_m: Float[np.ndarray, "n"]) 
 
 
 def _rotation_matrix(angle_rad: float) -> Float[np.ndarray, "2 2"]:
+    """Return the matrix of a rotation in the plane, counterclockwise."""
     sine, cosine = np.sin(angle_rad), np.cos(angle_rad)
     return np.array([[cosine, -sine], [sine, cosine]])
 
@@ -190,8 +196,8 @@ def _generate_paths(goal: Float[np.ndarray, "2"], options: NavigationOptions) ->
     """
     goal_direction = float(np.arctan2(goal[1], goal[0]))
     turns = np.concatenate([np.radians(_TURNS_DEG), [goal_direction]])
-    curvatures = options.max_curvature_per_m * np.linspace(-1.0, 1.0, 9)
-    lengths = 0.75 * float(np.hypot(*goal)) * np.linspace(0.0, 1.0, 9)
+    curvatures = options.max_curvature_per_m * np.linspace(-1.0, 1.0, _GRID_COUNT)
+    lengths = _MAX_FIRST_FRACTION * float(np.hypot(*goal)) * np.linspace(0.0, 1.0, _GRID_COUNT)
     turn, curvature_1, length_1 = (grid.ravel() for grid in np.meshgrid(turns, curvatures, lengths, indexing="ij"))
     # the end of the first arc, and distance and direction from it to the goal
     half_turn = 0.5 * curvature_1 * length_1

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float64
 
 from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector2
 
-#: Side of a cell, metres (GESTALT: 0.2 m), and half the side of the map.
+#: Side of a cell (GESTALT: 0.2 m) and half the side of the map (assumed), metres.
 CELL_M, HALF_SIDE_M = 0.2, 20.0
 #: Minimum number of points in a cell, and quantiles of their heights that give a cell's lower and upper height: single
 #: false matches have no effect.
@@ -106,7 +106,7 @@ class TerrainMap:
     def add_plane(
         self, centre_m: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"], radius_m: float
     ) -> TerrainMap:
-        """Return the map with a plane in the unmapped cells of a disc: ground under the rover, which operators know."""
+        """Return the map with a plane in the unmapped cells of a disc, for the ground that the rover stands on."""
         axis = self.corner_m[:, None] + CELL_M * np.arange(len(self.median_m))
         east, north = np.meshgrid(axis[0] - centre_m[0], axis[1] - centre_m[1])
         heights = centre_m[2] - (normal[0] * east + normal[1] * north) / normal[2]

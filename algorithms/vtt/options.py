@@ -47,7 +47,7 @@ class VttOptions:
       2%"); on steep ground without visual odometry up to 1 is required.
     - direction_error_rad: Error of the direction to the target, from attitude and mast, in the tolerance of the
       position (default 1.7 deg)
-    - min_tolerance_m: Part of both tolerances that does not depend on distance: terrain relief around a drifted match,
+    - min_tolerance_m: Constant term of the tolerances of distance and position: terrain relief around a drifted match,
       and mast pointing errors
     - max_lost_updates: Consecutive updates after a loss in which the target can be recovered (paper: N, default 2)
     """

@@ -1,4 +1,8 @@
-"""Run all checks, print them and write docs/validation.md: ``python -m benchmarks.validation [--only NAME]``."""
+"""Run all validation checks, print the results and write docs/validation.md.
+
+Usage: ``python -m benchmarks.validation [--only NAME]``. A check compares measured properties of the simulation with
+limits (`records`).
+"""
 
 from __future__ import annotations
 
@@ -55,6 +59,7 @@ def _parse_arguments() -> argparse.Namespace:
 
 
 def _print_table(console: Console, title: str, measures: list[Measure]) -> None:
+    """Print the measurements of one check."""
     table = Table(title=title, title_justify="left")
     for column in ("property", "limit", "measured", "", "method"):
         table.add_column(column, overflow="fold")
@@ -66,6 +71,7 @@ def _print_table(console: Console, title: str, measures: list[Measure]) -> None:
 
 
 def main() -> int:
+    """Run the selected checks. Returns 1 if a limit is missed."""
     arguments = _parse_arguments()
     console = Console()
     results: dict[str, list[Measure]] = {}

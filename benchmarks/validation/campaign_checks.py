@@ -20,6 +20,7 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store.table import read_rows
 
+#: Campaign file of the scenario with random faults (`chaos`).
 CAMPAIGN_TEXT = """
 name = "chaos"
 scenario = "benchmarks.validation.chaos:ChaosScenario"
@@ -64,7 +65,10 @@ def check_rows(quick: bool) -> Iterator[Measure]:
 def _compare_executors(
     campaign: str, folder: Path, settings: Sequence[str], kills: int, population: str
 ) -> Iterator[Measure]:
-    """Compare the rows of each executor, of interrupted runs and of replays with those of one worker."""
+    """Compare the rows of each executor, of interrupted runs and of replays with those of one worker.
+
+    `settings` change the campaign file; `population` describes the cases in the table of results.
+    """
     folder.mkdir()
     expected_rows = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
     cases = len(expected_rows)
@@ -126,12 +130,14 @@ def check_survival(quick: bool) -> Iterator[Measure]:
 
 
 def _draw_fault(campaign: Any, case: int) -> str:
+    """Draw the fault of a case as in the campaign; empty for a case without fault."""
     parameters = campaign.parameters(case)
     assert isinstance(parameters, ChaosParameters)
     return draw_fault(parameters, campaign.streams(case))
 
 
 def _write_campaign(folder: Path) -> Path:
+    """Write `CAMPAIGN_TEXT` to a file."""
     path = folder / "chaos.toml"
     path.write_text(CAMPAIGN_TEXT)
     return path
@@ -140,6 +146,7 @@ def _write_campaign(folder: Path) -> Path:
 def _run_campaign(
     campaign: str | Path, directory: Path, executor: ExecutorConfig, settings: Sequence[str]
 ) -> list[dict[str, Any]]:
+    """Run a campaign with changed settings; return its rows."""
     run_campaign(load_campaign(str(campaign), settings), directory, executor, SilentProgress())
     return read_rows(directory / "cases.parquet")
 
@@ -149,7 +156,7 @@ def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kil
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", campaign, "--out", str(directory), "--jobs", "2"]
-    command += [part for setting in settings for part in ("--set", setting)]
+    command += [argument for setting in settings for argument in ("--set", setting)]
     for _ in range(kills):
         runner = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while not (directory / "campaign.json").exists() and runner.poll() is None:

@@ -15,6 +15,7 @@ from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes import DimesOptions
 
+#: Seed of the simulated descents.
 SEED = 4002
 #: Required fraction of descents with a correct velocity or none, and required velocity error.
 REQUIRED_FRACTION = 0.995

@@ -28,7 +28,10 @@ def format_number(value: float) -> str:
 
 
 def format_value(measure: Measure, value: float) -> str:
-    """Format a value with its unit; fractions with a lower limit are formatted in per cent."""
+    """Format a value with its unit; fractions with a lower limit are formatted in per cent.
+
+    The units "" (fraction) and "1" (other number without a unit) are explained in `Measure`.
+    """
     if measure.unit == "1":
         return f"{value:.3g}"
     if measure.sense == "at least":
@@ -48,6 +51,7 @@ def store(results: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
 
 
 def _read_environment(quick: bool) -> dict[str, str]:
+    """Return machine, OpenGL library, package versions and number of samples of the measurements."""
     return {
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, {processor_features()}",
         "gl": renderer().description(),

@@ -17,12 +17,13 @@ from scipy.interpolate import BSpline
 PATCH, HALF = 31, 15
 #: Standard deviation of the smoothing of both images, pixels.
 SIGMA_PX = 1.0
-#: Margin around a patch for its shift and the support of the quintic spline.
+#: Minimum distance of a patch's centre from the image border: half width, shift and support of the quintic spline.
 MARGIN = HALF + 6
 
 
 @cache
 def _quintic_spline() -> tuple[BSpline, BSpline]:
+    """Quintic B-spline with its centre at 0, and its derivative."""
     basis = BSpline.basis_element(np.arange(-3.0, 4.0), extrapolate=False)
     return basis, basis.derivative()
 
@@ -137,6 +138,7 @@ def peak_fits(first: np.ndarray, second: np.ndarray, centres: np.ndarray) -> tup
 
 
 def _normalise(patches: np.ndarray) -> np.ndarray:
+    """Subtract the mean of each patch and divide by its norm."""
     deviation = patches - patches.mean(axis=(1, 2), keepdims=True, dtype=np.float64)
     return deviation / np.sqrt(np.sum(deviation**2, axis=(1, 2), keepdims=True))
 

@@ -1,8 +1,8 @@
 """Checks of the simulated world: statistics of rendered images compared with those of images from Mars.
 
 The limits are derived from Spirit's descent images (the public copies, which have 843 x 843 pixels), HiRISE
-orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images; for
-these the checks are no predictions. A "flown" value is one of images from Mars.
+orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images: there
+the agreement is no independent test. "Flown" values were measured in images from Mars.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
 
 
 def _render_statistics(site: str, camera: str, **settings: float | int) -> ImageStatistics:
+    """Compute the statistics of one rendered image; `settings` are those of `ImageRequest`."""
     image = render_images(ImageRequest.from_defaults(site, camera, **settings), both=False)[0]
     return compute_image_statistics(image.to_uint16().astype(np.float64))
 
 
-def run_descent(quick: bool) -> Iterator[Measure]:
+def compare_descent_images(quick: bool) -> Iterator[Measure]:
     """Compare descent images over Gusev and Meridiani with Spirit's descent images."""
     for site in ("gusev", "meridiani"):
         seeds = range(1, 4 if quick else 21)
@@ -53,7 +54,7 @@ def run_descent(quick: bool) -> Iterator[Measure]:
         )
 
 
-def run_mast(quick: bool) -> Iterator[Measure]:
+def compare_mast_images(quick: bool) -> Iterator[Measure]:
     """Compare mast images with those of both rovers."""
     for site, reference in (("gusev", "Spirit: 0.061 to 0.065"), ("meridiani", "Opportunity: 0.046 to 0.055")):
         seeds = range(1, 2 if quick else 6)
@@ -76,7 +77,7 @@ FLOWN_WIDTHS_PX, FLOWN_SECOND_PEAKS = (3.3, 15.6), (0.40, 0.82)
 FLOWN_REFUSED_FRACTION = (0.006, 0.806)
 
 
-def run_templates(quick: bool) -> Iterator[Measure]:
+def compare_templates(quick: bool) -> Iterator[Measure]:
     """Compare the correlation peaks of DIMES' templates in `dimes-gusev` with those of the four flown templates.
 
     The range of the simulated values must contain the range of the flown values.
@@ -103,7 +104,7 @@ def run_templates(quick: bool) -> Iterator[Measure]:
 
 
 CHECKS = (
-    Check("flight", "Images from Mars", run_descent),
-    Check("flight-templates", "Images from Mars", run_templates),
-    Check("flight-mast", "Images from Mars", run_mast),
+    Check("flight", "Images from Mars", compare_descent_images),
+    Check("flight-templates", "Images from Mars", compare_templates),
+    Check("flight-mast", "Images from Mars", compare_mast_images),
 )

@@ -31,10 +31,10 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.render import Scene
 from marsyard.sim.terrain import Surface
 
+#: Shared libraries of the OpenGL backends.
 LIBRARIES = {"osmesa": "libOSMesa.so.8", "egl": "libEGL.so.1"}
-#: Maximum second difference of the ranges of a pixel and two opposite neighbours, divided by the range; larger values
-#: mark silhouettes.
-#: For smooth ground seen from a mast at 3 deg it is smaller.
+#: Maximum second difference of the ranges of a pixel and two opposite neighbours, divided by the range. Larger values
+#: mark silhouettes; smooth ground seen from a mast at 3 deg above the surface has smaller values.
 MAX_RANGE_CURVATURE = 0.003
 #: Maximum number of terrain samples per pixel along the line of sight; above it the renderer smooths the ground.
 MAX_SAMPLES_PER_PIXEL = 8.0
@@ -126,7 +126,7 @@ class Ranges:
 
 
 def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Ranges:
-    """Compute the ranges at random pixels, up to the range `max_range_m`.
+    """Compute the ranges at `count` random pixels, up to the range `max_range_m`; `step` is that of `Ground.cast`, m.
 
     The independent ray casting also detects silhouettes: the ranges of a pixel and of opposite neighbours are not
     collinear, or some rays hit an object and some the ground. Oblique pixels that cover many terrain samples are
@@ -141,7 +141,7 @@ def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Rang
     camera, ground = view.camera.transform(view.world_from_body), Ground(view.scene.surface)
 
     def cast(right: float, down: float) -> tuple[np.ndarray, np.ndarray]:
-        """Ranges at shifted pixels, and whether the ray hits an object."""
+        """Ranges at pixels shifted by `right` and `down` pixels, and whether the ray hits an object."""
         origins, directions = camera.rays(pixels + np.array([right, down]))
         origins = np.array(origins)
         hits = ground.cast(origins, directions, 1.3 * max_range_m, step)
@@ -165,6 +165,7 @@ def cast_ranges(view: View, count: int, max_range_m: float, step: float) -> Rang
 
 
 def _measure_ranges(name: str, view: View, count: int, max_range_m: float, step: float) -> Measure:
+    """Measure the agreement of the ranges of `cast_ranges`."""
     ranges = cast_ranges(view, count, max_range_m, step)
     how = (
         f"{ranges.reference_m.size} random pixels; excluded: {ranges.silhouette_fraction:.1%} near silhouettes, "

@@ -1,4 +1,4 @@
-"""A scenario with faults of a custom algorithm that damage the process or other cases."""
+"""A scenario with faults of a custom algorithm that damage the process or other cases; used by the soak test."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ _remaining_objects: list[Any] = []
 
 
 class HostileParameters(BaseModel):
+    """Parameter of the fault injection."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     misbehaving: float = Field(default=0.0, ge=0.0, le=1.0, description="fraction of cases that misbehave")
@@ -86,7 +88,7 @@ def _kill_supervisor() -> None:
 
 
 def _loop_in_c() -> None:
-    # backtracks 2^64 times in C
+    """Match a regular expression that backtracks 2^64 times in C."""
     re.match("(a+)+$", "a" * 64 + "b")
 
 
@@ -120,17 +122,20 @@ def _raise_long_message() -> None:
 
 
 def _close_stream() -> None:
+    """Close standard output."""
     sys.stdout.close()
 
 
 def _change_inputs() -> None:
+    """Change the inputs of an algorithm although they are read-only."""
     input_copy = InputCopy([np.ones(9)])
     input_copy.inputs[0].flags.writeable = True
     input_copy.inputs[0][:] = 0.0
     input_copy.check()
 
 
-#: Entry of `_remaining_objects` after a case that changed the state of this process.
+#: Marker in `_remaining_objects`, a state of the process that the engine does not compare: a later case that finds the
+#: marker fails.
 _CHANGED_STATE = "changed state"
 
 #: Faults of misbehaving cases and their expected outcomes; a VALID case must have the row of a healthy case.

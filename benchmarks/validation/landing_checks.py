@@ -18,8 +18,9 @@ from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 
+#: Seed of the random streams of all image pairs.
 SEED = 20050107
-#: Terrain banks of the sites, as in the campaigns.
+#: Number of terrains and seed of each site's terrain bank, as in the campaigns.
 BANK = {"bank": 8, "bank_seed": 1}
 SITES = ("heli-benign", "heli-hazardous")
 #: Limits of rms errors: rotation; baseline divided by its length; elevation divided by the height.

@@ -22,7 +22,9 @@ from marsyard.sim.terrain import Surface
 
 #: Brightness is albedo times the cosine of incidence in sunlight, and 0 in shadow.
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
+#: Albedo of the ground in checks that do not compare albedos.
 FLAT_ALBEDO = 0.2
+#: Maximum range of compared pixels from a mast.
 MAX_MAST_RANGE_M = 40.0
 #: Reflectance laws of the check, by name.
 LAWS = {
@@ -34,6 +36,7 @@ LAWS = {
 
 
 def _make_flat_surface(albedo: float = FLAT_ALBEDO) -> Surface:
+    """Create level ground with uniform albedo."""
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = albedo
     return Surface.from_samples(samples, 64.0)
@@ -88,7 +91,7 @@ def make_uniform(view: View, sun: Sun) -> View:
 
 
 def _compare_shadows(name: str, view: View, sun: Sun, count: int, max_range_m: float, step: float) -> Measure:
-    """Compare cast shadows at random pixels with those of independent ray casting."""
+    """Compare cast shadows at `count` random pixels with independent ray casting in steps of `step` metres."""
     view = make_uniform(view, sun)
     frame = render(renderer(), view)
     points = frame.points_world().reshape(-1, 3)
@@ -253,6 +256,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
 
 
 def _render_from_above(scene: Scene, camera: CameraModel, position: np.ndarray, time_s: float) -> np.ndarray:
+    """Render the radiance from 2 km above a position (east, north), m."""
     pose = rigid(Rotation.identity(), np.array([*position, 2000.0]))
     return renderer().render(scene, PixelRays.from_camera(camera), pose, time_s).radiance.astype(np.float64)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+#: Limit divided by the measured value.
 FACTOR = 3.0
 
 #: Measured value per claim, the larger of both OpenGL backends (x86_64, llvmpipe of Mesa 22.3.6).

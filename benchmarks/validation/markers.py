@@ -170,6 +170,7 @@ def measure_marker_errors(renderer: Renderer, camera: CameraModel, seed: int, co
 
 
 def main() -> None:
+    """Measure the markers of all cameras; the arguments are the backend and the number of markers."""
     backend, count = sys.argv[1], int(sys.argv[2])
     renderer = Renderer(backend)  # type: ignore[arg-type]
     errors = {}

@@ -17,6 +17,7 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, Renderer, Scene
 
+#: Motions of the image centre.
 STEPS_PX = np.linspace(0.0, 1.0, 11)
 #: Maximum relative difference of the motions within a patch; larger values mark an edge.
 MAX_MOTION_RANGE = 0.1
@@ -93,8 +94,8 @@ def supersample(renderer: Renderer, view: View, samples: int) -> np.ndarray:
     for row in range(0, rows, step):
         for column in range(0, columns, step):
             size = (min(step, columns - column), min(step, rows - row))
-            part = fine.crop(column * samples, row * samples, (size[0] * samples, size[1] * samples))
-            radiance = renderer.render(view.scene, view.rays(part), view.world_from_body).radiance
+            tile = fine.crop(column * samples, row * samples, (size[0] * samples, size[1] * samples))
+            radiance = renderer.render(view.scene, view.rays(tile), view.world_from_body).radiance
             blocks = radiance.reshape(size[1], samples, size[0], samples)
             image[row : row + size[1], column : column + size[0]] = blocks.mean(axis=(1, 3), dtype=np.float64)
     return image
@@ -120,6 +121,7 @@ def compute_true_motion(frame: Frame, view: View, target: View) -> np.ndarray:
 
 
 def _extract_patches(values: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Extract the patches around `centres` (u, v), shape (n, PATCH, PATCH, ...)."""
     offsets = np.arange(-HALF, HALF + 1)
     return values[(centres[:, 1, None] + offsets)[:, :, None], (centres[:, 0, None] + offsets)[:, None, :]]
 

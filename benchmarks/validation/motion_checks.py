@@ -21,17 +21,19 @@ QUICK_CONTROL_LIMIT_PX = 0.005
 DESCENT_HEIGHT_M = 2000.0
 #: Height at which a pixel of the descent camera is 0.25 m; the orthoimage has 0.5 m.
 TILE_HEIGHT_M = 300.0
+#: Distances of the mast camera from a large rock.
 DISTANCES_M = (10.0, 5.0, 2.0)
 #: Distances at which the image contains the outline of the rock.
 OUTLINE_DISTANCES_M = (10.0, 5.0)
 ROCK_SITE = "gusev"
 #: Size of descent images, with 256 patches of 31 x 31.
 DESCENT_SIZE = (512, 512)
-#: Size of control images with 256 samples per pixel: 210 patches.
+#: Size of control images (210 patches), and samples per pixel and axis (256 samples per pixel).
 CONTROL_SIZE = (486, 455)
 CONTROL_SAMPLES = 16
 #: Steps of the control: maximum of pixel locking, and half a pixel.
 CONTROL_STEPS_PX = np.array([0.25, 0.5])
+#: Steps with the option --quick.
 QUICK_STEPS_PX = np.array([0.3, 0.5, 0.8])
 
 

@@ -1,4 +1,7 @@
-"""Simulated nightly runs ("nights") of campaigns whose cases share terrains in different ways."""
+"""Simulated nightly runs ("nights") of campaigns, to measure false alarms and detections of regressions.
+
+The campaigns differ in the assignment of cases to terrains: cases on one terrain are correlated.
+"""
 
 from __future__ import annotations
 

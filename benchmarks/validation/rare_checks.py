@@ -1,4 +1,7 @@
-"""Checks of subset simulation on limit states with known probabilities: coverage of intervals, and cost."""
+"""Checks of subset simulation on limit states with known probabilities: coverage of intervals, and cost.
+
+A limit state returns the margin of a case, which is negative if the requirement is violated.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ SAMPLES, REPLICATES, CONFIDENCE = 200, 6, 0.9
 MIN_COVERAGE, MIN_SAVINGS = 0.87, {1e-4: 8.0, 1e-6: 300.0}
 #: Probability below which a simulation stops; never reached here.
 LOWEST_LEVEL = 1e-9
+#: Probabilities of violation of the linear limit states.
 PROBABILITIES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 #: Function of coordinates and stream numbers that returns margins.
 LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -61,6 +61,7 @@ class Ground:
     def _cast_block(
         self, origins: np.ndarray, directions: np.ndarray, start: np.ndarray, stop: np.ndarray, step: float
     ) -> np.ndarray:
+        """Find the first point below ground on each ray between the distances `start` and `stop`, then bisect."""
         steps = int(np.ceil((stop - start).max() / step)) + 2
         t = start[:, None] + (stop - start)[:, None] * np.linspace(0.0, 1.0, steps)
         x, y, z = (origins[:, k, None] + t * directions[:, k, None] for k in range(3))
@@ -82,8 +83,8 @@ class Ground:
         is_occluded = np.zeros(len(points), dtype=bool)
         size = max(BLOCK // t.size, 1)
         for first in range(0, len(points), size):
-            part = points[first : first + size]
-            x, y, z = (part[:, k, None] + t * to_light[k] for k in range(3))
+            block = points[first : first + size]
+            x, y, z = (block[:, k, None] + t * to_light[k] for k in range(3))
             is_occluded[first : first + size] = (z - self.height(x, y) < 0.0).any(axis=1)
         return is_occluded
 

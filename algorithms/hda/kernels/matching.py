@@ -18,7 +18,7 @@ MIN_VARIANCE = 1e-6
 
 @njit(cache=True)
 def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int) -> float:
-    """Correlation (Eq. 3, section II.A) of two patches, each minus its mean.
+    """Correlation (Eq. 3, section II.A) of two patches, each minus its mean: twice the covariance / sum of variances.
 
     The patches have the half width `half` and the centres (r1, c1) and (r2, c2).
     """

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Damping above which the iteration ends without convergence.
-MAX_DAMPING = 1e12
+#: Levenberg-Marquardt damping: initial value, lower limit, and value above which the iteration ends unconverged.
+START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-12, 1e12
 #: Regularisation added to the Hessian diagonal of each inverse depth, as a fraction of the squared focal length. It
 #: keeps inverse depths fixed that are not observable because the camera does not move.
 DEPTH_CURVATURE = 1e-14
@@ -91,7 +91,7 @@ def residuals(matches: Matches, motion: Motion) -> Array:
 
 @njit(cache=True)
 def cauchy_cost(r: Array, scale: float) -> float:
-    """Sum of scale^2 / 2 log(1 + (r / scale)^2) over features."""
+    """Sum of scale^2 / 2 log(1 + (|r| / scale)^2) over the residuals r of the features, shape (n, 2)."""
     total = 0.0
     for i in range(r.shape[0]):
         total += math.log1p((r[i, 0] ** 2 + r[i, 1] ** 2) / scale**2)
@@ -102,7 +102,8 @@ def cauchy_cost(r: Array, scale: float) -> float:
 def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, Jm: Array, Jd: Array) -> None:
     """Jacobian of one residual: rotation (left perturbation) and translation (`Jm`, 2 x 6), inverse depth (`Jd`, 2).
 
-    (ax, ay, az) is R (x, y, 1), the feature's direction in the second camera's frame; pz is its depth times rho.
+    (ax, ay, az) is R (x, y, 1), the feature's direction in the second camera's frame; pz is rho times the feature's
+    depth in that frame.
     """
     ax = R[0, 0] * x + R[0, 1] * y + R[0, 2]
     ay = R[1, 0] * x + R[1, 1] * y + R[1, 2]
@@ -177,7 +178,7 @@ def solve(
     motion = start
     r = residuals(matches, motion)
     cost = cauchy_cost(r, matches.scale)
-    damping = 1e-3
+    damping = START_DAMPING
     for iteration in range(iterations):
         step, depth_steps = _compute_step(matches, r, motion, damping, with_depths)
         trial = Motion(rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
@@ -186,7 +187,7 @@ def solve(
         step_length = math.sqrt(np.sum(step * step))
         if new_cost <= cost:
             motion, r, cost = trial, new_r, new_cost
-            damping = max(damping * 0.1, 1e-12)
+            damping = max(damping * 0.1, MIN_DAMPING)
             if step_length < tolerance:
                 return motion, cost, True, iteration + 1
         elif step_length < tolerance:

@@ -101,7 +101,7 @@ def solve(lower: Array, values: Array) -> None:
 
 @njit(cache=True)
 def compose_with_inverse(warp: Array, change: Array) -> bool:
-    """Compose a warp with the inverse of the small warp ``identity + change``, in place; False if that is singular.
+    """Compose a warp with the inverse of the small warp ``identity + change``, in place; False if it is near singular.
 
     Both arrays have shape (2, 5): coefficients of y, x, y^2, y x and x^2. Products of quadratic terms are neglected,
     because they vanish at convergence.
@@ -144,8 +144,9 @@ def register(
 ) -> tuple[bool, float, float, float]:
     """Register a template (see `register_template`); return convergence, row and column of its centre, correlation.
 
-    `order` is 0 for a pure shift, 1 with affine terms, 2 also with quadratic terms. `limits` are the largest shift, the
-    largest warp size and the maximum number of steps.
+    The iteration starts with the template's centre at (`row`, `column`) of the spline `coefficients`. `order` is 0 for
+    a pure shift, 1 with affine terms, 2 also with quadratic terms. `limits` are the largest shift, the largest warp
+    size and the maximum number of steps.
     """
     side = template.shape[0]
     half = 0.5 * (side - 1)
