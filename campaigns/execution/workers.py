@@ -1,7 +1,7 @@
-"""Isolated worker processes: a crash, hang or memory overrun of one case cannot affect another.
+"""Isolated worker processes on this machine: a crash, hang or memory overrun of one case cannot affect another.
 
-Each worker is a loky executor (of joblib) with one process, also for `jobs=1`. If a worker dies, its executor
-identifies the batch, and its status board identifies the case; the other workers continue. The parent checks each
+Each worker is a loky executor (of joblib) with one process, which runs batches of cases. If a worker dies, its executor
+identifies the batch, and its status board (shared memory) identifies the case. The parent checks each
 worker about twenty times per second, and terminates a worker whose case exceeds a limit.
 """
 

@@ -88,8 +88,8 @@ class Design(Parameters):
 def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int) -> tuple[int, int, int, int] | None:
     """Return the position of a case in blocks of the sizes `blocks`; None for the nominal case.
 
-    The position consists of the index of the case's grid point, the first case and the number of cases at this point in
-    the block, and the index of the case among these cases.
+    The position is: index of the case's grid point; in its block, first case and number of cases at this grid point;
+    index of the case among these cases.
     """
     if design.nominal and case == 0:
         return None
