@@ -23,7 +23,7 @@ from marsyard.reports.section import (
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, format_fraction, label, number, split_unit
 
-#: Difference of the closure from 1 above which the contributions are not additive.
+#: Difference of the closure (contributions and remaining part divided by the total) from 1 that is reported.
 MAX_CLOSURE_ERROR = 0.1
 #: Title of the mean square without any source of error.
 REMAINING = "remaining without any source"

@@ -47,7 +47,7 @@ population = "all"
 #: Environment variable that identifies the processes of a soak test; its value is the folder of the test.
 _PROCESS_VARIABLE = "MARSYARD_SOAK"
 
-#: Maximum time per case, seconds; a case normally needs a tenth of it.
+#: Maximum mean time per case of an uninterrupted run, seconds; a case normally needs a tenth of it.
 _MAX_CASE_S = 20.0
 
 #: Maximum time until processes of a killed campaign have ended, seconds.

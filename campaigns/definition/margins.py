@@ -1,10 +1,12 @@
 """Margins of requirements: signed numbers that are below 0 if and only if a case violates its requirement.
 
 - A metric with a bound has the margin bound - |scale * metric|, in the unit of the bound.
-- A boolean metric has the margin of the requirement's `margin` column, or 1 and -1 without such a column.
+- A boolean metric has the margin of the requirement's `margin` column. Without such a column its margin is 1 if the
+  metric is true, and -1 if it is false or missing.
 - A case outside the population cannot violate the requirement: its margin is infinite. For the population `valid`,
   these are the finished cases without a valid answer.
-- An unfinished case, a missing value or a missing flag of the population is a violation: its margin is minus infinity.
+- An unfinished case, and a case without the flag of its population or the value of a bounded metric, violate the
+  requirement: their margin is minus infinity.
 """
 
 from __future__ import annotations

@@ -168,6 +168,7 @@ def intersect_rays(left: CameraModel, left_px: np.ndarray, right: CameraModel, r
 def main() -> None:
     """Answer the requests on standard input, one per line, until the input ends."""
     tracker = WholePixelTracker()
+    # "exchange" is the version of the exchange format (docs/custom-algorithms.md)
     print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
