@@ -1,7 +1,8 @@
 """Sections of the report of every campaign.
 
 Answers (availability), scatter (error ellipse), drivers (conditions that may affect errors or failures), convergence
-(estimates against the number of cases), consistency (covariances against errors), and faults (injected errors).
+(estimates against the number of cases), consistency (covariances against errors), and faults (dust on the
+window or bad pixels, for example).
 """
 
 from __future__ import annotations

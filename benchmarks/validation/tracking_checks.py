@@ -30,7 +30,7 @@ DRIFT_RMS_LIMIT_PX, DRIFT_MAX_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
 #: Maximum fraction of lost targets: 2 of 100 were lost, plus three standard deviations of this number, 4 of 100.
 LOST_LIMIT = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
-#: Parameters without errors of cameras, mast and odometry.
+#: Parameters of a run without errors of cameras, mast and odometry.
 NO_ERRORS: dict[str, Any] = {
     "stereo": dict.fromkeys(
         ("disparity_error_px", "epipolar_error_px", "alignment_deg", "roll_deg", "focal_error"), 0.0

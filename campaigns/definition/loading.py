@@ -441,6 +441,7 @@ def _collect_columns(campaign: Campaign) -> RowColumns | None:
         if path in configuration.dispersions:
             return None
         scores += [f"{label}_*" for label in labels(find_value(configuration.parameters, path))]
+    # boolean columns that the campaign file defines by name
     flags = find_value(configuration.parameters, columns.named_flags) if columns.named_flags else ()
     return replace(
         columns,

@@ -74,6 +74,7 @@ def run_case(configuration: str, selection: ProductSelection, points: Mapping[in
     conditions: dict[str, Scalar] = {}
 
     def record(columns: Mapping[str, Scalar]) -> None:
+        """Record columns that are known before the result, for the row of an unfinished case."""
         conditions.update(_convert_columns(columns))
         worker_process.record_note(json.dumps({"case": case, "conditions": conditions}))
 

@@ -325,9 +325,11 @@ class _Study:
             ]
             rows = self._runner.run(candidates)
             errors[:, list(cases)] = np.reshape([self._error(row) for row in rows], (len(cases), -1)).T
-            complete = rows[:: len(configurations)]
-            violations += sum(compute_margin(row, self._requirement) < 0.0 for row in complete)
-            terrains += [str(row.get("terrain", f"case {case}")) for case, row in zip(cases, complete, strict=True)]
+            # the first configuration is that with all sources
+            rows_all_sources = rows[:: len(configurations)]
+            violations += sum(compute_margin(row, self._requirement) < 0.0 for row in rows_all_sources)
+            names = [str(row.get("terrain", f"case {case}")) for case, row in zip(cases, rows_all_sources, strict=True)]
+            terrains += names
         return errors, np.unique(terrains, return_inverse=True)[1], violations
 
     def _run_design(self) -> tuple[tuple[SobolIndex, ...], int]:

@@ -228,7 +228,11 @@ _MAX_POINTS, _WIDTH_PX, _HEIGHT_PX = 24, 120.0, 26.0
 
 @dataclass(frozen=True)
 class Sparkline:
-    """Observed rates over time, oldest first: points of the line, last point, y of the required rate, and a text."""
+    """Line of the observed rates over time, oldest first, in pixels of an SVG image.
+
+    - points: points of the line as SVG text ("x,y x,y"); last: the last point
+    - required_y: y of the line of the required rate; text: description of the line
+    """
 
     points: str
     last: tuple[float, float]

@@ -36,6 +36,7 @@ _IN_PER_UNIT = 8.3 / 4.9
 _RECTIFIED_PX = 384
 #: Valid template numbers. The figure shows at most `_MAX_TRACKS` templates per pair; the table lists all.
 _TEMPLATE_NUMBERS = range(100)
+#: Matplotlib line style of tracks that failed a validity check: offset, and lengths of dash and gap.
 _DASHED = (0, (2, 1.5))
 
 
