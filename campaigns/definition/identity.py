@@ -1,7 +1,7 @@
 """Identity of a campaign: hashes and versions of all inputs, except the case number, that determine its rows.
 
 The module also describes the algorithms of a campaign for its record: class, version, options, hash of the sources.
-Custom parts are classes of users that replace motions, instruments or scores (docs/custom-parts.md).
+Custom parts are code of users that replaces the motion, an instrument or a score (docs/custom-parts.md).
 """
 
 from __future__ import annotations
