@@ -46,8 +46,9 @@ MAX_STRATIFIED = 2**20
 _SOBOL_BITS = 52
 #: Number of designs that a process caches, since successive cases use the same design.
 _CACHED_DESIGNS = 4
+#: Kinds of sampling designs, see above.
 Kind = Literal["random", "latin-hypercube", "sobol", "adaptive"]
-#: Kind of a study's folder: its cases are points that are stored with the rows.
+#: Kind of a study: it chooses its cases, whose points are stored with their rows.
 ADAPTIVE: Final = "adaptive"
 #: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
 CorrelatedGroup = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
