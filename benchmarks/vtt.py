@@ -1,4 +1,4 @@
-"""Run times of a tracking update, of its template search (also by OpenCV), and of a complete rover run."""
+"""Run times of visual target tracking: a tracking update, its template search (also by OpenCV), and a rover run."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ BATCH = 20
 
 
 def _simulate_stops(options: VttOptions) -> tuple[RoverMeasurements, RoverMeasurements]:
-    """Simulate the measurements of two stops, 10 % of the distance apart, in front of a slanted face."""
-    face = Plane(TARGET, np.array([-0.8, 0.0, 0.6]))
-    drive = Drive(Scene((face,), draw_waves(1), TARGET), navcam(), VisualTargetTracker(options))
+    """Simulate the measurements of two stops, 10 % of the distance apart, in front of a slanted, textured plane."""
+    plane = Plane(TARGET, np.array([-0.8, 0.0, 0.6]))
+    drive = Drive(Scene((plane,), draw_waves(seed=1), TARGET), navcam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(TARGET), pose(0.0, 0.0))
     for x in (0.0, 0.97):
         drive.stop(pose(x, 0.0))
@@ -92,7 +92,7 @@ def measure_searches(repeats: int) -> list[Measurement]:
         window = search_window(second.left, pixel, side)[0].astype(np.float64)
         template_32, window_32 = template.astype(np.float32), window.astype(np.float32)
         searches: dict[str, Callable[[], object]] = {
-            "coarse to fine": partial(coarse_to_fine_peak, template, window, 1, 6),
+            "coarse to fine": partial(coarse_to_fine_peak, template, window, levels=1, candidates=6),
             "at every position": partial(normalized_correlation, template, window),
             "by cv2.matchTemplate": partial(cv2.matchTemplate, window_32, template_32, cv2.TM_CCOEFF_NORMED),
         }

@@ -54,7 +54,11 @@ def suggest_similar(word: str, allowed: Iterable[str]) -> str:
 
 
 def unknown_name_message(kind: str, word: str, allowed: Iterable[str], listed_only: Iterable[str] | None = None) -> str:
-    """Create the message about an unknown word, with a similar word and the allowed words (or `listed_only`)."""
+    """Create the message about an unknown word, with a similar word and the allowed words.
+
+    - kind: what the word names, for example `campaign`
+    - listed_only: words that are listed instead of all allowed words
+    """
     allowed_words = sorted(allowed)
     words_text = ", ".join(allowed_words if listed_only is None else sorted(listed_only)) or "none"
     return f"unknown {kind} '{word}'{suggest_similar(word, allowed_words)}; allowed: {words_text}"
@@ -70,8 +74,8 @@ OUT_OF_MEMORY = "OUT_OF_MEMORY"
 TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
 #: The algorithm's answer violated its interface.
 BAD_ANSWER = "BAD_ANSWER"
-#: Outcomes by their command-line names (`--retry`).
 _OUTCOMES = (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
+#: Outcomes by their command-line names (`--retry timed-out`).
 RETRYABLE: Mapping[str, str] = {outcome.lower().replace("_", "-"): outcome for outcome in _OUTCOMES}
 #: Cases with these outcomes fail the requirements on all cases, and result in exit status 1.
 ENGINE_FAILURES = frozenset(RETRYABLE.values())

@@ -60,6 +60,7 @@ def _compute_distortion(camera: CameraModel) -> tuple[np.ndarray, np.ndarray]:
     columns = np.linspace(0.5 * camera.size[0], camera.size[0] - 1.0, 200)
     pixels = np.stack([columns, np.full_like(columns, 0.5 * (camera.size[1] - 1))], axis=1)
     directions = camera.rays(pixels)[1]
+    # direction along the image row, perpendicular to the axis
     row_chord = camera.rays(pixels[-1])[1] - camera.rays(pixels[0])[1]
     axis = np.asarray(camera.a) / np.linalg.norm(camera.a)
     perpendicular = directions - (directions @ axis)[:, None] * axis

@@ -1,13 +1,15 @@
-"""The Python API for notebooks: load and run campaigns and cases, render images, read results. See docs/examples/.
+"""The Python API for notebooks: load and run campaigns and cases, render images, read results.
 
-import marsyard
+Example (more in docs/examples/)::
 
-campaign = marsyard.load_campaign("dimes-smoke", {"terrain.samples": 1024})
-marsyard.draw(campaign, 3)                      # the randomly drawn parameter values of case 3
-marsyard.run_case(campaign, 3).row              # run the case in this process
-folder = marsyard.run_campaign(campaign, "runs/mine", jobs=2)
-marsyard.results(folder)                        # one row per case, a pandas data frame
-marsyard.verdicts(folder)                       # the verdicts on the requirements
+    import marsyard
+
+    campaign = marsyard.load_campaign("dimes-smoke", {"terrain.samples": 1024})
+    marsyard.draw(campaign, 3)                      # the randomly drawn parameter values of case 3
+    marsyard.run_case(campaign, 3).row              # run the case in this process
+    folder = marsyard.run_campaign(campaign, "runs/mine", jobs=2)
+    marsyard.results(folder)                        # one row per case, a pandas data frame
+    marsyard.verdicts(folder)                       # the verdicts on the requirements
 """
 
 from __future__ import annotations

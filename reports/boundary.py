@@ -1,7 +1,7 @@
 """Failure boundary: probability that a case violates a requirement as a function of two conditions.
 
-For each pair of the strongest conditions a logistic regression on spline functions is fitted (scikit-learn). It is
-validated with predictions for terrains that were not used for the fit, and drawn only if they are good.
+For each pair of the most influential conditions, a logistic regression on spline functions is fitted (scikit-learn). It
+is validated by its predictions for terrains that were not used for the fit, and drawn only if they are good.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from marsyard.reports.wording import label, number, numbers
 MIN_CASES_PER_CLASS = 20
 #: Maximum number of conditions, and maximum corrected p-value of a condition.
 MAX_CONDITIONS, MAX_P_VALUE = 4, 0.05
-#: Number of parts of the cross-validation, and of bins of the calibration.
+#: Number of folds of the cross-validation, and of bins of the calibration.
 _FOLDS, _BINS = 5, 5
 #: Maximum calibration error of a fit that is drawn.
 MAX_CALIBRATION_ERROR = 0.1
 #: Maximum number of cases of a fit: the first ones.
 _MAX_CASES = 5000
-#: Number of intervals of the spline functions, and of grid points of the figure along each axis.
+#: Number of knots of the spline functions, and of grid points of the figure along each axis.
 _KNOTS, _GRID_POINTS = 4, 41
 
 
@@ -85,15 +85,17 @@ def validate_fit(
     predicted, base_rate = np.empty(target.size), np.empty(target.size)
     for train, test in GroupKFold(_FOLDS).split(values, groups=groups):
         base_rate[test] = target[train].mean()
-        has_both = 0.0 < target[train].mean() < 1.0
+        has_both_classes = 0.0 < target[train].mean() < 1.0
         predicted[test] = (
-            fit_probability(values[train], is_violation[train])(values[test]) if has_both else target[train].mean()
+            fit_probability(values[train], is_violation[train])(values[test])
+            if has_both_classes
+            else target[train].mean()
         )
     losses, base_losses = (predicted - target) ** 2, (base_rate - target) ** 2
     weights = rates.bootstrap_weights(np.unique(groups, return_inverse=True)[1], np.random.default_rng(0))
     skills = 1.0 - (weights @ losses) / (weights @ base_losses)
     bins = np.array_split(np.argsort(predicted, kind="stable"), _BINS)
-    calibration_error = float(np.mean([abs(predicted[part].mean() - target[part].mean()) for part in bins]))
+    calibration_error = float(np.mean([abs(predicted[cases].mean() - target[cases].mean()) for cases in bins]))
     return BoundaryFit(
         conditions,
         target.size,

@@ -23,7 +23,7 @@ from marsyard.reports.section import (
 from marsyard.reports.stored import table
 from marsyard.reports.wording import count, format_fraction, label, number, split_unit
 
-#: Difference of the closure from 1 above which the contributions are not additive.
+#: Difference of the closure (contributions and remaining part divided by the total) from 1 that is reported.
 MAX_CLOSURE_ERROR = 0.1
 #: Title of the mean square without any source of error.
 REMAINING = "remaining without any source"
@@ -80,6 +80,7 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
 
 
 def _statistic(result: Mapping[str, Any]) -> str:
+    """Return the name of the root of the mean square, which is centred on the mean for a margin."""
     return "standard deviation" if result["centred"] else "RMS"
 
 
@@ -185,6 +186,7 @@ def _index_block(result: Mapping[str, Any]) -> Block:
 
 @in_page_style
 def _draw_waterfall(budget: Mapping[str, Any], axis_label: str) -> Figure:
+    """Draw horizontal bars: remaining mean square, contributions from the end of the previous bar, and total."""
     contributions = budget["contributions"]
     figure, axes = new_axes(9.0, 1.2 + 0.34 * (len(contributions) + 2))
     titles = [REMAINING, *(item["title"] for item in contributions), "all sources of error"]
@@ -195,6 +197,7 @@ def _draw_waterfall(budget: Mapping[str, Any], axis_label: str) -> Figure:
         color = SERIES[0] if item["mean"] >= 0.0 else SERIES[1]
         axes.barh(row, item["mean"], left=level, color=color, height=0.62)
         axes.plot([level + item["lower"], level + item["upper"]], [row, row], color=INK, linewidth=1.2)
+        # connect the end of the previous bar with the start of this bar
         axes.plot([level, level], [row - 1.31, row + 0.31], color=GRID, linewidth=0.8, zorder=0)
         level += item["mean"]
     last = len(titles) - 1

@@ -1,4 +1,4 @@
-"""A campaign's report: `report.html`, its data `report.json`, the traceability matrix and JUnit results."""
+"""Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results."""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
-"""Sections of every campaign: answers, scatter, drivers, convergence, consistency and faults.
+"""Sections of the report of every campaign.
 
-A driver is a condition that may affect the errors or the failures.
+Answers (availability), scatter (error ellipse), drivers (conditions that may affect errors or failures), convergence
+(estimates against the number of cases), consistency (covariances against errors), and faults (dust on the
+window or bad pixels, for example).
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Comparison of algorithms on the same cases, and of two stored campaigns.
 
-Other algorithms are compared with the tested one (the algorithm under test) case by case: successes by discordant
-cases, errors by the differences of the cases that both answered (`marsyard.reports.statistics.changes`). Campaigns with
-the same draws (name, seed, dispersions) are paired as well; otherwise they are compared per terrain if they share
-terrains, else with terrains as independent clusters. Cases on one terrain form a cluster. All p-values are corrected by
-Holm's method.
+Other algorithms are compared with the tested one (the algorithm under test) case by case: successes by the cases in
+which only one algorithm succeeded, errors by the differences of the cases that both answered
+(`marsyard.reports.statistics.changes`). Campaigns with the same draws (name, seed, dispersions) are paired as well;
+otherwise they are compared per terrain if they share terrains, else with terrains as independent clusters. Cases on one
+terrain form a cluster. All p-values are corrected by Holm's method.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Errors and answers by condition: a table for each condition. Its bins are single values or intervals."""
+"""Report section on errors and answers by condition: a table for each condition, a row for each of its bins.
+
+A condition is a column such as the sun elevation; a bin is one of its values, or an interval of values.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Check of random streams: the seeds of ten million streams differ from each other."""
+"""Check of random streams: the seeds of ten million streams differ from each other.
+
+NumPy's `SeedSequence` computes one seed per call; this module contains a vectorised version of its algorithm.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from marsyard.sim.streams import stream_key
 #: Constants INIT_A, MULT_A, MIX_MULT_L, MIX_MULT_R and XSHIFT of NumPy's `SeedSequence`
 #: (numpy/random/bit_generator.pyx), whose algorithm is fixed.
 _INITIAL_CONSTANT, _MULTIPLIER, _MIX_LEFT, _MIX_RIGHT, _SHIFT_BITS = 0x43B0D7E5, 0x931E8875, 0xCA01F9DD, 0x4973F715, 16
-#: Number of 32-bit words of a pool.
+#: Number of 32-bit words of an entropy pool of `SeedSequence`, from which a generator is seeded.
 _POOL_WORDS = 4
 #: Mask of the lower 32 bits.
 _MASK = 2**32 - 1
@@ -23,7 +26,7 @@ CAMPAIGNS, CASES = 25, 20_000
 
 
 class _Hash:
-    """Vectorised hash of `SeedSequence`; its constant changes with every call."""
+    """Hash function of `SeedSequence` for arrays of words; it changes its constant at every call."""
 
     def __init__(self) -> None:
         self._constant = _INITIAL_CONSTANT
@@ -78,13 +81,16 @@ def stream_words(seed: int, campaign: str, cases: np.ndarray, name: str) -> np.n
 
 
 def list_stream_names() -> list[str]:
-    """Return the names of twenty streams of campaigns."""
+    """Return the names of twenty streams: 14 of dispersions, and 6 of instruments and events of a descent."""
     dispersions = [f"dispersion:{path}" for path in load_campaign("dimes-gusev").drawn_paths]
     return [*dispersions[:14], "altimeter", "detector noise", "gusts", "image clock", "inertial unit", "landing"]
 
 
 def all_seeds(campaigns: int, cases: int, names: Sequence[str]) -> np.ndarray:
-    """Compute the seeds of all streams of campaigns with two alternating names and increasing root seeds."""
+    """Compute the seeds of the streams `names` of all cases, as in `seeds`.
+
+    The campaigns have two names in turn. Two successive campaigns have the same root seed: 0, 0, 1, 1, ...
+    """
     numbers = np.arange(cases)
     return np.concatenate(
         [
@@ -102,7 +108,7 @@ def collisions(pools: np.ndarray) -> int:
 
 
 def run_streams(quick: bool) -> Iterator[Measure]:
-    """Count equal seeds of neighbouring campaigns, cases and streams."""
+    """Count equal seeds of successive campaigns, cases and streams."""
     names = list_stream_names()
     pools = all_seeds(CAMPAIGNS // 5 if quick else CAMPAIGNS, CASES // 10 if quick else CASES, names)
     how = f"{len(pools):,} streams: {len(names)} names, cases from 0, root seeds from 0, two campaigns; 128-bit seeds"

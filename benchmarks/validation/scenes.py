@@ -1,4 +1,7 @@
-"""Scenes, cameras and views for the validation checks."""
+"""Scenes, cameras and views (scene, camera and camera pose) for the validation checks of the renderer.
+
+World axes: x east, y north, z up. Body axes of a camera on a mast: x forward, y left, z up.
+"""
 
 from __future__ import annotations
 
@@ -121,7 +124,7 @@ def create_rocks(
     above_m: float,
     albedo: float,
 ) -> Objects:
-    """Create the rocks around a position."""
+    """Create the rocks within `radius_m` of a horizontal position, as seen by a camera `above_m` above the ground."""
     if parameters is None:
         return Objects.none()
     field = RockField.draw(surface, parameters, np.random.default_rng(SEED))
@@ -130,7 +133,7 @@ def create_rocks(
 
 
 def crop_centre(camera: CameraModel, size: tuple[int, int]) -> CameraModel:
-    """Return the camera of the central part of the image."""
+    """Return the camera of the central `size` (columns, rows) pixels of the image."""
     return camera.crop((camera.size[0] - size[0]) // 2, (camera.size[1] - size[1]) // 2, size)
 
 
@@ -144,6 +147,7 @@ def tile_view(height_m: float, size: tuple[int, int]) -> View | None:
     surface = synthesise(terrain, np.random.default_rng(SEED))
     centre = (0.5 * 2048 * 0.25, 0.5 * 2048 * 0.25)
     camera = crop_centre(preset("mer-descent-flown").cameras()[0], size)
+    # the default mesh of a scene is for a height of about 1400 m; its lengths are scaled with the height
     scene = Scene(
         surface,
         centre,

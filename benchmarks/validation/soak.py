@@ -1,4 +1,7 @@
-"""Soak test: a campaign with faulty cases, killed and resumed, compared with the same campaign without faults."""
+"""Soak test of the campaign engine: a campaign with faulty cases is killed and resumed several times.
+
+Its results are compared with the same campaign without faults. `benchmarks.validation.hostile` defines the faults.
+"""
 
 from __future__ import annotations
 
@@ -41,10 +44,10 @@ confidence = 0.9
 population = "all"
 """
 
-#: Environment variable that identifies the processes of the campaign.
-_MARK = "MARSYARD_SOAK"
+#: Environment variable that identifies the processes of a soak test; its value is the folder of the test.
+_PROCESS_VARIABLE = "MARSYARD_SOAK"
 
-#: Maximum time per case, seconds; a case normally needs a tenth of it.
+#: Maximum mean time per case of an uninterrupted run, seconds; a case normally needs a tenth of it.
 _MAX_CASE_S = 20.0
 
 #: Maximum time until processes of a killed campaign have ended, seconds.
@@ -66,7 +69,7 @@ class SoakResult:
     faults
         Fault of each case; empty for cases without fault.
     wrong_outcomes, changed_cases
-        Cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
+        Descriptions of cases with an unexpected outcome; valid cases whose row differs from the undisturbed campaign.
     remaining_processes, remaining_files
         Numbers of processes and temporary files after the last run.
     """
@@ -97,7 +100,7 @@ def run_soak_test(
     """
     temporary = folder / "tmp"
     temporary.mkdir()
-    environment = {**os.environ, _MARK: str(folder), "TMPDIR": str(temporary)}
+    environment = {**os.environ, _PROCESS_VARIABLE: str(folder), "TMPDIR": str(temporary)}
     (folder / "soak.toml").write_text(f"cases = {cases}\n{CAMPAIGN_TEXT}")
     undisturbed_status = _run(folder, "healthy", 0.0, environment, cases)
     start_s = time.monotonic()
@@ -113,6 +116,7 @@ def run_soak_test(
     campaign = load_campaign(str(folder / "soak.toml"), [f"misbehaving={fault_fraction}"])
     faults = tuple(_draw_fault(campaign, case) for case in range(cases))
     pairs = list(zip(faults, rows["soaked"], rows["healthy"], strict=True))
+    # `FAULTS` contains a function and the expected outcome of each fault
     return SoakResult(
         kills=successful_kills,
         finished=finished,
@@ -170,12 +174,12 @@ def _run_with_kills(
 
 
 def _find_processes(folder: Path) -> list[int]:
-    """List the ids of processes whose environment contains the mark of the soak test."""
-    mark = f"{_MARK}={folder}".encode()
+    """List the ids of processes whose environment contains the variable of the soak test in this folder."""
+    variable = f"{_PROCESS_VARIABLE}={folder}".encode()
     ids = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
-            if mark in (process / "environ").read_bytes():
+            if variable in (process / "environ").read_bytes():
                 ids.append(int(process.name))
     return ids
 
@@ -193,8 +197,8 @@ def check_isolation(quick: bool) -> Iterator[Measure]:
     with TemporaryDirectory() as name:
         result = run_soak_test(Path(name), cases, kills, fault_fraction, (5.0, 40.0))
     healthy = result.faults.count("")
-    kinds = len(set(result.faults)) - 1
-    how = f"{cases} cases, {cases - healthy} of which misbehave in {kinds} ways; killed {result.kills} times"
+    fault_types = len(set(result.faults)) - 1
+    how = f"{cases} cases, {cases - healthy} of which misbehave in {fault_types} ways; killed {result.kills} times"
     yield Measure("soak: campaigns that did not end by themselves", float(not result.finished), "", 0, how)
     yield Measure("soak: outcomes that do not match the fault of the case", len(result.wrong_outcomes), "", 0, how)
     yield Measure(

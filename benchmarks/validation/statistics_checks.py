@@ -1,4 +1,7 @@
-"""Checks of statistics: coverage of intervals, error rates of sequential stopping, false alarms of nightly runs."""
+"""Checks of statistics: coverage of intervals, error rates of sequential stopping, false alarms of nightly runs.
+
+The coverage of an interval is the fraction of simulated samples whose interval contains the true value.
+"""
 
 from __future__ import annotations
 
@@ -33,6 +36,7 @@ from marsyard.reports.statistics.samples import (
     standard_deviation_interval,
 )
 
+#: One-sided confidence of the checked bounds.
 CONFIDENCE = 0.9
 #: Cases per terrain.
 _CASES_PER_TERRAIN = 8
@@ -78,6 +82,7 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     )
     inside_count = 0
     for _ in range(4 * trials):
+        # 21 correlated normal errors (x, y) of arbitrary scale: 20 define the ellipse, the last one is tested
         points = rng.normal(size=(21, 2)) @ np.array([[2.0, 0.0], [0.9, 0.4]])
         ellipse = error_ellipse(points[:20], 0.95)
         assert ellipse is not None
@@ -110,8 +115,8 @@ def _draw_successes(
     return rng.random(terrain.size) < rates[terrain], terrain
 
 
-def run_clustered(quick: bool) -> Iterator[Measure]:
-    """Measure the coverage of the bounds of cases that share terrains."""
+def run_correlated_rates(quick: bool) -> Iterator[Measure]:
+    """Measure the coverage of the bounds of a success rate of cases that share terrains."""
     trials = 400 if quick else 3000
     rng = np.random.default_rng(2)
     for rate in (0.99, 0.95, 0.8):
@@ -128,7 +133,7 @@ def run_clustered(quick: bool) -> Iterator[Measure]:
                 yield Measure(claim, min(lower, upper), "", _min_coverage(CONFIDENCE, trials), how, "at least")
 
 
-def run_shared(quick: bool) -> Iterator[Measure]:
+def run_correlated_errors(quick: bool) -> Iterator[Measure]:
     """Measure the coverage of intervals of errors that share terrains: mean, standard deviation, quantile."""
     trials = 100 if quick else 600
     rng = np.random.default_rng(6)
@@ -153,7 +158,11 @@ def _draw_errors(rng: np.random.Generator, correlation: float, terrains: int) ->
 
 
 def _check_coverage(errors: np.ndarray, terrain: np.ndarray, truths: dict[str, float]) -> dict[str, tuple[bool, ...]]:
-    """Return whether each interval contains the true value; the two bounds of the quantile are checked separately."""
+    """Return whether each interval contains the true value; the two bounds of the quantile are checked separately.
+
+    - errors, terrain: error and terrain number of each case
+    - truths: true value of each statistic
+    """
     lower, upper = quantile_bounds(errors, 0.95, CONFIDENCE, terrain)
     contains_truth: dict[str, tuple[bool, ...]] = {
         "95 % quantile": (lower <= truths["95 % quantile"], upper >= truths["95 % quantile"])
@@ -183,7 +192,10 @@ def run_sequential(quick: bool) -> Iterator[Measure]:
 def _simulate_decision(
     rng: np.random.Generator, required: float, max_cases: int, correlation: float | None
 ) -> tuple[bool, bool]:
-    """Simulate a campaign; return whether its first decision is PASS, and whether it is FAIL."""
+    """Simulate a campaign with planned interim evaluations (looks); return whether its verdict is PASS, and FAIL.
+
+    correlation: correlation of two cases on one terrain; None for independent cases
+    """
     if correlation is None:
         success, terrain = rng.random(max_cases) < required, np.arange(max_cases)
     else:
@@ -225,8 +237,8 @@ def run_nights(quick: bool) -> Iterator[Measure]:
 
 CHECKS = (
     Check("intervals", "Statistics", run_intervals),
-    Check("clustered", "Statistics", run_clustered),
-    Check("shared", "Statistics", run_shared),
+    Check("clustered", "Statistics", run_correlated_rates),
+    Check("shared", "Statistics", run_correlated_errors),
     Check("sequential", "Statistics", run_sequential),
     Check("nights", "Statistics", run_nights),
 )

@@ -1,4 +1,8 @@
-"""Checks of target tracking on rendered rocks: drift without noise, and range error of stereo."""
+"""Checks of target tracking on rendered rocks: drift without noise, and range error of stereo.
+
+The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking". Its Eq. 1 is the range error of stereo,
+proportional to the disparity error and the square of the range.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +23,14 @@ from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, sco
 from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
 
+#: Seed of the random streams; the choice is arbitrary.
 SEED = 20061108
 #: Limits of the drift (rms, maximum), and of the relative deviation of the range error from Eq. 1.
 DRIFT_RMS_LIMIT_PX, DRIFT_MAX_LIMIT_PX, RANGE_LIMIT = 1.0, 2.5, 0.15
-#: Maximum fraction of lost targets: 2 of 100 were lost; three standard deviations of this number are 4.
+#: Maximum fraction of lost targets: 2 of 100 were lost, plus three standard deviations of this number, 4 of 100.
 LOST_LIMIT = 0.06
 CAMERAS = ("research-navcam", "research-pancam")
-#: Parameters without errors of cameras, mast and odometry.
+#: Parameters of a run without errors of cameras, mast and odometry.
 NO_ERRORS: dict[str, Any] = {
     "stereo": dict.fromkeys(
         ("disparity_error_px", "epipolar_error_px", "alignment_deg", "roll_deg", "focal_error"), 0.0
@@ -54,7 +59,7 @@ def draw_exact_parameters(number: int, camera: str) -> RoverScenarioParameters:
 
 
 def simulate_run(number: int, camera: str) -> dict[str, Scalar]:
-    """Simulate a run without errors and return its row."""
+    """Simulate a run without errors; return its row: score and conditions."""
     parameters = draw_exact_parameters(number, camera)
     run = run_case(parameters, Streams(SEED, "validation tracking", number))
     return {**score_run(parameters, run), **fixed_conditions(parameters, run), **run_conditions(parameters, run)}

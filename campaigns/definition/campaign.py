@@ -1,4 +1,8 @@
-"""A campaign and the parameters of each of its cases: the campaign's parameters with the case's sampled values."""
+"""A campaign and the parameters of each of its cases: the campaign's parameters with the case's sampled values.
+
+A path is the dotted path of a parameter in nested tables and lists, such as `wind.east_m_s`. A study evaluates cases at
+points that it chooses (`marsyard.campaigns.sampling.points`).
+"""
 
 from __future__ import annotations
 
@@ -72,6 +76,7 @@ class Campaign:
         """Evaluate the dispersions at cumulative probabilities.
 
         Dispersions in `nominal` have the value of the campaign's parameter; all of them if `probabilities` is None.
+        Dispersions without a random number are evaluated at the probability 0.5, which does not affect their values.
         """
         parameters = self.configuration.parameters
         values: dict[str, Any] = {}
@@ -201,7 +206,7 @@ def value_at(tree: Any, path: str) -> Any:
 
 
 def find_value(tree: Any, path: str) -> Any:
-    """Return the value at a dotted path in nested tables and lists; an empty tuple if there is no such path."""
+    """Return the value at a dotted path in nested tables and lists; `()` if there is no such path."""
     try:
         return value_at(tree, path)
     except ValueError:

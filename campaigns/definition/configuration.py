@@ -1,4 +1,4 @@
-"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits); update of old names."""
+"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits); use of former names."""
 
 from __future__ import annotations
 
@@ -289,8 +289,8 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
         key: Key = ()
         node: Any = model
         for part in location:
-            # pydantic adds the names of alternative models
-            if not any(kind.__name__ == part for kind in _list_models(node)):
+            # pydantic adds the names of alternative models, which are no keys of the file
+            if not any(option.__name__ == part for option in _list_models(node)):
                 key = (*key, part)
             node = _find_inner_type(node, part)
         if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
@@ -320,45 +320,45 @@ def description_at(model: type[BaseModel], path: str) -> str:
 
 def current_path(model: type[BaseModel], path: str) -> str:
     """Replace former names in the dotted path of a model's field by current names; unknown names are unchanged."""
-    kind: Any = model
-    parts = []
-    for part in path.split("."):
-        fields = {name for option in _list_models(kind) for name in option.model_fields}
-        fields = fields.union(*map(field_names, _list_alternatives(kind)))
-        parts.append(current_key(part, fields))
-        kind = _find_inner_type(kind, int(part) if part.isdigit() else parts[-1])
-    return ".".join(parts)
+    annotation: Any = model
+    keys = []
+    for key in path.split("."):
+        fields = {name for option in _list_models(annotation) for name in option.model_fields}
+        fields = fields.union(*map(field_names, _list_alternatives(annotation)))
+        keys.append(current_key(key, fields))
+        annotation = _find_inner_type(annotation, int(key) if key.isdigit() else keys[-1])
+    return ".".join(keys)
 
 
-def _find_inner_type(kind: Any, part: str | int) -> Any:
-    """Find the type of the field, entry or element `part` of a type; None if there is none."""
+def _find_inner_type(annotation: Any, key: str | int) -> Any:
+    """Find the type of the field, entry or element `key` of a type; None if there is none."""
     inner_types: list[Any] = []
-    for choice in _list_alternatives(kind):
+    for choice in _list_alternatives(annotation):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
-            if part in choice.model_fields:
-                inner_types.append(choice.model_fields[str(part)].annotation)
-            elif choice.__name__ == part or (part in BUILT_IN and choice is BUILT_IN[str(part)]):
+            if key in choice.model_fields:
+                inner_types.append(choice.model_fields[str(key)].annotation)
+            elif choice.__name__ == key or (key in BUILT_IN and choice is BUILT_IN[str(key)]):
                 inner_types.append(choice)
-        elif get_origin(choice) in (list, tuple, set, frozenset) and isinstance(part, int):
+        elif get_origin(choice) in (list, tuple, set, frozenset) and isinstance(key, int):
             inner_types.append(get_args(choice)[0])
-        elif get_origin(choice) in (dict, Mapping) and isinstance(part, str):
+        elif get_origin(choice) in (dict, Mapping) and isinstance(key, str):
             inner_types.append(get_args(choice)[1])
     return Union[tuple(inner_types)] if inner_types else None  # noqa: UP007
 
 
-def _list_models(kind: Any) -> list[type[BaseModel]]:
+def _list_models(annotation: Any) -> list[type[BaseModel]]:
     """List the pydantic models among the alternatives of a type."""
-    return [item for item in _list_alternatives(kind) if isinstance(item, type) and issubclass(item, BaseModel)]
+    return [item for item in _list_alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
 
 
-def _list_alternatives(kind: Any) -> list[Any]:
-    """List the members of a union, or the type itself; annotations are removed."""
-    origin = get_origin(kind)
+def _list_alternatives(annotation: Any) -> list[Any]:
+    """List the members of a union, or the type itself; metadata of `Annotated` types are removed."""
+    origin = get_origin(annotation)
     if origin is Annotated:
-        return _list_alternatives(get_args(kind)[0])
+        return _list_alternatives(get_args(annotation)[0])
     if origin in (Union, types.UnionType):
-        return [inner for choice in get_args(kind) for inner in _list_alternatives(choice)]
-    return [kind]
+        return [inner for choice in get_args(annotation) for inner in _list_alternatives(choice)]
+    return [annotation]
 
 
 _NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")

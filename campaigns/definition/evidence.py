@@ -1,4 +1,4 @@
-"""Kind of evidence of a run: calibration, confirmation or exploration, by its seed and its frozen algorithm.
+"""Kind of evidence of a run (calibration, confirmation or exploration), determined from its seed and its algorithm.
 
 Options that were set by looking at results fit the cases of these results. Only new cases, drawn once after the
 algorithm was frozen, can confirm it. `marsyard run --confirm` draws the seed of such a run from a namespace, and
@@ -25,12 +25,12 @@ NAMESPACE = "confirmation"
 _KEYS_NOT_HASHED = frozenset(
     {"appended", "calibration", "cases", "description", "limits", "max_cases", "requirements", "retain", "seed"}
 )
-#: Maximum number of a confirmation whose seed is recognised without an entry in the record.
+#: Maximum number of a confirmation whose seed is recognised although the record has no entry of it.
 _MAX_RESERVED_NUMBER = 1000
 
 
 class EvidenceKind(StrEnum):
-    """Kind of evidence of a run, explained by `Evidence.text`; results of `KINDS_WITHOUT_PASS` cannot be PASS."""
+    """Kind of evidence of a run; `Evidence.text` explains each kind, and `KINDS_WITHOUT_PASS` cannot result in PASS."""
 
     CONFIRMATION = "confirmation"
     REPETITION = "repetition of a confirmation"
@@ -236,6 +236,7 @@ def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation],
     if calibration_runs:
         options = dict.fromkeys(option for run in calibration_runs for option in run.options)
         return Evidence(EvidenceKind.CALIBRATION, changes=tuple(options))
+    # the seed of a confirmation that was not recorded
     own_namespace = confirmation_namespace(configuration)
     for number in range(1, _MAX_RESERVED_NUMBER + 1):
         if confirmation_seed(own_namespace, name, number) == seed:

@@ -1,6 +1,7 @@
 """Identity of a campaign: hashes and versions of all inputs, except the case number, that determine its rows.
 
 The module also describes the algorithms of a campaign for its record: class, version, options, hash of the sources.
+Custom parts are code of users that replaces the motion, an instrument or a score (docs/custom-parts.md).
 """
 
 from __future__ import annotations
@@ -231,6 +232,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
         parameters = getattr(parameters, name)
     entries = []
     for spec in list_algorithms(campaign.configuration):
+        # shipped algorithms are installed with Marsyard; their sources are all of `marsyard.algorithms`
         is_shipped = spec in selected_scenario.task.shipped
         sources = list(source_files("algorithms:") if is_shipped else custom_sources(spec))
         if is_shipped:

@@ -1,4 +1,4 @@
-"""Loading of a campaign: read its file, apply the command-line options, and report all problems together.
+"""Load a campaign: read its file, apply the command-line options, and report all problems together.
 
 Dispersions and the columns of requirements are checked against the scenario before any case runs.
 """
@@ -54,9 +54,9 @@ _CHECKED_CASES = 32
 #: Maximum number of dispersed parameters in the formulas of a dispersion, since all combinations of their extremes are
 #: checked.
 _MAX_VARYING = 8
-#: Kinds of columns in requirements, as in messages.
+#: Types of columns in requirements, as named in messages.
 FLAGS, NUMBERS = "column of true and false", "column of numbers"
-#: Columns that the engine writes.
+#: Columns that the campaign engine adds to those of the scenario.
 _ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -441,6 +441,7 @@ def _collect_columns(campaign: Campaign) -> RowColumns | None:
         if path in configuration.dispersions:
             return None
         scores += [f"{label}_*" for label in labels(find_value(configuration.parameters, path))]
+    # boolean columns that the campaign file defines by name
     flags = find_value(configuration.parameters, columns.named_flags) if columns.named_flags else ()
     return replace(
         columns,

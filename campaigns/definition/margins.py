@@ -1,10 +1,12 @@
 """Margins of requirements: signed numbers that are below 0 if and only if a case violates its requirement.
 
 - A metric with a bound has the margin bound - |scale * metric|, in the unit of the bound.
-- A boolean metric has the margin of the requirement's `margin` column, or 1 and -1 without such a column.
-- Outside the population no violation is possible: the margin is infinite. A refused answer is in this class if the
-  population is `valid`.
-- An unfinished case, a missing value and a missing flag of the population are violations: minus infinity.
+- A boolean metric has the margin of the requirement's `margin` column. Without such a column its margin is 1 if the
+  metric is true, and -1 if it is false or missing.
+- A case outside the population cannot violate the requirement: its margin is infinite. For the population `valid`,
+  these are the finished cases without a valid answer.
+- An unfinished case, and a case without the flag of its population or the value of a bounded metric, violate the
+  requirement: their margin is minus infinity.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from typing import Any
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.errors import ENGINE_FAILURES
 
-#: Margin of a violation whose margin column is not negative, although its boolean metric is false.
+#: Margin of a case whose boolean metric is false, although its margin column is not negative.
 _MAX_VIOLATION_MARGIN = -1e-12
 
 
@@ -45,7 +47,7 @@ def compute_margin(row: Mapping[str, Any], requirement: Requirement) -> float:
 
 
 def describe_margin(requirement: Requirement) -> str:
-    """Describe the margin of a requirement, and the treatment of cases without a value, in two sentences."""
+    """Describe the margin of a requirement, and which cases without a value are violations, in two sentences."""
     if requirement.bound is not None:
         factor = "" if requirement.scale == 1.0 else f"{requirement.scale:g} * "
         text = f"The margin is {requirement.bound:g} - |{factor}{requirement.metric}|"

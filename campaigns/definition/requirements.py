@@ -1,4 +1,4 @@
-"""Requirement files: campaigns refer to requirements by id, and stored campaigns can be evaluated against them."""
+"""Requirements files: campaign files refer to their requirements by id; stored campaigns are evaluated against them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
 
-#: Keys of a requirement that a campaign may override.
+#: Keys of a shared requirement that a campaign file may override.
 _CHANGEABLE = ("statement", "population", "probability", "confidence", "decide_by", "accept_rate")
 
 

@@ -1,4 +1,4 @@
-"""Execution of single cases in worker processes, and their rows; only this module runs scenarios."""
+"""Run single cases of a campaign in worker processes, and create their rows (one table row of results per case)."""
 
 from __future__ import annotations
 
@@ -74,6 +74,7 @@ def run_case(configuration: str, selection: ProductSelection, points: Mapping[in
     conditions: dict[str, Scalar] = {}
 
     def record(columns: Mapping[str, Scalar]) -> None:
+        """Record columns that are known before the result, for the row of an unfinished case."""
         conditions.update(_convert_columns(columns))
         worker_process.record_note(json.dumps({"case": case, "conditions": conditions}))
 
@@ -102,7 +103,7 @@ def run_case(configuration: str, selection: ProductSelection, points: Mapping[in
 
 
 def prepare_input(configuration: str, shared_input: int) -> str:
-    """Build or verify an input shared by cases; return the warnings of the cache as one text, or an empty text."""
+    """Build or verify the shared input (such as a terrain) with this number; return the warnings of its cache."""
     campaign = _load_campaign(configuration)
     with warnings.catch_warnings(record=True) as cache_warnings:
         warnings.simplefilter("always", CacheWarning)
@@ -241,7 +242,7 @@ def _replace_surrogates(text: str) -> str:
     return text.encode("utf-8", errors="replace").decode("utf-8")
 
 
-#: Maximum number of cases listed for each kind of change.
+#: Maximum number of notes for each kind of change of the process state.
 _MAX_NOTES = 3
 
 

@@ -31,6 +31,7 @@ _LOCAL_PREFIX = "local:"
 _TIMEOUT_S = 30
 #: Batches queued at each Dask worker, so that no worker waits for the network.
 _QUEUED_BATCHES = 2
+#: Worker process of each thread of a Dask worker (attribute `workers`).
 _thread_state = threading.local()
 
 

@@ -1,7 +1,8 @@
-"""State of a worker process by which a case could affect later cases: it is compared and restored after each case.
+"""State of a worker process by which a case could affect later cases (environment variables, signal handlers, ...).
 
-Changes are reported. If a change cannot be restored (a thread, a child process, a signal handler), the next case runs
-in a fresh worker. The global random generators of Python, NumPy and OpenCV are seeded before each case.
+After each case the state is compared with a reference, changes are reported, and the state is restored. If a change
+cannot be restored (a thread, a child process, a signal handler), the next case runs in a fresh worker. The global
+random generators of Python, NumPy and OpenCV are seeded before each case.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from marsyard.algorithms.processes import children
 
 #: Maximum seconds to wait for threads and processes to end.
 _MAX_END_WAIT_S = 0.2
+#: Device and inode of an open file; None for a closed descriptor.
 FileIdentity = tuple[int, int] | None
+#: Numbers of the standard signals, without real-time signals.
 _SIGNALS = tuple(range(1, signal.SIGSYS + 1))
 
 
@@ -55,7 +58,7 @@ _OPENGL_VARIABLE = b"PYOPENGL_PLATFORM"
 
 
 def _read_environment() -> dict[bytes, bytes]:
-    # the undecoded mapping inside `os.environ`, which is ten times as fast
+    # read the undecoded mapping inside `os.environ`, which is ten times as fast
     variables: dict[bytes, bytes] = dict(os.environ._data)  # type: ignore[attr-defined]
     variables.pop(_OPENGL_VARIABLE, None)
     return variables
@@ -89,7 +92,7 @@ def _read_decimal_context() -> tuple[Any, ...]:
         context.Emax,
         context.capitals,
         context.clamp,
-        [],  # no flags
+        [],  # flags of earlier operations are not restored
         enabled_traps,
     )
 
@@ -136,7 +139,7 @@ _PARTS = (
     _StatePart("the floating-point rounding mode", _read_arithmetic, _set_arithmetic),
     _StatePart("garbage collection", gc.isenabled, lambda enabled: (gc.enable if enabled else gc.disable)()),
 )
-#: Indices of the parts that imports of modules change: environment, `sys.path` and warning filters.
+#: Indices in `_PARTS` of the parts that an import may change: environment variables, `sys.path`, warning filters.
 _CHANGED_BY_IMPORTS = (1, 2, 3)
 
 

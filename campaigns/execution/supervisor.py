@@ -1,7 +1,8 @@
 """Supervisor process between the parent and a worker: it kills all descendants of the worker when the worker ends.
 
-A worker and the parent may end at any moment. The supervisor runs no code of cases. It becomes the parent of orphaned
-descendants, and ends after it has killed all descendants. The parent sends signals only to the supervisor.
+The parent is the program that runs the campaign; a worker runs its cases. Both may end at any moment. The supervisor
+runs no code of cases. It becomes the parent of orphaned descendants, and ends after it has killed all of them. The
+parent sends signals only to the supervisor.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Tasks of the worker processes and their results, and the code inside a worker: setup, batches and status."""
+"""Tasks of the worker processes and their results, and the code inside a worker: setup, batches and status.
+
+A task is a function of an integer, its item: the number of a case, of a shared input or of a check.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,7 @@ LOADING_S = 300.0
 _MAX_GROUP_DURATION_S = 0.005
 #: Exit status of a worker after an item closed file descriptors that the worker needs.
 FILES_CLOSED = 97
-#: Layout of the status board: item number (`_NO_ITEM` between items), and start time in seconds.
+#: Layout of the status board: item (`_NO_ITEM` between items), and its start time in seconds (monotonic clock).
 _BOARD_LAYOUT = struct.Struct("=qd")
 _NO_ITEM = -1
 
@@ -145,6 +148,8 @@ class _WorkerContext:
     """Context of this worker process: status board, files, current item, and reference process state.
 
     - trace, note: files of the stack trace and of the task's note; output: descriptor of the output file
+    - item, crashed: latest item, and whether it requested a fresh worker
+    - checks_each_item: whether the state is checked after each item, since an earlier item of a group changed it
     - files: open descriptors that an item must not close, with their identities
     """
 

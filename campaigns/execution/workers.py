@@ -1,8 +1,8 @@
-"""Isolated worker processes: a crash, hang or memory overrun of one case cannot affect another.
+"""Isolated worker processes on this machine: a crash, hang or memory overrun of one case cannot affect another.
 
-Each worker is a loky executor (of joblib) with one process, also for `jobs=1`. If a worker dies, its executor
-identifies the batch, and its status board identifies the case; the other workers continue. The parent checks each
-worker about twenty times per second, and terminates a worker whose case exceeds a limit.
+Each worker is a loky executor (of joblib) with one process, which runs batches of cases. If a worker dies, its executor
+identifies the batch, and its status board (shared memory) identifies the case. The parent checks each worker about
+twenty times per second, and terminates a worker whose case exceeds a limit.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def available_cores() -> int:
 _BATCH_S = 1.0
 #: Maximum number of items in a batch.
 MAX_BATCH = 1000
-#: Weight of the latest batch in the running mean of the time per item.
+#: Weight of the latest batch in the exponential mean of the time per item.
 _LATEST_WEIGHT = 0.3
 
 

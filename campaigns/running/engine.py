@@ -49,7 +49,7 @@ class ProgressObserver(Protocol):
 
 @dataclass(frozen=True)
 class _CampaignRun:
-    """A campaign with its folder, its executor and the receiver of its progress."""
+    """A campaign to run, with its folder, the configuration of its workers, and the receiver of its progress."""
 
     campaign: Campaign
     directory: Path
@@ -140,7 +140,7 @@ def append_cases(
 
 
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
-    """Load a stored campaign with an additional block of cases. Raises CampaignError like `append_cases`."""
+    """Load a stored campaign with a block of `cases` additional cases. Raises CampaignError like `append_cases`."""
     configuration = record.stored_configuration(directory)
     _reject_study(directory, configuration)
     extended_configuration = configuration.model_copy(update={"appended": (*configuration.appended, cases)})

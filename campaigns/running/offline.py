@@ -1,7 +1,7 @@
-"""Offline campaigns: cases are exported without their truth to another team, and its answers are scored.
+"""Offline campaigns: cases are exported to another team without their ground truth, and the team's answers are scored.
 
-The export and the scoring are campaigns. The rows of the export campaign contain the truth and are stored in a separate
-folder. The scoring campaign runs the same cases again, with a table of answers instead of an algorithm.
+The export and the scoring are campaigns. The rows of the export campaign contain the ground truth and are stored in a
+separate folder. The scoring campaign runs the same cases again, with a table of answers instead of an algorithm.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SCHEMA = 1
 
 
 def truth_folder(directory: Path) -> Path:
-    """Return the default folder of the truth, next to the exported folder."""
+    """Return the default folder of the ground truth, next to the exported folder."""
     return directory.with_name(f"{directory.name}-truth")
 
 
@@ -40,7 +40,10 @@ def export_campaign(
 ) -> None:
     """Export a campaign's cases, or continue an interrupted export of the same campaign.
 
-    The campaign's algorithm is `export:` with the folder. Raises CampaignError if the folders contain other files, or
+    - campaign: its algorithm is `export:` with the path of the exported folder
+    - directory, truth: exported folder, and folder of the campaign's rows with the ground truth
+
+    Raises CampaignError if the folders contain other files, or
     are not writable.
     """
     if truth.resolve().is_relative_to(directory.resolve()):

@@ -1,4 +1,7 @@
-"""Preparation of a campaign: plan of shared inputs (terrains), compilation, estimate of time and disk space."""
+"""Preparation of a campaign: plan of shared inputs (terrains), compilation, estimate of time and disk space.
+
+A shared input is used by several cases, and is built once into a cache on disk; a scenario numbers its shared inputs.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loading of stored campaigns, replay of single cases, and conformance checks of algorithms in worker processes."""
+"""Load stored campaigns, run single cases again (replay), and check custom algorithms in worker processes."""
 
 from __future__ import annotations
 
@@ -132,8 +132,9 @@ _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
 def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject:
-    """Create the subject of conformance checks from the name of an algorithm or a part.
+    """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
+    limit_s: time limit of one answer
     task: task of the algorithm; None for the task that its interface determines.
     Raises CampaignError if the name or the task is unknown.
     """

@@ -46,8 +46,9 @@ MAX_STRATIFIED = 2**20
 _SOBOL_BITS = 52
 #: Number of designs that a process caches, since successive cases use the same design.
 _CACHED_DESIGNS = 4
+#: Kinds of sampling designs, see above.
 Kind = Literal["random", "latin-hypercube", "sobol", "adaptive"]
-#: Kind of a study's folder: its cases are points that are stored with the rows.
+#: Kind of a study: it chooses its cases, whose points are stored with their rows.
 ADAPTIVE: Final = "adaptive"
 #: Indices of a correlated group's members among the dispersions, and the rows of its factor L.
 CorrelatedGroup = tuple[tuple[int, ...], tuple[tuple[float, ...], ...]]
@@ -88,8 +89,8 @@ class Design(Parameters):
 def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int) -> tuple[int, int, int, int] | None:
     """Return the position of a case in blocks of the sizes `blocks`; None for the nominal case.
 
-    The position consists of the index of the case's grid point, the first case and the number of cases at this point in
-    the block, and the index of the case among these cases.
+    The position is: index of the case's grid point; in its block, first case and number of cases at this grid point;
+    index of the case among these cases.
     """
     if design.nominal and case == 0:
         return None

@@ -335,7 +335,7 @@ def scipy_parameters(distribution: str) -> tuple[list[str], list[str]]:
 def create_scipy_distribution(distribution: str, parameters: Mapping[str, float]) -> UnivariateDistribution:
     """Create a distribution of `scipy.stats` with parameters.
 
-    Raises ValueError if the distribution is not defined for the parameters, now or when it is evaluated.
+    Raises ValueError if the distribution is not defined for the parameters; its evaluation can raise it as well.
     """
     from scipy import stats
 

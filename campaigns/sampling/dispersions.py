@@ -17,6 +17,7 @@ from marsyard.campaigns.sampling import dispersion as base
 
 #: Maximum number of levels of one grid.
 MAX_LEVELS = 100_000
+#: Finite number that is no formula.
 _Bound = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 
 

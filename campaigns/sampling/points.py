@@ -1,8 +1,8 @@
 """Cases as points in standard normal space: their coordinates, and the number of their random streams.
 
-Reliability methods need cases at chosen points. Each random dispersion is a function of one standard normal variable:
-its inverse distribution at Phi(z), after the correlation of its group. The random streams of a case (noise of the
-instruments, for example) are one further variable, which can only be drawn again or kept.
+Studies (`marsyard.campaigns.studies`) choose the points of their cases. Each random dispersion is a function of one
+standard normal variable: its inverse distribution at Phi(z), after the correlation of its group. The random streams of
+a case (noise of the instruments, for example) have no coordinates; a point selects them by a number.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Record of confirmations: a file of JSON lines, to which runs with `--confirm` append their start and their result.
 
-A confirmation evaluates a frozen algorithm (its options and source hash) on a seed that nobody has used before. The
-seed is derived from a namespace, which the user states in advance; it cannot be chosen after results are known.
+A confirmation evaluates a frozen algorithm (recorded by its options and source hash) on a seed that nobody has used
+before. The seed is derived from a namespace (a text in the campaign file), the campaign's name and a running number.
+The user therefore cannot choose a seed by its results.
 
 The file belongs under version control, next to the algorithm. Entries are never changed or removed.
 """

@@ -1,4 +1,7 @@
-"""Products of cases: selection of the cases, and files (arrays in `products.npz`, other data in `products.json`)."""
+"""Products of cases (images, histories, intermediate results): selection of the cases, and their files.
+
+Arrays are stored in `products.npz`, other data in `products.json`.
+"""
 
 from __future__ import annotations
 

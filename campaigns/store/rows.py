@@ -29,6 +29,7 @@ ROWS_FILE = "cases.sqlite"
 STORE_VERSION = 2
 #: Identifier of the file type (`PRAGMA application_id`): "Mars".
 _APPLICATION_ID = int.from_bytes(b"Mars", "big")
+#: SQL of an empty store. The journal mode DELETE leaves no second file when the new store is renamed.
 _TABLES = f"""
 PRAGMA journal_mode = DELETE;
 PRAGMA application_id = {_APPLICATION_ID};

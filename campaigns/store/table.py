@@ -1,7 +1,7 @@
-"""Parquet table of a campaign, written from its row store in row groups to limit memory, and selection of cases.
+"""Parquet table of a campaign's rows: it is written from the row store, in row groups to limit memory, and read.
 
 A layout is the tuple of column names of a stored row (`marsyard.campaigns.store.rows`): rows of one campaign can have
-different columns.
+different columns. The module also selects the showcase of a report and the cases with the largest errors.
 """
 
 from __future__ import annotations

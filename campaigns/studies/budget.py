@@ -191,6 +191,7 @@ def start_budget(
         if not error_sources(scenario):
             reason = f"has the scenario '{scenario}', which names no sources of error"
         raise CampaignError(f"campaign '{campaign.configuration.name}' {reason}; allowed: --sobol N")
+    # Saltelli's design has d + 2 cases per base sample for d variables: the dispersions and the random streams
     n_cases = settings.cases * len(list_configurations(sources)) if sources else 0
     n_cases += settings.sobol * (len(campaign.drawn_paths) + 3) if settings.sobol else 0
     session = StudySession(
@@ -324,9 +325,11 @@ class _Study:
             ]
             rows = self._runner.run(candidates)
             errors[:, list(cases)] = np.reshape([self._error(row) for row in rows], (len(cases), -1)).T
-            complete = rows[:: len(configurations)]
-            violations += sum(compute_margin(row, self._requirement) < 0.0 for row in complete)
-            terrains += [str(row.get("terrain", f"case {case}")) for case, row in zip(cases, complete, strict=True)]
+            # the first configuration is that with all sources
+            rows_all_sources = rows[:: len(configurations)]
+            violations += sum(compute_margin(row, self._requirement) < 0.0 for row in rows_all_sources)
+            names = [str(row.get("terrain", f"case {case}")) for case, row in zip(cases, rows_all_sources, strict=True)]
+            terrains += names
         return errors, np.unique(terrains, return_inverse=True)[1], violations
 
     def _run_design(self) -> tuple[tuple[SobolIndex, ...], int]:
@@ -343,8 +346,8 @@ class _Study:
         errors: list[float] = []
         block = len(paths) + 2
         for first in range(0, len(uniform), block):
-            part = range(first, first + block)
-            rows = self._runner.run([Candidate(tuple(coordinates[i].tolist()), int(streams[i])) for i in part])
+            cases = range(first, first + block)
+            rows = self._runner.run([Candidate(tuple(coordinates[i].tolist()), int(streams[i])) for i in cases])
             errors += [self._error(row) for row in rows]
         return compute_indices(np.array(errors), problem, self._settings.confidence, seed)
 
@@ -373,9 +376,11 @@ def compute_budget(
     group_numbers = np.unique(groups[is_common], return_inverse=True)[1]
     n_groups = int(group_numbers.max()) + 1
     rng = np.random.default_rng(0)
+    # row 0 of all arrays below: original sample; other rows: bootstrap resamples
     resampled = rng.multinomial(n_groups, np.full(n_groups, 1.0 / n_groups), size=_RESAMPLES)
     weights = np.concatenate([np.ones((1, group_numbers.size)), resampled[:, group_numbers]])
     weights /= weights.sum(axis=1, keepdims=True)
+    # mean square of each configuration
     squares = weights @ (values**2).T
     if is_centred:
         squares = squares - (weights @ values.T) ** 2

@@ -1,8 +1,8 @@
 """Importance sampling around known violations: cases are drawn where violations occur, and weighted.
 
-The sampling density is a mixture of the nominal density and of standard normal densities that are shifted to the
-centres of clusters of violations (Melchers 1989, Structural Safety 6, 3-10). A tenth of the cases come from the nominal
-density, so no weight exceeds ten.
+Cases are points in standard normal space, so their nominal density is the standard normal one. The sampling density is
+a mixture of the nominal density and of normal densities of unit variance at the centres of clusters of violations
+(Melchers 1989, Structural Safety 6, 3-10). A tenth of the cases come from the nominal density: weights are below ten.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Intervals of a small probability from independent replicates, and the verdict on its upper limit."""
+"""Intervals of a small probability from independent simulations (replicates), and the verdict on its upper limit."""
 
 from __future__ import annotations
 
@@ -37,6 +37,8 @@ class ProbabilityInterval:
 
 def replicate_interval(estimates: Sequence[float], reached: Sequence[bool], confidence: float) -> ProbabilityInterval:
     """Compute the interval of a probability from independent estimates, at least two.
+
+    reached: whether each replicate reached a violation
 
     Estimates of subset simulations are close to lognormal and unbiased. The interval is Cox's for the mean of a
     lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13): with the mean m

@@ -48,9 +48,9 @@ from marsyard.sim.streams import Streams
 
 #: Value of the key `kind` in the settings of this study.
 KIND = "rare"
-#: Methods: the verdict rests on the replicates of subset simulation, or on importance sampling after them.
+#: Methods that decide the verdict: subset simulation, or importance sampling around the violations that it found.
 METHODS = ("subset", "importance")
-#: Fraction of the limit at which subset simulation stops: levels less likely than this cannot change the verdict.
+#: Subset simulation stops at levels less likely than this fraction of the limit, which cannot change the verdict.
 _MIN_PROBABILITY_FRACTION = 0.01
 #: Minimum number of effective violations (Kish) at which the interval of importance sampling is used.
 MIN_EFFECTIVE_VIOLATIONS = 30.0

@@ -1,4 +1,6 @@
-"""Run and continue studies, which choose their cases: points in standard normal space (`sampling.points`).
+"""Run and continue studies (`rare`, `search`, `budget`), which choose the points of their cases.
+
+A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.points`).
 
 A study is a deterministic function of its settings and of the rows of its cases. To continue an interrupted study, it
 is run again from its start. Cases with a stored row are not run again: their rows are read.

@@ -304,7 +304,11 @@ class SearchStudy:
             remaining = [item for item, is_similar in zip(remaining, has_same_cause, strict=True) if not is_similar]
             values = self.campaign.draws_at(reduction.point)
             failure_index = next(
-                (index for index, other in enumerate(reduced_points) if _is_close(reduced_coordinates, paths, other)),
+                (
+                    index
+                    for index, other in enumerate(reduced_points)
+                    if _have_same_cause(reduced_coordinates, paths, other)
+                ),
                 None,
             )
             if failure_index is not None:
@@ -332,24 +336,24 @@ class SearchStudy:
     def _remove_dispersions(self, failure: _Evaluated) -> _Evaluated:
         """Reset groups of dispersions to the campaign's parameters, as long as the case remains a violation."""
         paths = [path for path in self.campaign.drawn_paths if path not in failure.point.nominal]
-        groups = 2
+        group_count = 2
         while paths:
-            size = math.ceil(len(paths) / groups)
-            parts = [paths[start : start + size] for start in range(0, len(paths), size)]
+            size = math.ceil(len(paths) / group_count)
+            groups = [paths[start : start + size] for start in range(0, len(paths), size)]
             candidates = [
-                Candidate(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *part))
-                for part in parts
+                Candidate(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *group))
+                for group in groups
             ]
             trials = self._evaluate(candidates)
-            removed_part = next((index for index, item in enumerate(trials) if item.margin < 0.0), None)
-            if removed_part is not None:
-                failure = trials[removed_part]
-                paths = [path for path in paths if path not in parts[removed_part]]
-                groups = max(groups - 1, 2)
+            removed_group = next((index for index, item in enumerate(trials) if item.margin < 0.0), None)
+            if removed_group is not None:
+                failure = trials[removed_group]
+                paths = [path for path in paths if path not in groups[removed_group]]
+                group_count = max(group_count - 1, 2)
             elif size == 1:
                 break
             else:
-                groups = min(2 * groups, len(paths))
+                group_count = min(2 * group_count, len(paths))
         return failure
 
     def _shrink(self, failure: _Evaluated) -> _Evaluated:
@@ -370,7 +374,7 @@ class SearchStudy:
         return failure
 
 
-def _is_close(coordinates: np.ndarray, paths: list[str], other: tuple[list[str], np.ndarray]) -> bool:
+def _have_same_cause(coordinates: np.ndarray, paths: list[str], other: tuple[list[str], np.ndarray]) -> bool:
     """Whether two reduced violations have the same dispersions, with similar coordinates."""
     return paths == other[0] and float(np.linalg.norm(coordinates - other[1])) <= _MAX_CAUSE_DISTANCE
 

@@ -4,8 +4,8 @@ Au & Beck 2001, Probabilistic Engineering Mechanics 16, 263-277. A violation is 
 the cases with a margin of at most its threshold, a quantile of the previous level's margins. Cases of a level are drawn
 by Markov chains that start at the cases of the previous level below the threshold: conditional sampling with an
 adaptive step in standard normal space (Papaioannou et al. 2015, Probabilistic Engineering Mechanics 41, 89-103,
-algorithm with acceptance 0.44). The random streams of a case are a further variable: a step draws them again with
-probability 0.25, and keeps them otherwise.
+algorithm with acceptance 0.44). The random streams of a case are a further variable: a step replaces them by new ones
+with probability 0.25.
 
 The estimated coefficient of variation of one run is too small, because its chains are correlated. Intervals therefore
 use the spread of independent replicates (`marsyard.campaigns.studies.interval`).
@@ -74,7 +74,10 @@ SubsetRun = Generator[Proposals, Evaluated, SubsetResult]
 
 
 def subset_simulation(dimension: int, samples: int, min_probability: float, rng: np.random.Generator) -> SubsetRun:
-    """Run one subset simulation with `samples` cases per level; stop at levels less likely than `min_probability`."""
+    """Run one subset simulation with `samples` cases per level; stop at levels less likely than `min_probability`.
+
+    `dimension` is the number of standard normal variables.
+    """
     coordinates = rng.standard_normal((samples, dimension))
     evaluated = yield Proposals(coordinates, np.full(samples, NEW_STREAM))
     streams, margins = evaluated.streams, evaluated.margins

@@ -1,4 +1,4 @@
-"""Read a camera calibration by OpenCV, ROS or Kalibr: accuracy of the conversion, use in a campaign, projection."""
+"""Read a camera calibration of OpenCV, ROS or Kalibr: error of its conversion, use in a campaign, projection."""
 
 import tempfile
 from pathlib import Path
@@ -28,5 +28,6 @@ with tempfile.TemporaryDirectory() as folder:
     campaign = marsyard.load_campaign("dimes-smoke", changes)
     print("columns:", campaign.configuration.parameters["camera"]["model"]["columns"])
 
+# project a point, m, in the frame of the calibration: x right, y down, z forward
 pixel, is_visible = calibration.camera.project(np.array([0.2, -0.1, 1.0]))
 print("pixel:", pixel.round(2), "visible:", bool(is_visible))

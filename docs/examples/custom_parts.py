@@ -69,6 +69,7 @@ class PulsedLidar:
         """Return the altitudes of one descent."""
         scale = 1.0 + self.scale_error * rng.standard_normal()
         times = truth.times_s - self.delay_s
+        # the maximum range is 10 km
         ranges = np.array([truth.first_return_m(time, 0.5 * self.beam_deg, 10000.0) for time in times])
         cos_tilt = np.array([truth.motion.state(time).attitude.as_matrix()[2, 2] for time in times])
         altitudes = scale * ranges * cos_tilt + self.noise_m * rng.standard_normal(times.size)
@@ -91,7 +92,7 @@ class StarTracker:
         return InstrumentReadings(truth.times_s, attitudes.as_quat())
 
 
-MASS_KG = 533.0
+MASS_KG = 533.0  # lander with rover
 
 
 def lateral_impact(case: ScoredDescent) -> dict[str, float | bool]:

@@ -4,7 +4,7 @@ import marsyard
 
 campaign = marsyard.load_campaign(
     "dimes-smoke",
-    # a small terrain (4 km) is built quickly; terrains of sites are 4 to 8 km wide with finer samples
+    # a terrain of 4 km with coarse samples is built quickly; terrains of sites have finer samples
     {"terrain.samples": 512, "terrain.spacing_m": 8.0, "location.bank": 1, "location.terrain": 0},
 )
 case = marsyard.run_case(campaign, 3)

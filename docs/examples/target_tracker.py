@@ -3,9 +3,9 @@
     marsyard run vtt-montecarlo -n 20 --algorithm "exec:python docs/examples/target_tracker.py" --algorithm vtt
     marsyard conformance "exec:python docs/examples/target_tracker.py" --task tracking
 
-The template of the last stop is searched in the left image without correction of scale or roll. Its patch is then
-searched in the right image. The target is the point nearest to both lines of sight. The program uses Marsyard's readers
-for files; a program in another language reads the files itself (docs/custom-algorithms.md).
+The template of the last stop is searched in the left image without correction of scale or roll. The patch around the
+match is then searched in the right image. The target is the point nearest to both lines of sight. The program uses
+Marsyard's readers for files; a program in another language reads the files itself (docs/custom-algorithms.md).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, R
 HALF_PX = 10  # half of the template: its side is 2 * HALF_PX + 1 pixels
 SEARCH_PX = 70  # maximum distance from the predicted pixel, and maximum disparity error
 STEREO_ROWS_PX = 3  # maximum distance from the predicted row in the right image
-MIN_SCORE = 0.7
+MIN_SCORE = 0.7  # minimum normalised correlation
 ASSUMED_RANGE_M = 6.0  # range of a target that was designated by its pixel
 
 
@@ -168,6 +168,7 @@ def intersect_rays(left: CameraModel, left_px: np.ndarray, right: CameraModel, r
 def main() -> None:
     """Answer the requests on standard input, one per line, until the input ends."""
     tracker = WholePixelTracker()
+    # "exchange" is the version of the exchange format (docs/custom-algorithms.md)
     print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)

@@ -18,7 +18,7 @@ from marsyard.sim.measurements import DescentMeasurements
 HALF_SIZE_PX = (20, 5)  # half of a template: columns, rows
 SEARCH_PX = (48, 14)  # maximum distance from the predicted position: columns, rows
 MIN_CORRELATION = 0.6
-MIN_TRACKS = 3
+MIN_TRACKS = 3  # minimum number of matched templates
 MIN_VARIANCE_M2_S2 = 0.01  # due to attitude errors, which are common to all templates
 
 

@@ -203,6 +203,7 @@ def main() -> None:
     """Answer the requests on standard input, one per line, until the input ends."""
     uses_increments = "--increments" in sys.argv
     stream = IntegratedShifts() if uses_increments else ChainedShifts()
+    # "exchange" is the version of the exchange format (docs/custom-algorithms.md)
     print(json.dumps({"exchange": 2, "ready": True}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)

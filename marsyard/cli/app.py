@@ -30,7 +30,7 @@ from marsyard.cli.terrain import gallery, render
 
 
 class _FlagsWithoutType:
-    """Mixin that hides the value type of flags in the help of a command or group."""
+    """Mixin that hides the value type of flags (options without a value) in the help of a command or group."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the parameters; the value type of flags is removed."""

@@ -1,4 +1,4 @@
-"""Commands `marsyard run`, `resume`, `append` and `replay`: run campaigns and rerun cases."""
+"""Commands `marsyard run`, `resume`, `append` and `replay`: run or continue campaigns, and run single cases again."""
 
 from __future__ import annotations
 

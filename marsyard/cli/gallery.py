@@ -155,6 +155,7 @@ def draw_contact_sheet(images: Sequence[GalleryImage]) -> bytes:
     cell_width, cell_height = CELL_PX
     rows = -(-len(images) // COLUMNS)
     size = (rows * (cell_height + LABEL_PX + GAP_PX) + GAP_PX, COLUMNS * (cell_width + GAP_PX) + GAP_PX)
+    # grey levels: background 24, labels 235
     sheet = np.full(size, 24, dtype=np.uint8)
     for number, image in enumerate(images):
         top = GAP_PX + number // COLUMNS * (cell_height + LABEL_PX + GAP_PX)

@@ -209,7 +209,7 @@ def _expose(
     height = float(position[2]) - float(ground.surface.height(*position[:2]))
     hazy_radiance = add_haze(frame, environment, sun, environment.mean_extinction_m(height))
     radiance = hazy_radiance * np.float32(environment.direct_fraction(math.radians(request.sun_elevation_deg)))
-    # the random stream keeps its former name, so that the random values do not change
+    # the name of a random stream determines its values, so that it must not change
     auto_exposure = sensor.auto_expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )

@@ -75,7 +75,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def night_seed(seed: int, night: int) -> int:
-    """Derive the root seed of a night by hashing the plan's seed and the night's number."""
+    """Derive the root seed of a night (56 bits) by hashing the plan's seed and the night's number."""
     digest = hashlib.sha256(f"{seed}:{night}".encode()).digest()
     return int.from_bytes(digest[:7], "little")
 

@@ -1,4 +1,4 @@
-"""Commands `marsyard conformance`, `export`, `score` and `dataset`: check and score algorithms, export data."""
+"""Commands `marsyard conformance`, `export`, `score`, `dataset`: check algorithms, export data, score answers."""
 
 from __future__ import annotations
 

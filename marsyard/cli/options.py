@@ -1,4 +1,4 @@
-"""Options, arguments, exit status, error handling and console used by several commands."""
+"""Options, arguments, exit status, error handling and console of several commands of `marsyard`."""
 
 from __future__ import annotations
 
@@ -44,6 +44,7 @@ MaxHolesOption = Annotated[
 ]
 CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
 SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]
+#: Default record of confirmations.
 CONFIRMATIONS = Path("confirmations.jsonl")
 ConfirmationsOption = Annotated[
     Path, Option(metavar="FILE", help="Record of confirmations; keep it under version control.")

@@ -1,6 +1,6 @@
-"""Work of the commands before and after the cases of a campaign: estimate, evaluation, report and dashboard server.
+"""Functions of the commands that run or report campaigns: time estimate, evaluation, report, dashboard server.
 
-Sequential runs (`--until-decided`) and reruns of notable cases are also here.
+The module also runs campaigns until their verdicts are decided (`--until-decided`), and reruns cases for their images.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ def rerun_notable_cases(directory: Path) -> None:
             typer.echo(f"case {case}: rerun for its images{differences}")
 
 
-#: Maximum number of cases whose distinct terrains are counted; the draws of a case take milliseconds.
+#: Maximum number of cases that are drawn to count their distinct terrains; the draws of a case take milliseconds.
 _MAX_DRAWS = 5000
 
 

@@ -27,7 +27,12 @@ _MAX_DEPTH = 3
 
 @dataclass(frozen=True)
 class RequirementVerdict:
-    """Verdict of a campaign on one requirement."""
+    """Verdict of a campaign on one requirement, from `report.json`; see `marsyard.reports.verdicts.Verdict`.
+
+    - margin: value that decides (lower bound or rate) minus the required probability; NaN if unknown
+    - n, failures: number of cases of the population, and of those that violate the requirement
+    - all_cases: text with the failures over all cases; empty if the population is all cases
+    """
 
     requirement: str
     statement: str
@@ -134,7 +139,9 @@ def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
 
 
 def _read_entry(path: Path) -> Entry:
-    file, report = path / REPORT_JSON, table(None)
+    """Read one campaign; its report is written first if it is missing, outdated or of another schema."""
+    file = path / REPORT_JSON
+    report: Mapping[str, Any] = {}
     with suppress(OSError, ValueError):
         report = table(json.loads(file.read_text(encoding="utf-8")))
     if report.get("schema") != SCHEMA or file.stat().st_mtime < (path / TABLE_FILE).stat().st_mtime:
@@ -169,6 +176,7 @@ def _read_entry(path: Path) -> Entry:
 
 
 def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:
+    """Read a verdict of `report.json`."""
     values: dict[str, Any] = {
         name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
     }
@@ -220,7 +228,11 @@ _MAX_POINTS, _WIDTH_PX, _HEIGHT_PX = 24, 120.0, 26.0
 
 @dataclass(frozen=True)
 class Sparkline:
-    """Observed rates over time, oldest first: points of the line, last point, y of the required rate, and a text."""
+    """Line of the observed rates over time, oldest first, in pixels of an SVG image.
+
+    - points: points of the line as SVG text ("x,y x,y"); last: the last point
+    - required_y: y of the line of the required rate; text: description of the line
+    """
 
     points: str
     last: tuple[float, float]

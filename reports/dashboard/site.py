@@ -48,6 +48,7 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
     """
     entries, problems = stored.read_entries(stored.find_campaigns(sources))
     rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)
+    # the pages of a campaign are in the folder c/SLUG
     (directory / "c").mkdir(parents=True, exist_ok=True)
     for entry in entries:
         _write_campaign(directory / "c" / entry.slug, entry)

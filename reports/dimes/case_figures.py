@@ -36,6 +36,7 @@ _IN_PER_UNIT = 8.3 / 4.9
 _RECTIFIED_PX = 384
 #: Valid template numbers. The figure shows at most `_MAX_TRACKS` templates per pair; the table lists all.
 _TEMPLATE_NUMBERS = range(100)
+#: Matplotlib line style of tracks that failed a validity check: offset, and lengths of dash and gap.
 _DASHED = (0, (2, 1.5))
 
 
@@ -165,6 +166,11 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
 def _draw_rectified(
     axes: Axes, products: Mapping[str, Any], image: Image, pair_tracks: Sequence[Track], pair: int, image_index: int
 ) -> None:
+    """Draw an image of a pair, rectified, with its templates (first image) or windows and matches (second image).
+
+    `rectified_frame_<pair>` contains west and north edge and spacing of the lattice, metres; `gsd_<pair>` is the pixel
+    size of templates and windows, metres (`marsyard.algorithms.dimes.details`).
+    """
     lattice = numeric_product(products.get(f"rectified_{pair}_{image_index}"))
     frame, gsd = numeric_product(products.get(f"rectified_frame_{pair}")), numeric_product(products.get(f"gsd_{pair}"))
     if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
@@ -198,7 +204,7 @@ def _draw_rectified(
 
 
 def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
-    """Rectify an image by a lattice of ground points with their pixels (u, v); NaN outside the image."""
+    """Rectify an image by a square lattice of ground points with their pixels (u, v); NaN outside the image."""
     indices = np.linspace(0.0, lattice.shape[0] - 1.0, _RECTIFIED_PX)
     v, u = np.meshgrid(indices, indices, indexing="ij")
     pixels = [ndimage.map_coordinates(lattice[..., component], [v, u], order=1, mode="nearest") for component in (1, 0)]
@@ -209,6 +215,7 @@ def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndar
 
 
 def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
+    """Draw the template and the search window of a track on two axes, and the match in the window."""
     line = "-" if track.valid else _DASHED
     parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
     for panel, (image, title, colour, style) in zip(axes, parts, strict=True):
@@ -224,6 +231,7 @@ def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
 
 
 def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], prefix: str, colour: str) -> None:
+    """Draw squares with template numbers at the `template` or `match` pixels (`prefix`) of the tracks."""
     box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
     for track in pair_tracks:
         u, v = track.values.get(f"{prefix}_u", np.nan), track.values.get(f"{prefix}_v", np.nan)

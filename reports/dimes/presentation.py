@@ -1,4 +1,7 @@
-"""Presentation of descents: report sections, and views of DIMES cases and of velocity streams."""
+"""Presentation of descents in reports: sections, and views of single cases (figures and a table).
+
+A DIMES case has three images. A velocity stream is an algorithm that answers after each of any number of images.
+"""
 
 from __future__ import annotations
 
