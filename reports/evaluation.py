@@ -1,4 +1,7 @@
-"""Evaluation of a stored campaign: overall verdict, exit status, and the next evaluation of a sequential campaign."""
+"""Evaluation of a stored campaign: overall verdict, exit status, and the next evaluation of a sequential campaign.
+
+A study is a run of `marsyard rare`, `search` or `budget`; its verdict does not follow from success rates.
+"""
 
 from __future__ import annotations
 
@@ -120,7 +123,8 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
 class Evaluation:
     """A stored campaign with its sampling design, its verdicts, and what they are evidence for.
 
-    - evidence: whether the run is a confirmation of a frozen algorithm, for example; some kinds allow no PASS
+    - evidence: kind of evidence; a confirmation is a run with a new seed after the algorithm was frozen, a calibration
+      allows no PASS
     - verdicts: verdict of each requirement; empty for a study
     """
 

@@ -1,4 +1,4 @@
-"""Masks of the populations of stored rows; rates with their intervals, and their texts."""
+"""Boolean masks of populations (subsets of a campaign's cases), rates with confidence intervals, and their texts."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ THRESHOLD = section_kinds.SectionDeclaration(
 
 
 def _describe_fault(fault: str, size: float) -> tuple[str, str]:
-    """Return the name of a fault, and its size with the unit; the size is empty if it is NaN or has no unit."""
+    """Return the name of a fault, and its size with the unit; the size is empty if it is NaN, or without a unit."""
     description = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
     name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
