@@ -20,9 +20,10 @@ from matplotlib.ticker import MaxNLocator
 from marsyard.reports.section import GRID, INK, MAX_VECTOR_POINTS, MUTED, RASTER_DPI, SERIES, in_page_style
 from marsyard.reports.wording import count, rank_correlation, split_unit
 
-#: Size of a marginal, height of a heading and margin of the figure, inches; minimum number of marginals in a row.
+#: Width and height of the panel of one distribution, height of a heading and margin of the figure, inches; number of
+#: panels that always fit in a row.
 _WIDTH_IN, _HEIGHT_IN, _HEADING_HEIGHT_IN, _MARGIN_IN, _MIN_PER_ROW = 3.0, 1.9, 0.45, 0.15, 4
-#: Side of the cell of a pair, inches, and maximum number of parameters in the pairs.
+#: Side of the panel of two parameters, inches, and maximum number of parameters that are drawn in pairs.
 _CELL_SIDE_IN, MAX_PAIRED = 0.95, 24
 _CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "color": INK}
 #: Maximum number of bars with labels; maximum number of histogram bins.

@@ -1,4 +1,7 @@
-"""Evaluation of a stored campaign: overall verdict, exit status, and the next evaluation of a sequential campaign."""
+"""Evaluation of a stored campaign: overall verdict, exit status, and the next evaluation of a sequential campaign.
+
+A study is a run of `marsyard rare`, `search` or `budget`; its verdict does not follow from success rates.
+"""
 
 from __future__ import annotations
 
@@ -118,7 +121,12 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A stored campaign with its sampling design, its kind of evidence and its verdicts."""
+    """A stored campaign with its sampling design, its verdicts, and what they are evidence for.
+
+    - evidence: kind of evidence; a confirmation is a run with a new seed after the algorithm was frozen, a calibration
+      allows no PASS
+    - verdicts: verdict of each requirement; empty for a study
+    """
 
     run: StoredRun
     sampling: SamplingDesign
@@ -143,6 +151,7 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
         return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(study, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     columns = _read_columns(str(run.configuration.get("scenario") or ""))
+    # columns that are computed from the truth, and columns that the configuration of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
     verdicts = [withhold_verdict(verdict, evidence) for verdict in verdicts]

@@ -34,7 +34,7 @@ from marsyard.reports.wording import count as count_text
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95
-#: Maximum end of an error axis divided by the bound; larger errors are counted, not drawn to scale.
+#: Maximum end of an error axis divided by the requirement's bound; larger errors are counted, not drawn to scale.
 _MAX_EDGE_RATIO = 3.0
 #: If all errors are below this fraction of the bound, an axis does not include the bound.
 _MIN_BOUND_FRACTION = 0.6

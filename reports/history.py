@@ -44,7 +44,7 @@ class NightCampaign:
 
 @dataclass(frozen=True)
 class NightMetric:
-    """One metric of a campaign in a night; `value` is the rate or the median error, `sample` contains the cases."""
+    """One metric of a campaign in a night; `value`: rate or median error; `sample`: values of the cases."""
 
     name: str
     is_rate: bool
@@ -54,7 +54,7 @@ class NightMetric:
 
 @dataclass(frozen=True)
 class Night:
-    """A stored night."""
+    """A stored night: number, start and end, state (running, finished or interrupted), and commit of the program."""
 
     night: int
     started_utc: str
@@ -64,7 +64,10 @@ class Night:
 
 
 class History:
-    """The history as a context manager with atomic writes; a missing file is created.
+    """Database of the results of nightly runs, as a context manager with atomic writes; a missing file is created.
+
+    The SQL table `figures` contains the metrics: `figure` is the name, `rate` is 1 for a rate, `level` is the value,
+    and `amounts` are the values of the cases.
 
     Raises StoreError if the file cannot be opened, is not a history, or has another version.
     """
@@ -224,7 +227,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A metric of one night, and its samples in earlier nights."""
+    """A metric of one night, and its samples in earlier nights (`before`)."""
 
     campaign: str
     metric: NightMetric

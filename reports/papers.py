@@ -26,9 +26,10 @@ def read_paper(path: Path) -> Mapping[str, Any]:
 
 @dataclass(frozen=True)
 class PaperFacts:
-    """A paper's numbers of single runs next to those of Marsyard: `[[facts]]` of its TOML file.
+    """Section of the report with a paper's numbers of a single run next to those of the campaign that repeats it.
 
-    Keys: `campaign` (that repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row:
+    The paper's TOML file contains a table `[[facts]]` for each run. Its keys are `campaign` (name of the campaign that
+    repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row:
 
     - `name` with its unit, `paper` (text, a dash by default), `column`
     - optional: `statistic` (``spread``: median, minimum and maximum; or ``rate``), `among` (flags that select rows),

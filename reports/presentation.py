@@ -1,7 +1,8 @@
 """Presentation of a system (DIMES, for example): its report sections, and the views of its cases on the page.
 
-Cases with stored products can be drawn. The gallery consists of the cases that the page shows: some of the cases with
-stored products. Notable cases are those that `marsyard report --gallery` reruns, in order to store their products.
+Products are the arrays and texts that a case stores for its figures. The gallery consists of the cases that the page
+shows: some of the cases with stored products. Notable cases are those that `marsyard report --gallery` reruns, in order
+to store their products.
 
 Each system of `marsyard.scenarios.systems` defines the import path of its presentation in `System.report`.
 """
@@ -57,7 +58,7 @@ class CaseView:
 
 @dataclass(frozen=True)
 class CaseKind:
-    """Functions that draw the cases of one kind from their products.
+    """Functions that draw the cases of one kind (landings, for example) from their products.
 
     - is_case: return whether the products are those of this kind of case
     - view: create the view for the page; the text argument prefixes the identifiers of figures

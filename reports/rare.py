@@ -130,6 +130,10 @@ def rare_section(subject: Subject) -> Section | None:
 
 @in_page_style
 def _draw_levels(replicates: list[Mapping[str, Any]], max_probability: float) -> Figure:
+    """Draw the probability of a margin at or below the threshold of each level, a line for each replicate.
+
+    A replicate that reached a violation also has the point of margin 0: its estimated probability of a violation.
+    """
     figure, axes = new_axes(6.0, 3.4)
     for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
         thresholds = [value for value in replicate["thresholds"] if value is not None]

@@ -1,4 +1,4 @@
-"""Masks of the populations of stored rows; rates with their intervals, and their texts."""
+"""Boolean masks of populations (subsets of a campaign's cases), rates with confidence intervals, and their texts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 
     is_finished = ~engine_failed(frame)
     if math.isnan(bound):
         return np.asarray(flag_mask(frame, metric) & is_finished, dtype=np.bool_)
-    values = sum((numbers(frame, part) for part in metric.split(" + ")), np.zeros(len(frame)))
+    values = sum((numbers(frame, column) for column in metric.split(" + ")), np.zeros(len(frame)))
     return np.asarray((np.abs(scale * values) <= bound) & is_finished, dtype=np.bool_)
 
 
@@ -40,11 +40,11 @@ def population_mask(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " 
 
 
 def population_and_unknown_masks(
-    frame: pd.DataFrame, parts: Sequence[str]
+    frame: pd.DataFrame, populations: Sequence[str]
 ) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Create the masks of the intersection of populations, and of its cases with a missing flag."""
     is_member, is_unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
-    for population in parts:
+    for population in populations:
         if population == "completed":
             is_member &= ~engine_failed(frame)
         elif population != "all":
@@ -70,8 +70,11 @@ def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
 
 
 def population_mask_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Create the mask of a population, extended by the unfinished cases that would belong to it with a valid answer."""
-    flags = [part for part in population.split(" and ") if part not in ("valid", "completed")]
+    """Create the mask of a population, extended by the unfinished cases that would belong to it with a valid answer.
+
+    The populations `valid` and `completed` exclude unfinished cases; here only the other flags decide for such cases.
+    """
+    flags = [name for name in population.split(" and ") if name not in ("valid", "completed")]
     return np.asarray(
         population_mask(frame, population) | (population_and_unknown_masks(frame, flags)[0] & engine_failed(frame))
     )
@@ -90,6 +93,7 @@ def terrain_groups(frame: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
 
 #: Confidence of the two-sided intervals.
 CONFIDENCE = 0.9
+#: Number of bootstrap samples.
 _N_RESAMPLES = 1000
 #: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 2005

@@ -47,7 +47,7 @@ BARS: Mapping[str, Mapping[str, Any]] = {
 
 #: Maximum number of points drawn as vectors; more points are drawn as pixels, to keep pages small.
 MAX_VECTOR_POINTS = 800
-#: Dots per inch of parts drawn as pixels: twice the resolution of a screen.
+#: Dots per inch of elements drawn as pixels: twice the resolution of a screen.
 RASTER_DPI = 160
 
 _STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
@@ -74,7 +74,7 @@ def _page_style(**settings: str) -> Iterator[None]:
 
 
 def new_axes(width: float, height: float) -> tuple[Figure, Axes]:
-    """Create a figure with one pair of axes, size in inches; call it in the page's style."""
+    """Create a figure with one pair of axes, size in inches; the caller must be decorated with `in_page_style`."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.add_subplot()
 
@@ -114,7 +114,7 @@ def show_image(axes: Axes, image: Float[np.ndarray, "_ _"]) -> None:
 
 
 def show_subframe(axes: Axes, image: Float[np.ndarray, "_ _"], quantiles: tuple[float, float] = (0.01, 0.99)) -> None:
-    """Draw an image in grey pixel by pixel, its contrast stretched between two quantiles."""
+    """Draw part of an image in grey, pixels not interpolated, its contrast stretched between two quantiles."""
     finite = image[np.isfinite(image)]
     low, high = np.quantile(finite, quantiles) if finite.size else (0.0, 1.0)
     levels = np.clip((np.nan_to_num(image, nan=low) - low) / max(float(high - low), 1e-9), 0.0, 1.0)

@@ -109,11 +109,12 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
 def outcome_grid(frame: pd.DataFrame, scenario: str) -> Grid:
     """Count the cases by outcome, with the meaning of each outcome in the system of the scenario.
 
-    Systems have outcomes of the same name; those of other systems are used for a scenario without a system.
+    Several systems have outcomes of the same name: the meaning in the scenario's own system takes precedence.
     """
-    own = system_presentation(scenario)
-    others = [presentation for presentation in presentations() if presentation is not own]
-    ordered = others if own is None else [*others, own]
+    own_presentation = system_presentation(scenario)
+    others = [presentation for presentation in presentations() if presentation is not own_presentation]
+    # later meanings replace earlier ones
+    ordered = others if own_presentation is None else [*others, own_presentation]
     kinds: list[type[Enum]] = [Fault, *(kind for presentation in ordered for kind in presentation.outcomes)]
     meanings = {member.name: str(member.value) for kind in kinds for member in kind}
     n_cases, counts = len(frame), outcome_counts(frame)

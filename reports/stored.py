@@ -144,6 +144,7 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         if isinstance(requirement_list, list)
         else []
     )
+    # columns of all cases that verdicts, outcomes and figures use
     columns = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
     for requirement in requirements:
         columns.update(

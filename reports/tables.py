@@ -136,7 +136,8 @@ def statistics_rows(summaries: Sequence[ErrorSummary]) -> list[list[str]]:
 def confirmations_table(entries: Sequence[Confirmation]) -> Table:
     """Create a table of confirmations (`marsyard run --confirm`) for terminals.
 
-    The column Number counts the confirmations of one algorithm on one campaign.
+    A confirmation is a run with a new seed after the algorithm was frozen. The column Number counts the confirmations
+    of one algorithm on one campaign.
     """
     table = Table(title="Confirmations", box=box.SIMPLE_HEAD, title_justify="left")
     for heading in ("Campaign", "Algorithm"):

@@ -25,7 +25,7 @@ _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "va
 
 
 def requirement_text(requirement: Any) -> str:
-    """Describe the criterion of a requirement (of a campaign or of a verdict) in words."""
+    """Describe the criterion of a requirement (of a campaign) or of a `Verdict` in words."""
     metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
     condition = _read_notes()["metrics"].get(metric, _to_words(metric if requirement.bound is None else name))
     if requirement.bound is not None and not math.isnan(requirement.bound):
@@ -50,7 +50,7 @@ def population_text(population: str) -> str:
 
 
 def number(value: float) -> str:
-    """Format a number with about three significant digits; a dash for NaN, 0 for rounding errors.
+    """Format a number with at least three significant digits; a dash for NaN, 0 for rounding errors.
 
     >>> number(1.23456), number(123.456), number(0.0123456), number(9.09e-13)
     ('1.235', '123.5', '0.0123', '0.000')
@@ -153,6 +153,7 @@ _PREFERRED_DRIVERS = (
     "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
     "pose_error_fraction", "rock_diameter", "disparity_error_goal",
 )  # fmt: skip
+#: Maximum number of distinct values of a column that divides the cases into categories.
 _MAX_CATEGORIES = 6
 
 

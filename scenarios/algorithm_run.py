@@ -71,28 +71,28 @@ def copy_inputs(original: Inputs, *, writable: bool = False) -> Inputs:
 
     Rotations and transforms are immutable and not copied: a copy would be normalised again, with different last digits.
     """
-    # `deepcopy` does not copy the objects of its memo
-    immutable = {id(part): part for part in _walk_values(original) if isinstance(part, Rotation | RigidTransform)}
+    # `deepcopy` does not copy the objects in its second argument
+    immutable = {id(item): item for item in _walk_values(original) if isinstance(item, Rotation | RigidTransform)}
     duplicate = copy.deepcopy(original, dict(immutable))
-    for part in _walk_values(duplicate):
-        if isinstance(part, np.ndarray):
-            part.flags.writeable = writable
+    for item in _walk_values(duplicate):
+        if isinstance(item, np.ndarray):
+            item.flags.writeable = writable
     return duplicate
 
 
 def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
     """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `excluded`."""
     digest = hashlib.sha256()
-    for part in _walk_values(value, excluded):
-        if isinstance(part, np.ndarray):
-            digest.update(f"{part.dtype}{part.shape}".encode())
-            digest.update(np.ascontiguousarray(part).data)
-        elif isinstance(part, Rotation):
-            digest.update(part.as_quat().tobytes())
-        elif isinstance(part, RigidTransform):
-            digest.update(part.as_matrix().tobytes())
+    for item in _walk_values(value, excluded):
+        if isinstance(item, np.ndarray):
+            digest.update(f"{item.dtype}{item.shape}".encode())
+            digest.update(np.ascontiguousarray(item).data)
+        elif isinstance(item, Rotation):
+            digest.update(item.as_quat().tobytes())
+        elif isinstance(item, RigidTransform):
+            digest.update(item.as_matrix().tobytes())
         else:
-            digest.update(repr(part).encode())
+            digest.update(repr(item).encode())
     return digest.hexdigest()
 
 

@@ -38,6 +38,8 @@ class BaseScenario(Generic[ParametersType]):
 class TerrainScenario(BaseScenario[ParametersType], ABC):
     """A scenario whose shared inputs are terrains; the most recently used terrains are cached in memory.
 
+    `shared_input` is the number of an input that several cases use, one of `Scenario.shared_inputs`.
+
     - algorithm_table: path of the parameter table that selects the algorithms; by default the top level
     - part_keys: parameter keys that select custom parts, and the kind of each part; by default only scores
     """
@@ -58,7 +60,7 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
         bank.terrain(number)
 
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
-        """Return the bytes of a terrain that is not yet on disk; 0 otherwise."""
+        """Return the size in bytes of a terrain that is not yet in the cache on disk; 0 if it is."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         return bank.missing_bytes(number)
 

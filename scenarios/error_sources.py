@@ -72,6 +72,8 @@ def error_sources(scenario: str) -> tuple[ErrorSource, ...]:
     if system.error_sources is None:
         return ()
     try:
+        # a table contains sources by name; or `sources_of`, another scenario with the same sources, and `prefix`, the
+        # table of their parameters in this scenario
         scenarios = tomllib.loads(system.error_sources.read_text(encoding="utf-8"))
         tables = scenarios.get(scenario, {})
         prefix = tables.get("prefix", "")

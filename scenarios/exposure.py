@@ -110,7 +110,7 @@ def select_middle_rows(rows_summed: int) -> slice:
 
 @runtime_checkable
 class ProvidesSamples(Protocol):
-    """A scenario that provides samples for learning."""
+    """A scenario that provides images with ground truth, to train and test learned methods."""
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Yield the images of one case that `run` passes to its algorithms."""

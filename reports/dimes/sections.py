@@ -98,7 +98,7 @@ def field_test_section(subject: Subject) -> Section | None:
 
 
 def field_cells(subject: Subject) -> list[dict[str, Any]]:
-    """List the results of each category and run, first those of the paper in its order, then others."""
+    """List the results of each category and run: first those of the paper, in its order, then others."""
     frame, cells = subject.frame, []
     names = frame[["category", "run"]].dropna().drop_duplicates()
     pairs = [(str(category), str(run)) for category, run in names.itertuples(index=False)]
@@ -204,7 +204,7 @@ FIRING = section_kinds.SectionDeclaration(
     parts=(
         section_kinds.Statistics(_FIRING, note=_FIRING_NOTE),
         section_kinds.Quantiles(
-            # time available for the computation
+            # the computation of the velocity must end within this time
             [section_kinds.Quantity("firing_after_s")],
             {"Minimum": 0.0, "Median": 0.5, "Maximum": 1.0},
             heading="Time from the last image to thruster ignition",
@@ -252,6 +252,7 @@ def _landing_model(subject: Subject) -> dict[str, str]:
 
 
 def _create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
+    """Create the table of touchdown speeds with and without the correction: mean, quantiles, fractions above speeds."""
     columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
     groups = rates.terrain_groups(landings)
     change = columns[0] - columns[1]
@@ -309,6 +310,7 @@ LANDING = section_kinds.SectionDeclaration(
 #: Conditions that the paper compares (all of them must vary), and additional conditions.
 PAPER_CONDITIONS = ("descent_rate_m_s", "altitude_1_m", "attitude_rate_max_deg_s")
 ADDITIONAL_CONDITIONS = ("off_nadir_max_deg", "horizontal_speed_m_s", "sun_elevation_deg")
+#: Minimum number of errors for the section.
 MIN_CASES = 50
 #: Fixed seed of the bootstrap, for reproducible reports.
 _SEED = 20050815
@@ -316,9 +318,10 @@ _SEED = 20050815
 
 @dataclass(frozen=True)
 class ConditionEffect:
-    """Effect of one condition on the magnitude of the error; each triple contains a value and its interval.
+    """Effect of one condition on the magnitude of the error; each tuple contains an estimate and its two bounds.
 
     - low, high: 5 % and 95 % quantile of the condition
+    - rank_correlation: Spearman's rank correlation of condition and magnitude
     - coefficient: coefficient of a regression on all conditions, in standard deviations of condition and magnitude
     - effect: change of the mean magnitude from `low` to `high` in that regression, in the error's unit
     """

@@ -1,4 +1,4 @@
-"""Figures of one landing as Figs. 1 to 5 and 7 of `papers/vision-guided-landing.txt`.
+"""Figures of one landing, as Figs. 1 to 5 and 7 of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 
 Colours are those of the paper's text, in shades that colour-blind readers can distinguish. Fig. 2: cameras red and
 green, features white. Fig. 3: structure pixels red, segments green, matches blue. Maps: green, yellow and red. A black
@@ -29,7 +29,8 @@ Product = TypeVar("Product")
 GREEN, YELLOW, RED = "#009e73", "#f0e442", "#c83a12"
 BLUE, PURPLE, BLACK, WHITE = "#3da5ff", "#8f1fb0", "#000000", "#ffffff"
 TRACKED_COLOUR, LOST_COLOUR = "#f0a202", "#c9d1d9"
-#: Green in the lower half of the limit, yellow up to the limit, red above. The scale ends at twice the limit (1.0).
+#: Colours of slope and roughness, from 0 to twice the limit (1.0): green for small values, yellow up to the limit
+#: (0.5), red above.
 HAZARD_COLOURS = LinearSegmentedColormap.from_list(
     "hazard", [(0.0, GREEN), (0.2, GREEN), (0.42, YELLOW), (0.5, YELLOW), (0.5, RED), (1.0, "#7d1f06")]
 ).with_extremes(bad="#8a929b")
@@ -150,6 +151,7 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
 def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, truth: stages.GroundTruth) -> None:
     colour_scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
     map_axes.imshow(maps.safety, interpolation="nearest", **colour_scale)
+    # hazards (2) are also hatched, since colour must not be the only distinction
     if (maps.safety > 1.5).any() and (maps.safety < 1.5).any():
         map_axes.contourf(maps.safety, levels=[1.5, 2.5], colors="none", hatches=["////"])
     cells = maps.world_to_cell(truth.offset_from_nadir_m)
@@ -166,7 +168,7 @@ def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, tru
 
 @in_page_style
 def draw_site(products: Mapping[str, Any]) -> Figure:
-    """Draw Fig. 7 and Fig. 5 (B): the first image, the safe landing map and the site on it and on the terrain."""
+    """Draw Fig. 7 and Fig. 5 (B): the first image; safe landing map and site on the image, and on the terrain."""
     images = _require(stages.read_images(products), "images")
     maps = _require(stages.read_landing_maps(products), "maps")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")

@@ -1,4 +1,4 @@
-"""Section parts of hazard detection: missed hazards by size, and tracked features by the change between the images.
+"""Tables and figures of hazard detection: missed hazards by size, and tracked features by the change between images.
 
 "The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
@@ -54,7 +54,8 @@ class HazardClass:
         return f"> {self.low:g}" if math.isinf(self.high) else f"{self.low:g} to {self.high:g}"
 
 
-#: Rates of footprints over all flights: columns of the counted and of all footprints, by name.
+#: Rates of footprints over all flights: columns of the counted and of all footprints, by name. A large hazard has at
+#: least twice the roughness limit and a diameter of at least three map cells.
 RATES: Mapping[str, tuple[str, str]] = {
     "truly safe footprints with a detected hazard (false alarms)": ("false_alarms", "footprints_truly_safe"),
     "footprints classified as safe that are not truly safe": (
@@ -145,7 +146,11 @@ _MIN_SIZES = 3
 
 @dataclass(frozen=True)
 class SizeResult:
-    """Correctly tracked features of flights with a change of one signed size; `good`: number with good tracking."""
+    """Correctly tracked features of the flights with one change between the images.
+
+    - size: signed size of the change, in its unit
+    - flights, good: number of flights, and of flights with at least `GOOD_FRACTION` of their features tracked
+    """
 
     size: float
     tracked: PooledRate
@@ -155,11 +160,11 @@ class SizeResult:
 
 @dataclass(frozen=True)
 class TrackingCurve:
-    """Tracking against one of the changes of `paper.toml`.
+    """Tracked fraction against the size of one change between the images, which is an entry of `paper.toml`.
 
     - points: results by size, including zero change
-    - knee_up, knee_down: largest positive and negative change with an interpolated fraction of `GOOD_FRACTION`;
-      infinite if all fractions are larger, NaN if the campaign contains no change in that direction
+    - knee_up, knee_down: sizes of positive and negative change at which the tracked fraction falls below
+      `GOOD_FRACTION`, see `find_knee`
     """
 
     change: Mapping[str, Any]
@@ -168,7 +173,7 @@ class TrackingCurve:
     knee_down: float
 
     def knee_text(self, value: float, sign: float) -> str:
-        """Format a knee with its unit."""
+        """Format a knee with its unit; `sign` is that of its changes."""
         if math.isnan(value):
             return NOTHING
         if math.isinf(value):

@@ -32,7 +32,10 @@ _OMITTED_FIGURE = "fig1-tracks"
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a landing case; it contains only the images if no stage of the paper has results."""
+    """Create the view of a landing case; it contains only the images if no stage of the paper has results.
+
+    `key` is the prefix of the identifiers of figures.
+    """
     names = [name for name in available_figures(products) if name != _OMITTED_FIGURE]
     image_pair = stages.read_images(products)
     if not names and image_pair is not None:

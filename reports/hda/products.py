@@ -55,6 +55,8 @@ class EpipolarMatches:
 class LandingMaps:
     """The maps of a case on the cells of the elevation map; row 0 has the largest y.
 
+    The surface frame is level, with its origin at the first camera (`marsyard.algorithms.hda.estimator`).
+
     - elevation_m: height relative to the first camera
     - safety: 0 safe, 1 unknown, 2 hazard
     - pixels: pixel (u, v) of each cell's centre in the first image; extrapolated if the elevation is unknown

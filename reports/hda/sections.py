@@ -22,7 +22,7 @@ from marsyard.reports.wording import NOTHING, count, format_fraction, note_text,
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))
-#: Columns of all rows of landing cases.
+#: Columns by which rows of landing cases are recognized.
 _REQUIRED_COLUMNS = ("site_safe", "site_reported", "no_site_reported", "true_safe_fraction")
 #: Minimum number of cases with a map for the section on map errors.
 MIN_MAPS = 8
@@ -100,7 +100,7 @@ THRESHOLD = section_kinds.SectionDeclaration(
 
 
 def _describe_fault(fault: str, size: float) -> tuple[str, str]:
-    """Return the name of a fault, and its size with the unit; the size is empty if it is NaN or has no unit."""
+    """Return the name of a fault, and its size with the unit; the size is empty if it is NaN, or without a unit."""
     description = PAPER["fault_names"].get(fault, {"name": fault.replace("_", " "), "unit": "number"})
     name, unit = description["name"], description.get("unit")
     if unit is None or math.isnan(size):
@@ -132,7 +132,7 @@ def _median(frame: pd.DataFrame, column: str) -> float:
     return rates.quantile(rates.finite_values(frame, column), 0.5)
 
 
-def _two_digits(value: float) -> str:
+def _two_decimals(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.2f}"
 
 
@@ -147,8 +147,8 @@ FAULT_OUTCOMES = section_kinds.OutcomesBySize(
     cases="Flights",
     wording=_describe_fault,
     extra_columns=(
-        ("Touchdown error (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_digits),
-        ("Sink rate (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_digits),
+        ("Touchdown error (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_decimals),
+        ("Sink rate (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_decimals),
     ),
     caption="Solid bars: truly safe site. Hatched: 'no safe site'. Dotted: not converged. Cross-hatched: unsafe site.",
     note=note_text("hda.faults", confidence=format_fraction(CONFIDENCE)),
@@ -409,6 +409,7 @@ def run_times_section(subject: Subject) -> Section | None:
     # the factor scales the total run time to that of the paper
     factor, rows, data = paper_total_s / total_s, [], []
     for stage, median_s, p95_s in zip(stages, medians_s.tolist(), percentiles_95_s, strict=True):
+        # medians of the columns with the simulated parameters of the stage, such as the number of features
         sizes = [rates.quantile(rates.finite_values(rows_with_times, name), 0.5) for name in stage["ours"]]
         text = NOTHING if np.isnan(sizes).any() else stage["wording"].format(*sizes)
         seconds = {"paper_s": stage["seconds"], "median_s": median_s, "p95_s": p95_s, "scaled_s": factor * median_s}

@@ -13,26 +13,28 @@ from marsyard.reports.rates import finite_values
 from marsyard.reports.section import Block, Grid, Subject
 from marsyard.reports.wording import number
 
-#: Components of the horizontal position.
-_FREEDOM = 2
-_CONFIDENCE = 0.9
+#: Degrees of freedom: the components of the horizontal position.
+_DEGREES_OF_FREEDOM = 2
+#: Probability of the interval of the mean, and of the error ellipse.
+_PROBABILITY = 0.9
 
 
 def create_consistency_blocks(
     frame: pd.DataFrame, _subject: Subject, _key: str
 ) -> tuple[Sequence[Block], Mapping[str, Any]]:
-    """Compare the normalised squared errors with the chi-square distribution with two degrees of freedom."""
+    """Compare the normalised squared errors (NEES) with the chi-square distribution with two degrees of freedom."""
     nees = finite_values(frame, "position_nees")
     if nees.size == 0:
         return [], {}
-    tail = 0.5 * (1.0 - _CONFIDENCE)
-    low, high = (float(stats.chi2.ppf(p, _FREEDOM * nees.size)) / nees.size for p in (tail, 1.0 - tail))
-    inside = float(np.mean(nees <= stats.chi2.ppf(_CONFIDENCE, _FREEDOM)))
+    tail = 0.5 * (1.0 - _PROBABILITY)
+    # the sum of n independent NEES has the chi-square distribution with 2 n degrees of freedom
+    low, high = (float(stats.chi2.ppf(p, _DEGREES_OF_FREEDOM * nees.size)) / nees.size for p in (tail, 1.0 - tail))
+    inside = float(np.mean(nees <= stats.chi2.ppf(_PROBABILITY, _DEGREES_OF_FREEDOM)))
     rows = [
         ["Descents with a final position", f"{nees.size:,}"],
         ["Mean of the normalised squared error", number(float(nees.mean()))],
-        [f"{100 * _CONFIDENCE:.0f} % interval of this mean for a correct covariance", f"{low:.2f} to {high:.2f}"],
-        [f"Errors within the {100 * _CONFIDENCE:.0f} % ellipse", f"{100.0 * inside:.1f} %"],
+        [f"{100 * _PROBABILITY:.0f} % interval of this mean for a correct covariance", f"{low:.2f} to {high:.2f}"],
+        [f"Errors within the {100 * _PROBABILITY:.0f} % ellipse", f"{100.0 * inside:.1f} %"],
     ]
     note = (
         "The normalised squared error is e' P^-1 e with the horizontal error e and its reported covariance P. Its mean "

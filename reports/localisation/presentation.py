@@ -28,7 +28,8 @@ from marsyard.reports.section_kinds import (
 from marsyard.reports.wording import number
 
 _LEGEND = "The blue line is the true position; the bands are three standard deviations that the algorithm reports."
-_REQUIRED_M = 40.0
+#: Required position error: the bound of a false fix.
+_MAX_POSITION_ERROR_M = 40.0
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
@@ -56,13 +57,15 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
 
 def write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
     """Write the figures of a case into a folder."""
-    drawn = {"errors": figures.draw_errors(products), "map": figures.draw_map(products)}
+    named_figures = {"errors": figures.draw_errors(products), "map": figures.draw_map(products)}
     landmarks = figures.draw_landmarks(products)
-    return save_figures(directory, drawn if landmarks is None else {**drawn, "landmarks": landmarks})
+    if landmarks is not None:
+        named_figures["landmarks"] = landmarks
+    return save_figures(directory, named_figures)
 
 
-_FIXED = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
-_FALSE = Rate("false_fix", "A reported position is wrong by more than 40 m", flag_rate("false_fix"))
+_FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
+_FALSE_FIX = Rate("false_fix", "A reported position is wrong by more than 40 m", flag_rate("false_fix"))
 
 POSITION = SectionDeclaration(
     "localisation",
@@ -70,7 +73,7 @@ POSITION = SectionDeclaration(
     "Position on the map",
     requires=("fixed_in_time",),
     parts=(
-        RateTable((_FIXED, _FALSE), cases="Descents", heading="Positions"),
+        RateTable((_FIXED_IN_TIME, _FALSE_FIX), cases="Descents", heading="Positions"),
         Distribution(
             (
                 Quantity("position_error_at_10_s_m", "after 10 s"),
@@ -81,7 +84,7 @@ POSITION = SectionDeclaration(
             "Cumulative distribution of the horizontal position error. The error relative to the world contains the "
             "map's registration and distortion.",
             heading="Position error",
-            bound=_REQUIRED_M,
+            bound=_MAX_POSITION_ERROR_M,
         ),
         Quantiles(
             (
@@ -110,7 +113,7 @@ CONDITIONS = SectionDeclaration(
     parts=(
         RateByCondition(
             Quantity("sun_difference_deg", "Angle between the suns of map and landing (deg)"),
-            (_FIXED, Rate("answered", "Position reported at the end", flag_rate("answered"))),
+            (_FIXED_IN_TIME, Rate("answered", "Position reported at the end", flag_rate("answered"))),
             cases="Descents",
             ylabel="fraction of descents",
             caption="Descents with a reported position against the angle between the suns of map and landing.",

@@ -1,4 +1,4 @@
-"""Presentation of measured cases: agreement of images and measured poses, matches, and figures of the task."""
+"""Presentation of measured cases (real images): agreement with measured poses, matches, and the algorithm's figures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"
 _MAX_ROWS = 60
 #: Minimum number of cases for a figure.
 _MIN_CASES = 3
-#: Additional columns of the table, if the rows contain them.
+#: Columns of the table after case, name and outcome; columns that the rows do not contain are omitted.
 _COLUMNS = (
     "matches", "outlier_fraction", MEDIAN, PERCENTILE_90, "residual_worst_pair_px", "max_rotation_deg",
     "max_translation_m",

@@ -3,8 +3,8 @@
 Unpaired cases: cases on one terrain are correlated. If both sets have cases on the same terrains, they are compared
 within each terrain, where cases are independent. Rates are compared by the exact distribution of Mantel and Haenszel's
 sum of hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int.
-Statist. 37, 1960). If they have few terrains in common, each terrain is one unit: the mean of the same number of
-cases.
+Statist. 37, 1960). If they have few terrains in common, terrains are compared instead of cases: each terrain is
+represented by the mean of the same number of its cases.
 
 Small p-values of ranks are computed by permutation. With many ties (rates of a few cases per terrain, for example), the
 rank sum is skewed. At 0.001 the p-value of its normal approximation is then too small by a factor of two to three.

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import optimize, stats
 
-#: Minimum number of cases.
+#: Minimum number of cases with condition and response for an estimate.
 MIN_CASES = 20
 #: Number of cases per bin for the fraction of variance, and the maximum number of bins.
 _CASES_PER_BIN, _MAX_BINS = 15, 20

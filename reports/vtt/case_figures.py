@@ -1,4 +1,6 @@
-"""Figures of one tracking case as Figs. 15, 17 and 16b of `papers/visual-target-tracking.txt`.
+"""Figures of one tracking case, as Figs. 15, 17 and 16b of Kim et al., "Targeted Driving Using Visual Tracking".
+
+A subframe is the part of an image that the cameras deliver at a stop.
 
 The first figure contains for every stop the left subframe with search window and match, the enlarged match (the next
 template), and the right subframe with the stereo match. The title contains the quantities of the update. The second
@@ -204,6 +206,7 @@ def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path
 
 
 def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side_px: float) -> None:
+    """Draw the subframes of a stop and the enlarged match; `side_px` is the side of the template, pixels."""
     cells = cell.subgridspec(2, 2, width_ratios=(2.0, 1.0))
     left = figure.add_subplot(cells[:, 0])
     show_subframe(left, stop.left, _CONTRAST_QUANTILES)
@@ -263,9 +266,9 @@ def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side_px: float) -> 
     _draw_rectangle(axes, centre - 0.5 * side_px, np.full(2, side_px), TARGET, "-")
 
 
-def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line: Any) -> None:
+def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line_style: Any) -> None:
     (x, y), (width, height) = corner.tolist(), size.tolist()
-    axes.add_patch(Rectangle((x, y), width, height, fill=False, edgecolor=colour, linewidth=1.3, linestyle=line))
+    axes.add_patch(Rectangle((x, y), width, height, fill=False, edgecolor=colour, linewidth=1.3, linestyle=line_style))
 
 
 def _draw_path_axes(axes: Axes, rover_path: RoverPath) -> None:
@@ -331,7 +334,7 @@ def _annotate_number(axes: Axes, point: Point, number: int) -> None:
 
 
 def _set_limits(axes: Axes, points: Float[np.ndarray, "n 2"], margin: float, min_aspect: float = 1.0) -> float:
-    """Set limits of equal scale around all points; return the width of the axes."""
+    """Set limits of equal scale around all points: their extent plus 10 % and a margin; return the axes' width."""
     low, high = points.min(axis=0), points.max(axis=0)
     half_size = 0.5 * (high - low) * 1.1 + margin
     half_size = np.maximum(half_size, min_aspect * half_size.max())

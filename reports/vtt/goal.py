@@ -61,7 +61,10 @@ def _group_by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
 
 
 def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
-    """Summarize each camera: rates (`_RATES`), and position errors and drift of its completed runs."""
+    """Summarize each camera: rates (`_RATES`), and position errors and drift of its completed runs.
+
+    `range` and `cross` are the error components along and across the line of sight.
+    """
     rows = []
     for camera, camera_rows in _group_by_camera(runs):
         is_completed = np.isfinite(numbers(camera_rows, "position_error_m"))

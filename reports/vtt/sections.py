@@ -130,14 +130,17 @@ def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
 
 
 def read_legs(subject: Subject) -> list[Mapping[str, Any]]:
-    """Read the legs of the drive from the campaign's parameters."""
+    """Read the legs of the drive (approach or turn, for example) from the campaign's parameters."""
     drive = subject.run.parameter("drive")
     leg_table = table(drive).get("legs") if drive is not None else subject.run.parameter("legs")
     return [table(leg) for leg in leg_table] if isinstance(leg_table, list | tuple) else []
 
 
 def table_4_grid(frame: Rows, legs: Sequence[Mapping[str, Any]]) -> Grid:
-    """Create Table IV: tracking updates and minutes of each operational mode; `legs` are the legs of the drive."""
+    """Create Table IV: tracking updates and minutes of each operational mode; `legs` are the legs of the drive.
+
+    The minutes of a mode end at its last update, and start at the end of the previous mode.
+    """
     updates = [int(str(name).split("_")[1]) for name in frame.columns if re.match(r"^update_\d+_leg$", str(name))]
     update_legs = np.column_stack([numbers(frame, f"update_{update_number}_leg") for update_number in updates])
     update_minutes = (
@@ -294,6 +297,7 @@ def _read_motion(subject: Subject) -> Mapping[str, Any] | None:
 def step_rates(subject: Subject) -> list[dict[str, Any]]:
     """Compute the rates of tracked targets for every line (tracker or search window) and step size.
 
+    - step: angle in degrees, or fraction of the distance to the target in per cent
     - good, false_tracks: fractions of the selectable targets that are tracked, and that have a false track
     - all_targets: fraction of all targets that are tracked
     """

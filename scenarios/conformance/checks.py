@@ -1,4 +1,8 @@
-"""Conformance checks and their findings, and the checks common to estimators, trackers and parts."""
+"""Conformance checks and their findings, and the checks common to estimators, trackers and custom parts.
+
+A custom part is a user-defined motion, instrument or score (`marsyard.scenarios.parts`). The protocol is the interface
+of an algorithm or part: its methods, their inputs, and the rules for their answers.
+"""
 
 from __future__ import annotations
 
@@ -80,8 +84,8 @@ class Check:
 class Suite(ABC):
     """Conformance suite of one algorithm or part; a new object is constructed for each check.
 
-    `marsyard.campaigns.running.replay` runs each check in a worker process, and also reports changes of the state of
-    this process.
+    `marsyard.campaigns.running.replay` runs each check in a worker process, and also reports whether the algorithm
+    changed the state of that process.
 
     - make: constructs the algorithm or part
     - spec: name of the algorithm or part

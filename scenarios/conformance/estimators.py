@@ -1,4 +1,4 @@
-"""Conformance checks of estimators: velocity, also from a stream of images, and landing sites."""
+"""Conformance checks of velocity estimators, for three images or a stream of images, and of landing site estimators."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Protocol:
 
     - measurements: creates the input of an ordinary case
     - check: returns a valid answer; raises AlgorithmError for an answer that does not conform to the interface
-    - is_valid: whether an answer contains a result
+    - is_valid: whether an answer contains a result (a velocity or a site)
     - describe: formats an answer
     - failures: outcomes without a result, as text
     """

@@ -41,7 +41,7 @@ _TEXTURE_SIZE, _TEXTURE_CONTRAST = 1024, 0.2
 DESCENT_VELOCITY_M_S = np.array([12.0, -7.0, -75.0])
 #: Maximum time between images, and from the first to the last image, s.
 _INTERVAL_S, _DURATION_S = 3.75, 7.5
-#: Rate of the inertial unit, and gravity of Mars.
+#: Rate of the inertial unit, Hz, and gravity of Mars, m/s^2.
 _IMU_HZ, _GRAVITY_M_S2 = 100.0, 3.71
 #: Attitudes of the images about z, y and x, degrees; further images repeat them.
 _ATTITUDES_DEG = ((40, 4, -3), (44, 2, 3), (41, -3, 5))
@@ -119,7 +119,11 @@ def descent(image_count: int = 3) -> DescentMeasurements:
 
 @cache
 def inertial_descent(image_count: int) -> DescentMeasurements:
-    """Create the measurements of `descent` with exact inertial increments, from a second before the first image."""
+    """Create the measurements of `descent` with exact inertial increments.
+
+    They start 1 s before the first image and end 0.5 s after the last. The velocity is constant, so that the specific
+    force is the reaction to gravity.
+    """
     measurements = descent(image_count)
     tags = np.array(measurements.tags_s)
     count = round((tags[-1] - tags[0] + 1.5) * _IMU_HZ)

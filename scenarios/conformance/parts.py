@@ -30,14 +30,18 @@ from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, KINDS, SCORE, P
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.frames import rigid
 
+#: Gravity of Mars, m/s^2.
 _GRAVITY_M_S2 = 3.72
-#: Slope of the suite's ground, and its normal.
+#: Slope of the suite's ground (rise towards the east divided by distance), and its unit normal.
 _SLOPE = 0.05
 _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
 
 
 def determine_kind(spec: str) -> str | None:
-    """Determine the kind of a part from entry point, members or annotations; None if they are ambiguous."""
+    """Determine the kind of a part by its entry point, the members of its class, or the annotations of its function.
+
+    Returns None if they are ambiguous.
+    """
     name = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
     if name is not None or ":" not in spec:
         return name
@@ -53,7 +57,7 @@ def determine_kind(spec: str) -> str | None:
 
 @dataclass(frozen=True)
 class PartSuite(Suite):
-    """Suite of one part of a kind, constructed with the default options of its class."""
+    """Conformance suite of one custom part of the kind `kind`, constructed with the default options of its class."""
 
     kind: PartKind
 
@@ -156,6 +160,7 @@ def _nearest_ground(
 def motion_cases() -> tuple[MotionInputs, ...]:
     """Create the inputs of motions: three images on Mars, and five images at shorter intervals on the Moon."""
     return (
+        # ground, gravity, times of the images, start and end of the poses (s), firing height (m)
         MotionInputs(_ground_height, _GRAVITY_M_S2, (0.0, 3.75, 7.5), -5.0, 8.0, 100.0),
         MotionInputs(_ground_height, 1.62, (0.0, 2.0, 4.0, 6.0, 8.0), -2.0, 8.5, 50.0),
     )
@@ -163,7 +168,7 @@ def motion_cases() -> tuple[MotionInputs, ...]:
 
 @cache
 def swinging_fall() -> RecordedMotion:
-    """Create the motion of a swinging fall: 1900 m high at time 0, 75 m/s down, tilts up to 10 deg."""
+    """Create the motion of a coning descent: 1900 m high at time 0, 75 m/s down, tilted by about 10 deg."""
     times = np.arange(-6.0, 22.0, 0.05)
     positions = np.column_stack([12.0 * times, -7.0 * times, 1900.0 - 75.0 * times])
     tilts = np.radians(10.0) * np.column_stack([np.sin(times), np.cos(times), 0.1 * times])
@@ -181,7 +186,10 @@ def instrument_cases() -> tuple[InstrumentTruth, ...]:
 
 @cache
 def scored_cases() -> tuple[scores.ScoredCase, ...]:
-    """Create the inputs of scores: all kinds of cases, each with an answer and with a failure, partly without truth."""
+    """Create the inputs of scores: each type of scored case, with an answer and with a failure.
+
+    Measured cases (`ScoredVelocity`, `ScoredSite`) are also created without truth.
+    """
     velocities = (
         VelocityEstimate(VelocityOutcome.VALID, np.array([11.0, -7.5])),
         VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
@@ -217,6 +225,7 @@ def _make_ground_truth() -> GroundTruth:
     is_safe[0, 0] = False
     relief = Relief(np.zeros((200, 200)), -10.0, -10.0, 0.1)
     footprints = Footprints(zeros, zeros, zeros, is_safe)
+    # lander: diameter 2 m, slope up to 0.26 rad (15 deg), roughness up to 0.2 m
     return GroundTruth(relief, Limits(2.0, 0.26, 0.2), positions_m, footprints, np.ones(zeros.shape, dtype=bool), 1.0)
 
 

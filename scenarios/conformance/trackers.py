@@ -23,7 +23,7 @@ from marsyard.sim.sensor import stereo_mast
 
 #: Largest count of the 12-bit cameras, and mean count of the wall.
 FULL_SCALE_DN, _MEAN_DN = 4095, 1500.0
-#: Distance of the wall from the start, length of a step, metres, and number of stops of the drive.
+#: Distance of the wall from the start and distance between stops, metres, and number of stops of the drive.
 _WALL_DISTANCE_M, _STEP_M, _STOPS = 8.0, 0.4, 4
 #: Spacing of the texture's samples on the wall, metres.
 _TEXTURE_STEP_M = 0.006
@@ -195,7 +195,7 @@ def _aim_at_target(tracker: Any, rover_pose: RigidTransform) -> MastAim:
 
 
 def aim_ahead() -> MastAim:
-    """Return an aim straight ahead with subframes at the centres of both images."""
+    """Return an aim straight ahead, 0.2 rad below the horizon, with subframes at the centres of both images."""
     columns, rows = mast().left.size
     box = PixelBox((columns // 4, rows // 4), (columns // 2, rows // 2))
     return MastAim(0.0, -0.2, box, box)

@@ -41,6 +41,7 @@ class Instruments:
     """Instruments of one descent with their constant errors, and readings of custom instruments.
 
     - approach: flight before the descent, during which navigation errors grow
+    - imu: inertial unit of the navigation, with the errors that remain after its calibration
     - navigation: propagated attitude and velocity, from shortly before the first image to the thrusters' firing
     - altimeter: the radar, or the readings of a custom altimeter
     - tags_s: time tags of the images

@@ -83,7 +83,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
-        """Yield the images of a case without delivery faults, with the ground truth of their pixels."""
+        """Yield the images of a case, without transmission faults, and the ground truth of their pixels."""
         p = self.check_parameters(parameters)
         world = World.from_parameters(p)
         states = states_at_images(p, create_flight(p, world.surface, streams))

@@ -171,6 +171,7 @@ def feasible_overlap_row(
     columns, rows = bin_factors(camera.size[::-1], options.binned_size)
     patch_samples = GROUND_PATCH_M / world.surface.spacing_m
     level = int(np.clip(np.rint(np.log2(max(patch_samples, 1.0))), 0, len(world.surface.levels) - 1))
+    # the overlap depends on the geometry of the views only, so that their images are blank
     blank = np.zeros(options.binned_size[::-1], dtype=np.float32)
     views = []
     for state in states:

@@ -44,7 +44,7 @@ _MARGIN_POSTS = 2
 _TARGET_EDGE_RAYS = 4
 #: Minimum number of sightings of a pass: two directions determine an attitude, one more checks it.
 _MIN_SIGHTINGS = 3
-#: Spacing of the mesh below the targets, in samples of the terrain.
+#: Spacing of the mesh at the centre of the scene, in samples of the terrain; it increases outwards.
 _MESH_SAMPLES = 0.67
 
 
@@ -188,7 +188,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
     solution = _estimate_attitudes(unprocessed_run, ground, clock, gps)
-    # the random stream keeps its former name, so that the random values do not change
+    # another name of a random stream would change the random values
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
     elevation_model = simulate_elevation_model(p.elevation, surface, horizontal, generator("elevation model"))
@@ -254,8 +254,8 @@ def render_and_detect_targets(
     p, key = run.key.field_test, run.key
     scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
     objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
-    # more rays at edges than for rocks, because a side of a target is 2 pixels; mesh lines at most one
-    # terrain sample apart, because coarser ground would hide some of the targets
+    # more rays at edges than for rocks, because a side of a target is 2 pixels; at the targets, mesh lines are at most
+    # one terrain sample apart, because coarser ground would hide some of the targets
     scene = replace(
         scene, objects=objects, edge_rays=_TARGET_EDGE_RAYS, mesh_finest_m=_MESH_SAMPLES * ground.surface.spacing_m
     )

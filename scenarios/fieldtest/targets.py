@@ -105,13 +105,13 @@ class Sightings:
         centroids_px: Sequence[Float64[np.ndarray, "targets 2"]],
     ) -> Sightings:
         """Compute the directions from the centroids in each image (columns, rows); NaN for targets not detected."""
-        parts = []
+        rows = []
         for tag, position, centroids in zip(tags_s, gps_m, centroids_px, strict=True):
             is_measured = np.isfinite(centroids).all(axis=1)
             directions = camera.rays(centroids[is_measured])[1]
             offsets = targets.surveyed_m[is_measured] - position
-            parts.append((np.full(len(offsets), tag), _normalize(directions), _normalize(offsets)))
-        times, camera_vectors, world_vectors = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+            rows.append((np.full(len(offsets), tag), _normalize(directions), _normalize(offsets)))
+        times, camera_vectors, world_vectors = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
         return cls(times, camera_vectors, world_vectors)
 
 

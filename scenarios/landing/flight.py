@@ -62,7 +62,7 @@ class Flight:
         course = np.pi / 2 - np.radians(p.image_poses.heading_deg + p.image_poses.course_deg)
         gravity = p.preset.environment.gravity_m_s2
         transit = Transit.fly(helicopter, start_m, float(course), float(heading), gravity, streams)
-        # the random stream keeps its former name, so that the random values do not change
+        # another name of a random stream would change the random values
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
         # laser ranges to the ground, without rocks, at all images; no echo beyond five times the height
         transit_states = [transit.state(number) for number in range(transit.times_s.size)]

@@ -182,7 +182,7 @@ class Transit:
         instruments = Instruments.draw(p, gravity_m_s2, streams)
         navigation_leg = NavigatedLeg.simulate(flight.path, *flight.path.span_s, instruments, streams, "transit")
         times = np.linspace(0.0, p.transit.imaging_duration_s, p.transit.images)
-        # the random stream keeps its former name, so that the random values do not change
+        # another name of a random stream would change the random values
         clock_stream = streams.generator("picture clock")
         tags = Clock.draw(p.image_clock, clock_stream).tags(times, clock_stream)
         return cls(p, instruments, air, flight, navigation_leg, times, tags)

@@ -101,7 +101,7 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     frames_and_motions = [render_state(p.render.backend, scene, optics, state) for state in flight.states]
     frames, motions = zip(*frames_and_motions, strict=True)
     radiances = [frame.radiance * np.float32(world.brightness) for frame in frames]
-    # the random stream keeps its former name, so that the random values do not change
+    # another name of a random stream would change the random values
     detector = auto_expose(detector, radiances[0], p.exposure, streams.generator("test pictures")).detector
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
     # the fault `repeated_image` = 1 replaces image 2
@@ -252,7 +252,7 @@ class RenderedFlight:
 #: Bounds of the classes of slope or roughness divided by its limit, and the names of the classes.
 CLASS_BOUNDS = (1.0, 1.5, 2.0, 3.0)
 CLASS_NAMES = ("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")
-#: Gross hazards: minimum diameter in map cells, and minimum roughness / limit.
+#: Gross (large) hazards: minimum diameter in map cells, and minimum roughness divided by its limit.
 MIN_GROSS_CELLS, MIN_GROSS_ROUGHNESS = 3.0, 2.0
 
 

@@ -1,4 +1,4 @@
-"""Compiled kernels of `relief`: heights of rocks on a grid, robust planes, slope and roughness of footprints."""
+"""Numba kernels of `relief`: heights of rocks on a grid, robust planes, slope and roughness of footprints."""
 
 from __future__ import annotations
 

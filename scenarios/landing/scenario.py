@@ -86,7 +86,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 check_site,
                 measurements,
             )
-            # without an answer the helicopter lands at the a-priori site
+            # without an answer the helicopter lands at the a-priori site; NO_STRUCTURE stands for any failure
             answer = algorithm_run.answer
             estimate = answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
             row = {

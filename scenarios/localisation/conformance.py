@@ -37,7 +37,7 @@ class PositionSuite(Suite):
         """See `Suite`."""
         advice = "see algorithms/localisation/interface.py for the methods and answers"
         rule = "returns a well-formed answer to each image and at the end"
-        yield Check("answer", rule, advice, lambda: _describe(self._answer(inputs.ordinary())))
+        yield Check("answer", rule, advice, lambda: _describe(self._answer(inputs.ordinary_descent())))
         refusals = ", ".join(outcome.name for outcome in PositionOutcome if outcome is not PositionOutcome.VALID)
         advice = f"without a position return one of {refusals}; no method may raise an exception"
         for name, (create, text) in inputs.UNUSUAL.items():
@@ -48,10 +48,10 @@ class PositionSuite(Suite):
 
     def cases(self) -> Sequence[Descent]:
         """See `Suite`."""
-        return [inputs.ordinary()]
+        return [inputs.ordinary_descent()]
 
     def _other_cases(self) -> Sequence[Descent]:
-        return [inputs.noisy()]
+        return [inputs.descent_with_noise_images()]
 
     def _call(self, algorithm: Any, case: Descent, seed: int) -> tuple[Any, ...]:
         return run(algorithm, case)
@@ -70,9 +70,9 @@ class PositionSuite(Suite):
         return _describe(self._answer(create()))
 
     def _check_restart(self) -> str:
-        case = inputs.ordinary()
+        case = inputs.ordinary_descent()
         expected_fingerprint = fingerprint(self._answer(case))
-        estimator, interrupted = self.make(), copy_inputs(inputs.shifted())
+        estimator, interrupted = self.make(), copy_inputs(inputs.descent_on_shifted_map())
         estimator.start(interrupted.initial, interrupted.map_product)
         images = 0
         for event in interrupted.events:
@@ -86,8 +86,8 @@ class PositionSuite(Suite):
 
     def _answer_time_s(self) -> float:
         """Measure the maximum time of an image in a second descent; the first descent compiles kernels."""
-        self._answer(inputs.ordinary())
-        estimator, case = self.make(), copy_inputs(inputs.ordinary())
+        self._answer(inputs.ordinary_descent())
+        estimator, case = self.make(), copy_inputs(inputs.ordinary_descent())
         estimator.start(case.initial, case.map_product)
         times = []
         for event in case.events:

@@ -23,13 +23,14 @@ from marsyard.sim.camera import Cahvore
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
 
-#: Motion of the lander: start, constant velocity, attitude at the start about z, y and x, turn rate about the vertical.
+#: Motion of the lander: position at time 0 and constant velocity (east, north, up), attitude at time 0 about z, y and
+#: x, turn rate about the vertical; gravity of Mars.
 START_M, VELOCITY_M_S = np.array([150.0, -120.0, 2400.0]), np.array([8.0, -5.0, -60.0])
 _ATTITUDE_DEG, _TURN_RAD_S, _GRAVITY_M_S2 = (20.0, 3.0, -4.0), 0.02, 3.71
 #: Error of the initial position (estimate minus truth), and standard deviations of the initial state per axis.
 _ERROR_M = np.array([160.0, -110.0, 20.0])
 _POSITION_SD_M, _VELOCITY_SD_M_S, _ATTITUDE_SD_RAD = (150.0, 150.0, 50.0), 0.5, 1e-3
-#: Rates of the inertial unit and the altimeter, end of the inertial data, and times of the images.
+#: Rates of the inertial unit and the altimeter, time of the last increment, and times of the images.
 _IMU_HZ, _ALTIMETER_HZ, _END_S = 100.0, 2.0, 8.0
 _IMAGE_TIMES_S = np.array([1.0, 3.0, 5.0, 7.0])
 #: Spacing of the texture's samples; pixel and size of the map.
@@ -63,24 +64,24 @@ def true_position(time_s: float) -> Float64[np.ndarray, "3"]:
 
 
 @cache
-def ordinary() -> Descent:
+def ordinary_descent() -> Descent:
     """Create an ordinary descent; only the initial position has an error."""
-    return _create(_increments(), _altitudes(), _images())
+    return _create_descent(_increments(), _altitudes(), _images())
 
 
 @cache
-def shifted() -> Descent:
+def descent_on_shifted_map() -> Descent:
     """Create the ordinary descent on another map: the positions of map and lander are shifted by a kilometre."""
-    case, shift = ordinary(), np.array([1000.0, -500.0, 0.0])
+    case, shift = ordinary_descent(), np.array([1000.0, -500.0, 0.0])
     initial = replace(case.initial, position_m=case.initial.position_m + shift)
     return Descent(initial, replace(case.map_product, origin_m=case.map_product.origin_m + shift[:2]), case.events)
 
 
 @cache
-def jittered() -> Descent:
-    """Create a descent with jitter of all time tags; two inertial boundaries, and an image and an altitude, are equal.
+def descent_with_jitter() -> Descent:
+    """Create a descent with jitter of all time tags; the inertial increments remain in order.
 
-    The order of the inertial boundaries is kept.
+    Two boundaries of increments have equal tags, and so have an image and an altitude.
     """
     rng = np.random.default_rng(20210218)
     increments, altitudes, images = _increments(), _altitudes(), _images()
@@ -91,43 +92,43 @@ def jittered() -> Descent:
     images = [replace(image, time_s=image.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for image in images]
     altitudes = [replace(item, time_s=item.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for item in altitudes]
     altitudes[1] = replace(altitudes[1], time_s=images[0].time_s)
-    return _create(replace(increments, times_s=tags), altitudes, images)
+    return _create_descent(replace(increments, times_s=tags), altitudes, images)
 
 
-def without_altitudes() -> Descent:
+def descent_without_altitudes() -> Descent:
     """Create a descent whose altimeter has no reading."""
-    return _create(_increments(), [], _images())
+    return _create_descent(_increments(), [], _images())
 
 
-def without_images() -> Descent:
+def descent_without_images() -> Descent:
     """Create a descent whose images are all lost."""
-    return _create(_increments(), _altitudes(), [])
+    return _create_descent(_increments(), _altitudes(), [])
 
 
-def repeated() -> Descent:
+def descent_with_repeated_images() -> Descent:
     """Create a descent in which all images show the first scene, and each is delivered twice."""
     first = _images()[0]
     images = [replace(image, counts=first.counts) for image in _images() for _ in range(2)]
-    return _create(_increments(), _altitudes(), images)
+    return _create_descent(_increments(), _altitudes(), images)
 
 
-def noisy() -> Descent:
+def descent_with_noise_images() -> Descent:
     """Create a descent whose images are noise."""
     rng = np.random.default_rng(1)
     return _change_counts(lambda image: rng.integers(0, _FULL_SCALE_DN + 1, image.counts.shape, dtype=np.uint16))
 
 
-def blank(name: str) -> Descent:
+def descent_with_blank_images(name: str) -> Descent:
     """Create a descent whose images have one count, by name of `BLANK_COUNTS`."""
     return _change_counts(lambda image: np.full_like(image.counts, BLANK_COUNTS[name](image.calibration)))
 
 
 def _change_counts(change: Callable[[DetectorImage], UInt16[np.ndarray, "rows columns"]]) -> Descent:
     images = [replace(image, counts=change(image)) for image in _images()]
-    return _create(_increments(), _altitudes(), images)
+    return _create_descent(_increments(), _altitudes(), images)
 
 
-def _create(
+def _create_descent(
     increments: ImuIncrements, altitudes: Sequence[AltitudeMeasurement], images: Sequence[DetectorImage]
 ) -> Descent:
     variances = np.square([*_POSITION_SD_M, *[_VELOCITY_SD_M_S] * 3, *[_ATTITUDE_SD_RAD] * 3])
@@ -163,6 +164,7 @@ def _images() -> list[DetectorImage]:
     """Take the images of the ground at the height 0."""
     camera: Cahvore = true_camera(CameraParameters(pixels=192, pixel_mrad=8.7))
     shape = camera.size[::-1]
+    # uniform response, exposure of 150 us, no row transfer times (global shutter), no summed rows
     calibration = DetectorCalibration(np.ones(shape), 150e-6, 0.0, 0.0, 1, _OFFSET_DN, _FULL_SCALE_DN)
     ground = TexturedPlane(np.zeros(3), np.eye(3)[:2], _TEXTURE_STEP_M)
     images = []
@@ -175,19 +177,19 @@ def _images() -> list[DetectorImage]:
 
 @cache
 def _map() -> MapProduct:
-    """Create the exact map, centred at the world's origin."""
+    """Create the exact map, centred at the world's origin; it states standard deviations of 1 m."""
     offsets = _MAP_PIXEL_M * (np.arange(_MAP_PX) - _MAP_PX // 2)
     samples = np.stack(np.meshgrid(offsets, offsets, indexing="ij")) / _TEXTURE_STEP_M
     appearance = map_coordinates(texture(), samples, order=1, mode="grid-wrap").astype(np.float32)
     return MapProduct(appearance, np.zeros_like(appearance), np.full(2, offsets[0]), _MAP_PIXEL_M, 1.0, 1.0, 1.0)
 
 
-#: Functions that create descents with unusual measurements, by the name of the check, with the requirement's end.
+#: Unusual descents by the name of their check: function that creates the descent, and its description.
 UNUSUAL: dict[str, tuple[Callable[[], Descent], str]] = {
-    **{name: (partial(blank, name), f"images that are {name}") for name in BLANK_COUNTS},
-    "noise": (noisy, "images of noise"),
-    "repeated": (repeated, "images that repeat the first, each delivered twice"),
-    "no-altitudes": (without_altitudes, "a descent without altitudes"),
-    "no-images": (without_images, "a descent without images"),
-    "jitter": (jittered, "time tags with jitter, some of them equal"),
+    **{name: (partial(descent_with_blank_images, name), f"images that are {name}") for name in BLANK_COUNTS},
+    "noise": (descent_with_noise_images, "images of noise"),
+    "repeated": (descent_with_repeated_images, "images that repeat the first, each delivered twice"),
+    "no-altitudes": (descent_without_altitudes, "a descent without altitudes"),
+    "no-images": (descent_without_images, "a descent without images"),
+    "jitter": (descent_with_jitter, "time tags with jitter, some of them equal"),
 }

@@ -44,6 +44,7 @@ class SmoothField:
         White noise is filtered by a Gaussian kernel; the spline is part of the kernel.
         """
         spacing = length_m / POINTS_PER_LENGTH
+        # a cubic spline needs control values beyond the extent: two on each side
         columns, rows = (np.ceil((np.asarray(high_m) - low_m) / spacing).astype(int) + 5).tolist()
         # two kernels with the variance length**2 / 2 give the correlation function
         kernel_sd = np.sqrt(0.5 * POINTS_PER_LENGTH**2 - _SPLINE_VARIANCE)

@@ -1,8 +1,8 @@
 """Instruments of localisation: camera and detector, inertial units, radar, image clock, and the initial state.
 
 Camera and inertial unit are at the origin of the body frame; the camera looks along -z and its columns increase along
-x. Facts of the camera: Maki et al. 2020 (Space Science Reviews) and Johnson et al. 2017, 2022, as listed for this
-project; other values are assumed and marked so.
+x. Sources of the camera's values: Maki et al. 2020 (Space Science Reviews), Johnson et al. 2017 and 2022. Other values
+are marked as assumed.
 """
 
 from __future__ import annotations
@@ -113,6 +113,7 @@ def _full_well_e() -> float:
 
 def _create_detector() -> DetectorParameters:
     full_well = _full_well_e()
+    # f-number, pixel pitch (um), passband (nm)
     light = LightPath(2.7, CameraParameters().pixel_pitch_um, (400.0, 900.0))
     return DetectorParameters(
         exposure_s=_EXPOSURE_S,
@@ -145,7 +146,7 @@ RADAR = RadarParameters(rate_hz=2.0, beam_deg=40.0, max_range_m=8000.0)
 #: Largest error of a time tag of images and altitudes, s (assumed): the interval of the images of Mars 2020, taken at
 #: up to 1 Hz. With a larger error an image has the time of another one.
 MAX_TAG_ERROR_S = 1.0
-#: Number of standard deviations in the largest error: 6e-7 of the tags have a larger one.
+#: Largest error in standard deviations: 6e-7 of the tags have a larger one.
 _TAG_SIGMAS = 5.0
 
 #: Clock of the image time tags, relative to the true time; that of the inertial unit is in `ImuParameters` (assumed).

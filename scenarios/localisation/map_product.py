@@ -32,14 +32,14 @@ from marsyard.sim.render.kernels.shading import GROUND
 from marsyard.sim.render.rays import VIEW_SIDES_PX
 from marsyard.sim.terrain import Surface
 
-#: Spacing of the mesh of first guesses at the centre, metres, and its relative growth per line. Rays are nearly
-#: vertical: Newton's method converges from any guess within the terrain's relief.
+#: Spacing of the renderer's mesh at the centre, metres, and its relative growth per line. The mesh gives first guesses
+#: of the intersections of rays and ground. Rays are nearly vertical: Newton's method converges from any such guess.
 _MESH_M, _MESH_GROWTH = 40.0, 0.02
-#: Side of the view of first guesses, samples, and margin around the rays in it, as a fraction.
+#: Side of the pinhole view of the mesh, samples, and margin around the rays in it, as a fraction.
 _VIEW_SIDE_PX, _VIEW_MARGIN = VIEW_SIDES_PX[0], 0.03
 #: Quantile of the brightness that becomes the largest count of the map, and step between pixels for this quantile.
 _WHITE_QUANTILE, _QUANTILE_STEP = 0.999, 4
-#: Rows of a block for the computation of rays, and of a band for rendering; they limit the memory.
+#: Number of map rows for which rays are computed, and that are rendered, at a time; limits the memory.
 _BLOCK_ROWS, _BAND_ROWS = 128, 512
 #: Margin of error fields around the map, m: positions near its border can be inverted.
 _FIELD_MARGIN_M = 500.0
@@ -237,14 +237,14 @@ def _render(
     east, north = _world_grid(truth, *map_axes)
     rays = orbital_rays(ground.surface, orbiter, east, north, p.pixel_m)
     scene = _map_scene(ground, sun, centre_m, east, north, p.orbit_height_m)
-    del east, north  # memory
+    del east, north  # frees memory before rendering
     pose = rigid(Rotation.identity(), orbiter)
     columns, rows = rays.size
     radiance, range_m = np.empty((rows, columns), dtype=np.float32), np.empty((rows, columns))
     for first in range(0, rows, _BAND_ROWS):
         band = slice(first, min(first + _BAND_ROWS, rows))
-        part = process_renderer(backend).render(scene, _select_rows(rays, band), pose)
-        radiance[band], range_m[band] = part.radiance, part.range_m
+        rendered = process_renderer(backend).render(scene, _select_rows(rays, band), pose)
+        radiance[band], range_m[band] = rendered.radiance, rendered.range_m
     if not np.isfinite(range_m).all():
         raise RenderingError("the mesh of the orbital images does not cover the map")
     # the haze depends on the mean radiance of the whole map
@@ -315,9 +315,9 @@ def _map_scene(
 ) -> Scene:
     """Create the scene of the orbital images: the ground without rocks, which are smaller than a map pixel."""
     bounds = float(east.min()), float(east.max()), float(north.min()), float(north.max())
-    # the renderer follows rays up to twice the reach of the mesh
-    reach_m = 0.55 * orbit_height_m
-    half_lines = int(np.arcsinh(reach_m / _MESH_M * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH)
+    # the renderer traces rays up to twice the half width of the mesh: 1.1 times the height of the orbiter
+    half_width_m = 0.55 * orbit_height_m
+    half_lines = int(np.arcsinh(half_width_m / _MESH_M * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH)
     texture = ground.site.ground_texture
     return Scene(
         ground.surface,
@@ -327,7 +327,7 @@ def _map_scene(
         relief=micro_relief(ground),
         ground_texture=Texture(texture.coarsest_m, texture.amplitudes),
         mesh_finest_m=_MESH_M,
-        mesh_half_width_m=reach_m,
+        mesh_half_width_m=half_width_m,
         mesh_lines=2 * half_lines + 1,
         visible_m=bounds,
     )

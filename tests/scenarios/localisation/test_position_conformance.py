@@ -214,7 +214,7 @@ def test_the_suite_is_registered_by_the_task_of_the_system() -> None:
 
 def test_inertial_data_are_exact() -> None:
     """Propagation from the true initial state ends at the true position."""
-    case = inputs.ordinary()
+    case = inputs.ordinary_descent()
     navigation = NavigationFilter.from_initial(case.initial)
     for event in case.events:
         if isinstance(event, ImuIncrements):
@@ -228,14 +228,18 @@ def test_unusual_descents_differ_as_described() -> None:
     def select(case: inputs.Descent, kind: type) -> list:
         return [event for event in case.events if isinstance(event, kind)]
 
-    images = select(inputs.ordinary(), DetectorImage)
+    images = select(inputs.ordinary_descent(), DetectorImage)
     assert {float(image.counts.std()) > 5.0 for image in images} == {True}
-    assert len(select(inputs.repeated(), DetectorImage)) == 2 * len(images)
-    assert {int(image.counts.max()) for image in select(inputs.blank("saturated"), DetectorImage)} == {255}
+    assert len(select(inputs.descent_with_repeated_images(), DetectorImage)) == 2 * len(images)
+    assert {
+        int(image.counts.max()) for image in select(inputs.descent_with_blank_images("saturated"), DetectorImage)
+    } == {255}
     assert (
-        select(inputs.without_altitudes(), AltitudeMeasurement) == select(inputs.without_images(), DetectorImage) == []
+        select(inputs.descent_without_altitudes(), AltitudeMeasurement)
+        == select(inputs.descent_without_images(), DetectorImage)
+        == []
     )
-    jittered, tags = inputs.jittered(), [image.time_s for image in images]
+    jittered, tags = inputs.descent_with_jitter(), [image.time_s for image in images]
     assert [image.time_s for image in select(jittered, DetectorImage)] != tags
     boundaries = np.concatenate([part.times_s[1:] for part in select(jittered, ImuIncrements)])
     assert np.diff(boundaries).min() == 0.0
