@@ -193,6 +193,7 @@ class DesignationGuide:
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
         """Store the view; the run continues."""
+        # a case that tracks over these views has one leg, and no drives of its own
         self.views.append(replace(view, leg=0, drives=()))
         return None
 
@@ -304,6 +305,7 @@ def drive_step(
     for command in commands:
         part_count = 1
         if leg.visual_odometry:
+            # 1e-9: tolerance for rounding errors
             parts = max(command.length_m / leg.visual_odometry_step_m, abs(command.turn_left_rad) / VISUAL_TURN_RAD)
             part_count = max(1, int(np.ceil(parts - 1e-9)))
             run.visual_odometry_updates += part_count

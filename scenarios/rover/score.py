@@ -108,6 +108,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
         drift_m = float(np.linalg.norm(last_m - first_m))
         designation_error = float(np.linalg.norm(first_stop.error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
+        # for a 3-sigma disparity error of 1 px (paper); `scale` already contains the baseline, so that of the call is 1
         designation_3_sigma = stereo_range_error_m(first_stop.range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
