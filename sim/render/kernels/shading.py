@@ -388,7 +388,7 @@ def _cast_shadows(
                 sun_fraction = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[SUN_FRACTION + k] = sun_fraction
         if sun_fraction > 0.0 and has_objects and (on_object or _may_be_shaded(shadow_footprint, x, y)):
-            # an offset along the normal: without it, rounding errors would let a facet shade itself
+            # an offset along the normal, m (objects: plus 5 % of a pixel); rounding could let a facet shade itself
             offset = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
             work[OBJECT_X + n_tested] = x + offset * work[NX + k]
             work[OBJECT_Y + n_tested] = y + offset * work[NY + k]
