@@ -44,7 +44,7 @@ from marsyard.scenarios.rover.stops import (
     StereoCamera,
     Stop,
     View,
-    choose_target,
+    designate_from_start,
     triangulate_point,
 )
 from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
@@ -233,7 +233,7 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
 def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
     """Create a run at its start and choose its target; the tracker is not called."""
     setup = Setup.draw(p, streams, load_ground)
-    return Run.from_setup(setup, choose_target(p, setup.world, setup.rig, setup.vehicle.stance))
+    return Run.from_setup(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
 
 
 def track_target(p: RoverScenarioParameters, run: Run) -> Run:

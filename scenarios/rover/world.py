@@ -111,8 +111,8 @@ class RunWorld:
     def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
 
-        The viewpoint of the selection is near the rover's start: at the start distance from the rock's face, and
-        `MAST_HEAD_HEIGHT_M` above the rock's foot.
+        The point is selected as seen from near the rover's start: half a rock's diameter plus the start distance from
+        the rock's centre, and `MAST_HEAD_HEIGHT_M` above its foot.
         """
         bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
         to_start = np.array([np.sin(bearing), np.cos(bearing), 0.0])

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.casters import Casters, sun_hidden
+from marsyard.sim.render.kernels.casters import Casters, find_occluded_positions
 from marsyard.sim.render.kernels.microrelief import add_relief_slopes, smith_shadowing
 from marsyard.sim.render.kernels.noise import NoiseBuffers, allocate_noise
 from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
@@ -398,7 +398,7 @@ def _cast_shadows(
     if n_tested > 0:
         xs, ys = work[OBJECT_X : OBJECT_X + n_tested], work[OBJECT_Y : OBJECT_Y + n_tested]
         zs = work[OBJECT_Z : OBJECT_Z + n_tested]
-        sun_hidden(casters, xs, ys, zs, hidden)
+        find_occluded_positions(casters, xs, ys, zs, hidden)
         for m in range(n_tested):
             work[SUN_FRACTION + other[m]] *= 0.0 if hidden[m] else 1.0
 
