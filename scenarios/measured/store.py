@@ -136,6 +136,7 @@ class CasesFile(UserFile):
 
 
 def _load(file: str) -> tuple[StoredCases, str]:
+    """Return contents and SHA-256 of `cases.json`, cached until the file changes. Raises ValueError."""
     try:
         status = check_regular(file)
     except OSError as error:

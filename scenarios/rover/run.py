@@ -67,7 +67,7 @@ MAST_SPACING_RAD = np.radians(40.0)
 
 @dataclass
 class Setup:
-    """A rover at its start with its cameras, before a target is chosen."""
+    """A rover at its start with its cameras, before the target is designated."""
 
     world: RunWorld
     rig: Rig
@@ -231,7 +231,7 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
 
 
 def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
-    """Create a run at its start and choose its target; the tracker is not called."""
+    """Create a run at its start and designate its target; the tracker is not called."""
     setup = Setup.draw(p, streams, load_ground)
     return Run.from_setup(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
 

@@ -196,7 +196,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
 
 def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
-    """Create a run over the drive's images and choose its target; the tracker is not called."""
+    """Create a run over the drive's images and designate its target; the tracker is not called."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
     target = designate_point(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint)
