@@ -1,8 +1,8 @@
 """Algorithms that run outside of Marsyard: export the cases, and read the answers from a table.
 
-Both replace an algorithm of a campaign. ``export:FOLDER`` writes the inputs of the algorithm and returns a failure;
-``export:FOLDER::bits-per-pixel=B`` writes images after lossy compression. ``answers:FILE.csv`` returns the answers of a
-table.
+Both are used like an algorithm of a campaign. ``export:FOLDER`` writes the inputs of the algorithm and returns a
+refusal; ``export:FOLDER::bits-per-pixel=B`` writes images after lossy compression. ``answers:FILE.csv`` returns the
+answers in a table.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class AnswerFormat(Generic[Answer]):
     - required: numeric columns in addition to `case` and `outcome`; a row contains all their values, or none
     - optional: groups of further numeric columns; a row contains all values of a group, or none
     - outcomes: allowed outcomes; an empty outcome with numbers means the first outcome
-    - create_answer: creates a valid answer from outcome and numbers. Raises AlgorithmError.
-    - create_empty: creates the failure that an export returns
-    - add_inputs: adds inputs of the case to an answer that needs them, such as the a-priori site
+    - create_answer: creates and checks an answer from outcome and numbers. Raises AlgorithmError.
+    - create_empty: creates the refusal that an export returns
+    - add_inputs: adds inputs of the case that the table does not contain, such as the a-priori site, to an answer
     - note: explanation of the columns for the user
     - write_inputs: writes the inputs of a case into an existing folder. Raises OSError.
     - join: joins the answers in the lines of a case, in the order of the table; None: a case has one line. Raises
@@ -142,7 +142,7 @@ def create_offline(spec: str, answer_format: AnswerFormat[Any], case: int) -> An
 
 @dataclass(frozen=True)
 class CaseExporter:
-    """Replaces an algorithm: writes its inputs into a folder atomically, and returns a failure."""
+    """Replaces an algorithm: writes its inputs into a folder atomically, and returns a refusal."""
 
     folder: Path
     answer_format: AnswerFormat[Any]
@@ -168,7 +168,7 @@ class CaseExporter:
 
 @dataclass(frozen=True)
 class RecordedAnswer(Generic[Answer]):
-    """Replaces an algorithm: returns the answer of a table; `error_message` is that of a missing answer."""
+    """Replaces an algorithm: returns the answer of a table; `error_message` is raised if the table has none."""
 
     answer: Answer | None
     error_message: str

@@ -1,6 +1,7 @@
-"""Registry of the systems and scenarios of Marsyard, of installed packages and of the user.
+"""Registry of the systems under test and their scenarios: those of Marsyard, and those of installed packages.
 
-A package adds a system by an entry point of the group `marsyard.systems`::
+A system is, for example, the velocity estimator DIMES with its scenarios, campaigns, requirements and reports. A
+package adds a system by an entry point of the group `marsyard.systems`::
 
     [project.entry-points."marsyard.systems"]
     altitude = "mypackage.system:SYSTEM"

@@ -1,8 +1,8 @@
 """Validate a user's terrain files before `marsyard.sim.terrain` reads them, and create sites from them.
 
-A GeoTIFF must have a projection in metres or another length unit, which preserves lengths, and square cells with grid
-north up. Its heights must be in metres, and gaps need a no-data value. An .npz archive must have heights and cell sizes
-in metres.
+A GeoTIFF must have a map projection that preserves lengths (to 2 %) and square cells with grid north up; coordinates
+may be in metres or another length unit. Its heights must be in metres, and gaps need a no-data value. An .npz archive
+must have heights and cell sizes in metres.
 """
 
 from __future__ import annotations

@@ -48,8 +48,8 @@ _NEAR_HEIGHTS, _NEAR_M = 3.0, 5.0
 _SECTOR_MARGIN_RAD, _MIN_DEPRESSION_RAD = np.radians(3.0), np.radians(5.0)
 #: Ratio of the diameters of neighbouring size classes of rocks; rocks of one class are selected up to one distance.
 _CLASS_RATIO = float(np.sqrt(2.0))
-#: Ground mesh: spacing / height of the viewpoint, relative growth per line, minimum half width / height of the
-#: viewpoint, and in m.
+#: Ground mesh: spacing next to the viewpoint divided by the viewpoint's height, relative growth of the spacing per
+#: line, and minimum half width, divided by this height and in m.
 _MESH_FINEST, _MESH_GROWTH, _MIN_HALF_WIDTH_RATIO, _MIN_HALF_WIDTH_M = 0.0085, 0.012, 14.0, 700.0
 #: Radius of Mars, m, for the distance of the horizon.
 _MARS_RADIUS_M = 3.39e6
@@ -146,6 +146,7 @@ class Viewpoint:
 def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
     """Build the scene for a viewpoint: ground, resolved rocks, texture and light."""
     spacing_m = ground.surface.spacing_m
+    # the terrain contains no detail for a mesh that is much finer than its samples
     finest_m = max(_MESH_FINEST * viewpoint.height_m, 0.8 * spacing_m)
     horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * viewpoint.height_m))
     half_width_m = max(

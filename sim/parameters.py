@@ -113,6 +113,7 @@ class Parameters(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _rename_deprecated_keys(cls, values: Any) -> Any:
+        """Replace deprecated keys, and complete tables whose default is a preset."""
         if not isinstance(values, Mapping):
             return values
         if not cls.model_fields.keys() >= values.keys():
@@ -154,7 +155,7 @@ def _complete_table(preset: BaseModel, table: Mapping[Any, Any]) -> Mapping[Any,
 
 
 def field_names(kind: Any) -> set[str]:
-    """Return the names of the fields of a data class; empty for any other type."""
+    """Return the field names of a data class; empty for any other type."""
     return {field.name for field in fields(kind)} if is_dataclass(kind) else set()
 
 

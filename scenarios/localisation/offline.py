@@ -1,7 +1,7 @@
-"""Position estimators on another computer: exported descents, and tables of their answers.
+"""Files for position estimators on another computer: exported measurements of a descent, and tables of estimates.
 
-A descent is a folder; `write_descent` writes it, and `read_descent` restores the measurements. A table has one line for
-each answer of a descent: one for each image, in the order of the images, then the final one.
+`write_descent` writes the measurements of a descent to a folder, and `read_descent` reads them again. A table has one
+line for each estimate of a descent: one per image, in the order of the images, then the final estimate.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 from marsyard.scenarios.localisation.stream import LocalisationMeasurements, ProcessorTimes, StreamAnswers
 from marsyard.scenarios.offline import AnswerFormat
 
-#: Columns of the parts of a state, by their keys in the exchange with programs.
+#: Columns of position, velocity and attitude, by their keys in the exchange with programs.
 _STATE_COLUMNS: Mapping[str, tuple[str, ...]] = {
     "position_m": ("position_east_m", "position_north_m", "position_up_m"),
     "velocity_m_s": ("velocity_east_m_s", "velocity_north_m_s", "velocity_up_m_s"),
@@ -74,7 +74,7 @@ def read_descent(folder: Path) -> LocalisationMeasurements:
 
 
 def _create_estimate(outcome: Enum, numbers: Mapping[str, float]) -> PositionEstimate:
-    """Create the estimate of one line, which has the content of a program's answer. Raises AlgorithmError."""
+    """Convert one line of a table to an estimate, with the checks of a program's answer. Raises AlgorithmError."""
     content: dict[str, object] = {
         "exchange": ANSWER_VERSIONS[-1],
         "outcome": outcome.name,
@@ -91,7 +91,7 @@ def _create_estimate(outcome: Enum, numbers: Mapping[str, float]) -> PositionEst
 
 
 def _join(estimates: Sequence[PositionEstimate]) -> tuple[PositionEstimate, ...]:
-    """Return the answers of a descent. Raises ValueError if their times decrease."""
+    """Collect the estimates in the lines of a descent. Raises ValueError if their times decrease."""
     for earlier, later in pairwise(estimates):
         if later.time_s < earlier.time_s:
             raise ValueError(f"time_s is {later.time_s:g} after {earlier.time_s:g}; allowed: the order of the images")
@@ -99,7 +99,7 @@ def _join(estimates: Sequence[PositionEstimate]) -> tuple[PositionEstimate, ...]
 
 
 def _create_answers(estimates: tuple[PositionEstimate, ...], measurements: LocalisationMeasurements) -> StreamAnswers:
-    """Return the answers of a table to a descent. Raises AlgorithmError for a wrong number of answers."""
+    """Create the answers to a descent from its estimates. Raises AlgorithmError for a wrong number of estimates."""
     n_images = len(measurements.images)
     if len(estimates) != n_images + 1:
         raise bad_answer(
@@ -110,13 +110,13 @@ def _create_answers(estimates: tuple[PositionEstimate, ...], measurements: Local
 
 
 def _refuse(measurements: LocalisationMeasurements) -> StreamAnswers:
-    """Return the answers of an export: a refusal."""
+    """Return a refusal: an export produces no estimates."""
     end_s = float(measurements.increments.times_s[-1])
     return StreamAnswers((PositionEstimate(PositionOutcome.NO_COARSE_FIX, end_s),), _unknown_times(0))
 
 
 def _unknown_times(n_images: int) -> ProcessorTimes:
-    """Return processor times of another computer."""
+    """Return NaN for all processor times: the other computer does not report them."""
     return ProcessorTimes(math.nan, (), (), (math.nan,) * n_images, math.nan)
 
 

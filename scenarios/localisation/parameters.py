@@ -53,8 +53,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     """Parameters of a localisation campaign.
 
     `location` is the terrain and the centre of the map; the descent begins at `start_east_m`, `start_north_m` from it.
-    Keys of the table `terrain` override the terrain of the site; `terrain.source` is a DTM with an orthoimage in its
-    middle.
+    Keys of the table `terrain` override the terrain of the site. With `terrain.source`, the middle of the terrain is a
+    DTM and an orthoimage from files.
     """
 
     task = LOCALISATION

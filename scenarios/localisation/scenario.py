@@ -37,12 +37,12 @@ from marsyard.sim.sensor.ranging import RadarAltimeter
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
-#: Time between the start of the inertial data and the start of localisation, s, and after the last image; longer if a
-#: clock's error moves a time tag out of this span.
+#: The inertial data begin `LEAD_S` before the start of localisation and end `MARGIN_S` after the last image, s. The
+#: span is longer if the error of a clock moves a time tag out of it.
 LEAD_S, MARGIN_S = 0.2, 0.2
 #: Largest bank whose terrains are built before the cases; a terrain needs 180 MB on disk.
 MAX_SHARED_TERRAINS = 20
-#: Index of the terrain on a wrong map, relative to that of the case.
+#: Index of the terrain that a wrong map shows, minus the index of the case's terrain.
 _WRONG_TERRAIN = 1
 
 
@@ -82,7 +82,7 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             tags = measurements.increments.times_s
             span_s = (float(tags[0]), float(tags[-1]))
             algorithm_run = run_algorithm_on_copy(
-                lambda inputs: _answer(LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case), inputs),
+                lambda inputs: _run_estimator(LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case), inputs),
                 lambda answers: _check_answers(answers, span_s),
                 measurements,
             )
@@ -95,7 +95,7 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
         return case_result(p.algorithms, evaluate, shared)
 
 
-def _answer(algorithm: object, inputs: LocalisationMeasurements) -> object:
+def _run_estimator(algorithm: object, inputs: LocalisationMeasurements) -> object:
     """Run an estimator over the stream; an export and a table of answers receive all measurements at once."""
     if isinstance(algorithm, CaseExporter | RecordedAnswer):
         return algorithm.estimate(inputs)
@@ -201,6 +201,7 @@ def _take_images(
     times = np.array([state.time_s for state in states])
     tags = times if p.exact_instruments else clock.tags(times, streams.generator("image tags"))
     first, last = states[0].position_m, states[-1].position_m
+    # a mesh for at least 50 m: a lower last image needs no denser first guess
     height_m = max(float(last[2] - world.surface.height(last[0], last[1])), 50.0)
     scene = world.scene(float(first[0]), float(first[1]), height_m, optics.rays.pixel_rad)
     shield = None

@@ -81,9 +81,11 @@ def _attitude_error_deg(estimate: Rotation, truth: State) -> float:
 
 @dataclass(frozen=True)
 class EstimateErrors:
-    """Errors of one valid estimate, estimate minus truth: position relative to the map (east, north, up), and others.
+    """Errors of one valid estimate: estimate minus truth.
 
-    - position_m, world_m: errors relative to the map and to the world (horizontal)
+    - position_m: error (east, north, up) relative to the map
+    - world_m: horizontal error (east, north) relative to the world
+    - velocity_m_s, attitude_deg: magnitudes of the velocity error and of the attitude error
     - sd_m: standard deviations of the position according to the estimator
     - nees: normalised squared error of the horizontal position, chi-square with 2 degrees of freedom if consistent
     """
@@ -126,7 +128,10 @@ class EstimateErrors:
 
 
 def compute_errors(descent: LocalisedDescent, answers: StreamAnswers) -> list[EstimateErrors | None]:
-    """Compute the errors of each estimate, None for a refusal."""
+    """Compute the errors of each estimate, None for a refusal.
+
+    Estimates have time tags of the inertial unit, whose offset is subtracted for the true time.
+    """
     first, last = descent.flight.span_s
     return [
         EstimateErrors.from_estimate(
@@ -198,10 +203,11 @@ def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, 
         outcomes            outcome of each estimate
         inliers             landmarks used in each image; NaN without a match
         true_xy_m           true positions on the map at the images; estimated_xy_m: estimates, NaN for a refusal
-        initial_xy_m        initial position of inertial navigation
+        initial_xy_m        initial position (east, north) of inertial navigation
         map                 appearance of the map, reduced; map_extent_m: west, east, south, north
         image_1, image_2    first and last image
-        landmarks_px        measured pixels of the landmarks in the last image; landmarks_residual_px, landmarks_used
+        landmarks_px        measured pixels of the landmarks in the last image; landmarks_residual_px: their residuals;
+                            landmarks_used: whether the position uses them
     """
     errors = compute_errors(descent, answers)
     nothing = np.full(7, np.nan)

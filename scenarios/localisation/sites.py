@@ -42,7 +42,7 @@ def localisation_site(name: str) -> Site:
 
 
 def _create_texture(entry: Mapping[str, Any]) -> SiteTexture:
-    """Create a texture with cells from `coarsest_m` down to 1 mm; each amplitude is `decay` times the previous one."""
+    """Create a texture with cell sizes halved from `coarsest_m` down to 1 mm, and amplitudes multiplied by `decay`."""
     octaves = np.arange(int(np.log2(entry["coarsest_m"] / _FINEST_M)) + 1)
     amplitudes = entry["amplitude"] * entry["decay"] ** octaves
     return SiteTexture(coarsest_m=entry["coarsest_m"], amplitudes=tuple(np.round(amplitudes, 5).tolist()))

@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 class ImageSchedule(Parameters):
     """Times of the images: those of the coarse stage first (0.3 Hz, Mars 2020), then those of the fine stage.
 
-    The cameras of Mars 2020 took pictures at up to 1 Hz; the default of half of it is assumed.
+    Mars 2020 took up to one image per second in the fine stage; the default of 0.5 Hz is assumed.
     """
 
     first_s: Annotated[float, bounded_field(INERTIAL_MARGIN_S, 60.0, "first image, after the start")] = 0.5

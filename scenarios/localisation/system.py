@@ -1,4 +1,4 @@
-"""Localisation of a lander on a map as a system of Marsyard: an entry point of the group `marsyard.systems`."""
+"""Register localisation on a map as a system under test, by an entry point of the group `marsyard.systems`."""
 
 from __future__ import annotations
 

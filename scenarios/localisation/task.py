@@ -1,4 +1,4 @@
-"""Task of the position estimators: names, options and creation."""
+"""Task of the position estimators: names of the algorithms, their options, and how they are created."""
 
 from __future__ import annotations
 

@@ -65,13 +65,13 @@ class LocalisationWorld:
     def scene(self, east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
         """Create the scene for a camera at or above a height above the ground.
 
-        One scene serves a whole descent; `height_m` is then the height of the last image. The mesh only gives first
-        guesses of the ground, which are refined on the exact surface. A mesh that is too coarse changes pixels at the
-        edges of hidden slopes: over the highland 0.2 % of the pixels of an image 500 m above the ground with a mesh
-        for 2000 m. A mesh for 500 m takes a third more time per image at 4200 m than one for 4200 m. The
-        terrain repeats beyond its period.
+        A whole descent uses one scene; `height_m` is then the height of the last image. The ground's mesh gives only
+        first guesses of the range, which are refined on the exact surface. A mesh that is too coarse changes pixels at
+        the edges of hidden slopes: 0.2 % of the pixels in an image 500 m above the highland, with a mesh for 2000 m. A
+        finer mesh takes longer: at 4200 m, a mesh for 500 m takes a third more time per image than one for 4200 m.
+        The terrain repeats beyond its period.
 
-        - east_m, north_m: position about which the mesh is dense, such as that below the last image
+        - east_m, north_m: position around which the mesh is dense: below one of the images
         - height_m: height above the ground of the lowest image
         - pixel_rad: angle of a pixel
         """

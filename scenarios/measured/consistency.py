@@ -28,7 +28,7 @@ from marsyard.sim.measurements import DetectorImage
 _MAX_FEATURES, _MAX_DISTANCE_RATIO = 4000, 0.8
 #: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a sample without outlier.
 _MAX_DISTANCE_PX, _CONFIDENCE = 2.0, 0.9999
-#: Minimum number of matches; five matches always have an essential matrix without residuals.
+#: Minimum number of matches: an essential matrix can be fitted exactly to any five matches, right or wrong.
 MIN_MATCHES = 15
 #: Distance that represents infinity, m.
 _INFINITY_M = 1e7
@@ -48,7 +48,7 @@ class PairMatches:
 
 @dataclass(frozen=True, eq=False)
 class PairAgreement:
-    """Matches of two images, and their offsets (u, v) from the epipolar curves that the poses define.
+    """Agreement of two images with their poses: matches, and offsets (u, v) from the epipolar curves of the poses.
 
     The offsets are in pixels of the later image; NaN if its camera cannot see the predicted point.
     """
@@ -83,7 +83,10 @@ def compare_with_poses(
 
 
 def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
-    """Return the columns of a case: matches, residuals of all pairs, worst pair's median; NaN without matches."""
+    """Return the columns of a case: number of matches, residuals over all pairs, and the largest median of a pair.
+
+    Residuals are NaN without matches.
+    """
     nan = float("nan")
     residuals = np.concatenate([pair.residuals_px for pair in pairs])
     inliers = np.concatenate([pair.matches.inliers for pair in pairs])

@@ -37,10 +37,12 @@ from marsyard.sim.camera import CameraModel, mount_looking_down, read_cameras, r
 from marsyard.sim.camera.pds import is_pds3
 from marsyard.sim.frames import SITE_FROM_WORLD
 
+#: Columns of a position.
 _POSITION = ("x_m", "y_m", "z_m")
 #: Maximum number of rows that a detector sums, and maximum relative deviation of the ratio of the focal lengths from a
 #: whole number. Calibrated focal lengths are accurate to 1 %; the next whole number after 8 differs by 12 %.
 _MAX_SUMMED_ROWS, _RATIO_TOLERANCE = 64, 0.05
+#: Default description of a campaign, by task.
 _DESCRIPTIONS = {
     "velocity": "Real descents: horizontal velocity from three images.",
     "landing": "Real flights: landing sites from two images.",

@@ -140,7 +140,11 @@ def read_ingest_file(folder: Path) -> IngestFile:
 
 
 class Column(NamedTuple):
-    """A column of `images.csv`; `images.toml` describes all columns."""
+    """A column of `images.csv`; `images.toml` describes all columns.
+
+    - tasks: tasks that read the column
+    - required: ``every`` if each row needs a value, empty if the column is optional, else the condition as text
+    """
 
     name: str
     tasks: tuple[str, ...]

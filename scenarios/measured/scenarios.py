@@ -104,14 +104,14 @@ class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParame
 
 
 class MeasuredScenario(BaseScenario[ParametersType]):
-    """A scenario whose cases are stored files; it has no shared inputs."""
+    """A scenario whose cases are stored files, so there are no inputs to prepare before the cases."""
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return an empty tuple: there are no shared inputs."""
+        """Return an empty tuple: no inputs are shared by cases."""
         return ()
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """Do nothing."""
+        """Do nothing: there is no input to prepare."""
 
 
 class MatchingScenario(MeasuredScenario[MatchingParameters]):

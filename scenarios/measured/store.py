@@ -50,7 +50,12 @@ class StoredFile(Parameters):
 
 
 class StoredImage(Parameters):
-    """An image, its size (columns, rows), and the measurements taken with it."""
+    """An image, its size (columns, rows), and the measurements taken with it.
+
+    - source: path of the image in the ingested folder
+    - counts, camera, flat_field: files next to `cases.json`; without a flat field the response is 1
+    - altitude_time_s: time tag of the altitude; None for the image's time
+    """
 
     source: str
     size: tuple[int, int]
@@ -78,7 +83,12 @@ class StoredTruth(Parameters):
 
 
 class StoredCase(Parameters):
-    """A case: its images and their measurements, and its truth."""
+    """A case: its images and their measurements, and its truth.
+
+    - interval_velocities_m_s, sun_direction: mean velocities between successive images, and the unit vector to the sun,
+      for velocity
+    - slant_range_m, site_m: range along the first camera's axis, and the a-priori site, for landing
+    """
 
     name: str
     images: tuple[StoredImage, ...]
@@ -126,6 +136,7 @@ class CasesFile(UserFile):
 
 
 def _load(file: str) -> tuple[StoredCases, str]:
+    """Return contents and SHA-256 of `cases.json`, cached until the file changes. Raises ValueError."""
     try:
         status = check_regular(file)
     except OSError as error:

@@ -36,7 +36,7 @@ class InstrumentTruth:
     World axes are east, north, up. In body axes the camera looks along -z, and its image columns increase along x.
 
     - times_s: requested times: true exposure times for an altimeter, time tags of the images for an attitude source.
-      An instrument may measure at other times; its readings contain the time tags.
+      An instrument may measure at other times; the time tags of its readings are then those of the measurements.
     - motion: true motion; `motion.state(time_s)` returns pose, velocity, body rate and specific force at a time within
       `motion.span_s`
     - ground_height: function that returns the height of the ground (m) at world x and y (m)

@@ -1,4 +1,4 @@
-"""Import and construct user-defined parts by name.
+"""Import and construct user-defined parts of a scenario by name: motions, instruments and scores.
 
 The name of a part is ``module:name`` (the module may be in the current folder), or the name of an entry point of an
 installed package in the group of the part's kind.
@@ -25,7 +25,7 @@ from marsyard.sim.parameters import Parameters
 
 @dataclass(frozen=True)
 class PartKind:
-    """A kind of user-defined parts: motions, instruments or scores.
+    """A kind of user-defined parts, and how its parts are found and checked.
 
     - name: name of the kind on the command line
     - group: entry point group for installed packages

@@ -1,4 +1,4 @@
-"""User-defined scores: `scores` of a campaign.
+"""User-defined scores: functions that compute result columns of a case, listed in the key `scores` of a campaign.
 
 A score is a function ``score(case) -> Mapping[str, float | bool]``. It returns the same names in every case; NaN is a
 missing number. Its values become result columns with the name of the function as prefix: `lateral_j` of the function
@@ -38,7 +38,7 @@ class ScoredVelocity:
     """A velocity estimator's answer to images of a descent, simulated or real.
 
     - measurements: input of the estimator
-    - answer: output of the estimator; `answer.velocity_m_s` is None after a failure
+    - answer: output of the estimator; `answer.velocity_m_s` is None after a refusal
     - true_velocity_m_s: true mean horizontal velocity (east, north) over the answer's span, by default the interval of
       the last two images; None if unknown
     """

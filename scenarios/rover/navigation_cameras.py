@@ -1,4 +1,7 @@
-"""Stereo pairs of the navigation: the mast's navcams and the body's hazcams, binned as on the rover (256 x 256)."""
+"""Stereo images for visual odometry and the terrain map: navcams on the mast and hazcams on the body, binned.
+
+The rover's software bins images to 256 x 256 pixels. `oracle_heights` replaces the images of the map by the truth.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +42,10 @@ _MAST_HALF_RAD, _BODY_HALF_RAD = float(np.radians(22.5)), float(np.radians(60.0)
 
 @dataclass(frozen=True)
 class _StereoPair:
-    """A binned stereo pair: detectors, and true and calibrated cameras in the frame of their mount (head or rover)."""
+    """A binned stereo pair: detectors, and true and calibrated cameras in the frame of their mount.
+
+    The mount is the head of the mast, or the bracket of the hazard cameras on the body.
+    """
 
     camera: StereoCamera
     true: tuple[CameraModel, CameraModel]
@@ -67,7 +73,7 @@ class _StereoPair:
         time_s: float,
         edge_rays: int,
     ) -> StereoMeasurement:
-        """Take a pair; `mounts` are the true and the measured pose of the head or rover frame, in the rover frame."""
+        """Take a pair; `mounts` are the true and the measured pose of the mount's frame in the rover frame."""
         world_from_mount = compose(vehicle.stance.world_from_rover, mounts[0])
         rays = PixelRays.from_camera(self.true[0])
         scene = replace(world.navigation_scene(rays, world_from_mount, time_s), edge_rays=edge_rays)
@@ -92,7 +98,7 @@ class NavigationCameras:
 
     mast: _StereoPair | None
     body: _StereoPair | None
-    rover_from_body: RigidTransform  #: pose of the body pair's frame, known without error
+    rover_from_body: RigidTransform  #: pose of the hazard cameras' mount in the rover frame, exact
 
     @classmethod
     def draw(cls, p: RoverScenarioParameters, rig: Rig, streams: Streams) -> NavigationCameras:
@@ -145,9 +151,10 @@ class NavigationCameras:
 def oracle_heights(
     world: RunWorld, vehicle: Vehicle, azimuth_rad: float, ranges_m: tuple[float, float], by_body: bool
 ) -> Float64[np.ndarray, "n 3"]:
-    """Sample the true ground with its rocks in a wedge, world axes: a map without occlusion and errors.
+    """Sample the true ground with its rocks in the sector that a camera sees: a map without occlusion and errors.
 
-    `azimuth_rad` is that of the wedge's centre line, positive to the right of the rover's heading.
+    Points are in world axes, metres. `azimuth_rad` is that of the sector's centre line, positive to the right of the
+    rover's heading. The apex of the sector is the front axle with `by_body`, else the rover's origin.
     """
     rover, stance = vehicle.rover, vehicle.stance
     half_rad = _BODY_HALF_RAD if by_body else _MAST_HALF_RAD

@@ -99,10 +99,11 @@ class ObstacleParameters(Parameters):
 
 
 class TargetParameters(Parameters):
-    """The target's rock, the designated point on it, and the kind of designation (section 3).
+    """The target's rock, the designated point on it, and the form of its designation (section 3).
 
     The point is selected in the view from the start: `across` is its horizontal position from the left (-1) to the
-    right (1) outline of the rock, `up` its vertical position from the foot (0) to the top (1).
+    right (1) outline of the rock, `up` its vertical position from the foot (0) to the top (1). `designation` is the
+    form in which the tracker receives the point: a pixel, or a position in the rover or site frame.
     """
 
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 0.8

@@ -44,7 +44,7 @@ from marsyard.scenarios.rover.stops import (
     StereoCamera,
     Stop,
     View,
-    choose_target,
+    designate_from_start,
     triangulate_point,
 )
 from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
@@ -67,7 +67,7 @@ MAST_SPACING_RAD = np.radians(40.0)
 
 @dataclass
 class Setup:
-    """A rover at its start with its cameras, before a target is chosen."""
+    """A rover at its start with its cameras, before the target is designated."""
 
     world: RunWorld
     rig: Rig
@@ -193,6 +193,7 @@ class DesignationGuide:
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
         """Store the view; the run continues."""
+        # a case that tracks over these views has one leg, and no drives of its own
         self.views.append(replace(view, leg=0, drives=()))
         return None
 
@@ -230,9 +231,9 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
 
 
 def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
-    """Create a run at its start and choose its target; the tracker is not called."""
+    """Create a run at its start and designate its target; the tracker is not called."""
     setup = Setup.draw(p, streams, load_ground)
-    return Run.from_setup(setup, choose_target(p, setup.world, setup.rig, setup.vehicle.stance))
+    return Run.from_setup(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
 
 
 def track_target(p: RoverScenarioParameters, run: Run) -> Run:
@@ -304,6 +305,7 @@ def drive_step(
     for command in commands:
         part_count = 1
         if leg.visual_odometry:
+            # 1e-9: tolerance for rounding errors
             parts = max(command.length_m / leg.visual_odometry_step_m, abs(command.turn_left_rad) / VISUAL_TURN_RAD)
             part_count = max(1, int(np.ceil(parts - 1e-9)))
             run.visual_odometry_updates += part_count

@@ -44,7 +44,7 @@ from marsyard.scenarios.rover.run import (
     prepare_run,
     track_target,
 )
-from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, evaluate_visibility, pick_target
+from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, designate_point, evaluate_visibility
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.parameters import Parameters
@@ -187,7 +187,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
-    run = Run.from_setup(setup, pick_target(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast)))
+    run = Run.from_setup(setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast)))
     guide = DesignationGuide.designate(run, key.margin_px, key.steering == "oracle-target")
     drive_legs(p, run, guide)
     if not guide.views:
@@ -196,10 +196,10 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
 
 def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
-    """Create a run over the drive's images and choose its target; the tracker is not called."""
+    """Create a run over the drive's images and designate its target; the tracker is not called."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
-    target = pick_target(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint)
+    target = designate_point(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint)
     return Run.from_setup(run, target)
 
 
@@ -223,7 +223,7 @@ def evaluate_drive_visibility(drive: SharedDrive, point: PointParameters, option
     """Evaluate the visibility of a target along a drive."""
     world, rig, first = drive.run.world, drive.run.rig, drive.views[0]
     position = point.across, point.up
-    target = pick_target(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
+    target = designate_point(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
     heads = [view.world_from_head for view in drive.views]
     return evaluate_visibility(world, rig, target.point_world, heads, options)
 

@@ -108,6 +108,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
         drift_m = float(np.linalg.norm(last_m - first_m))
         designation_error = float(np.linalg.norm(first_stop.error_m()))
         scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
+        # for a 3-sigma disparity error of 1 px (paper); `scale` contains the baseline, so the third argument is 1
         designation_3_sigma = stereo_range_error_m(first_stop.range_m, scale, 1.0)
     return {
         "updates": len(run.stops),
@@ -237,7 +238,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "duration_min": times[1] / 60.0,
         **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
-        "exposure_min_s": -_finite_max(-exposures),
+        "exposure_min_s": -_finite_max(-exposures),  # minimum of the finite values
         "exposure_max_s": _finite_max(exposures),
     }
 

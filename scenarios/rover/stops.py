@@ -240,7 +240,7 @@ class Visibility:
     obliquity_max_deg: float
 
 
-def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance) -> DesignatedTarget:
+def designate_from_start(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance: Stance) -> DesignatedTarget:
     """Designate the point of the parameters `target.across` and `target.up` in the view from the start.
 
     The point is designated by its true pixel, or by the position triangulated from its true pixels in both images. The
@@ -253,7 +253,7 @@ def choose_target(p: RoverScenarioParameters, world: RunWorld, rig: Rig, stance:
         raise ValueError("the mast cannot point at the target's rock from the start; change start.target_azimuth_deg")
     rig.point(*angles)
     head, readings = stance.world_from_rover * rig.rover_from_head, rig.state.readings_rad
-    target = pick_target(world, rig, head, readings, (p.target.across, p.target.up), p.vtt)
+    target = designate_point(world, rig, head, readings, (p.target.across, p.target.up), p.vtt)
     if p.target.designation == "pixel":
         return target
     in_rover = triangulate_point(rig, stance, target.point_world)
@@ -277,7 +277,7 @@ def triangulate_point(rig: Rig, stance: Stance, point_world: Vector) -> Vector:
     return np.asarray(calibrated.geometry.rover_from_head(*rig.state.readings_rad).apply(position))
 
 
-def pick_target(
+def designate_point(
     world: RunWorld,
     rig: Rig,
     world_from_head: RigidTransform,

@@ -111,8 +111,8 @@ class RunWorld:
     def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
 
-        The viewpoint of the selection is near the rover's start: at the start distance from the rock's face, and
-        `MAST_HEAD_HEIGHT_M` above the rock's foot.
+        The point is selected as seen from near the rover's start: half a rock's diameter plus the start distance from
+        the rock's centre, and `MAST_HEAD_HEIGHT_M` above its foot.
         """
         bearing, foot = p.bearing_rad, self.rocks.position_m[self.target_number]
         to_start = np.array([np.sin(bearing), np.cos(bearing), 0.0])
@@ -184,6 +184,7 @@ def place_rocks(p: RoverScenarioParameters, base: SiteGround, rng: np.random.Gen
     is_near = _distances(base.rocks, centre) < p.start.distance_m + CLEARANCE_M
     is_kept = ~is_near | (base.rocks.diameter_m <= p.world.largest_near_m)
     for position, diameter in zip(rocks.position_m[:, :2], rocks.diameter_m, strict=True):
+        # 0.6 instead of 0.5: irregular rocks extend beyond their nominal radius
         is_kept &= _distances(base.rocks, position) - 0.6 * (base.rocks.diameter_m + diameter) > MIN_GAP_M
     arrays: dict[str, Any] = {
         name: np.concatenate([getattr(rocks, name), getattr(base.rocks, name)[is_kept]]) for name in ROCK_ARRAYS
@@ -201,7 +202,7 @@ def _distances(rocks: RockField, position: Float64[np.ndarray, "2"]) -> Float64[
 
 @dataclass
 class Rig:
-    """The mast and its stereo pair with sampled errors: truth, calibration, and current angles."""
+    """Simulated mast and stereo pair with sampled errors: true values, calibrated values, and current mast angles."""
 
     head: StereoHead  #: true and calibrated stereo pair
     calibrated: MastCalibration  #: calibration known to the flight software
@@ -270,6 +271,7 @@ class Vehicle:
         azimuth = bearing + np.pi - np.radians(p.start.target_azimuth_deg)
         ahead = np.array([np.sin(azimuth), np.cos(azimuth)])
         left = np.array([-ahead[1], ahead[0]])
+        # the start distance is that of the mast's base, not of the rover's origin
         base = rig.calibrated.geometry.base_m
         target = np.array([p.world.east_m, p.world.north_m])
         position = (

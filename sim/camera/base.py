@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
 Vector = NDArray[np.float64]
-#: A number that may be an integer (the run-time type checks do not accept an integer for a float).
+#: Type of number arguments: the run-time type checks do not accept an integer for a float.
 Number = float | int
 #: Three components, as an array or a tuple.
 Vector3Like = Num[np.ndarray, "3"] | tuple[Number, Number, Number]
-#: Components x, y and z of n vectors, shape (n,) each.
-Gradient = tuple[Vector, Vector, Vector]
+#: Components x, y and z of n vectors (points, directions or gradients), shape (n,) each.
+Components = tuple[Vector, Vector, Vector]
 
 #: Tolerance on the length of A and O: labels round them to six digits or fewer.
 UNIT_TOLERANCE = 1e-4
@@ -65,11 +65,11 @@ class CameraModel(ABC):
         """Compute columns and rows, and whether each point lies in the valid range of the lens."""
 
     @abstractmethod
-    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Components, Components]:
         """Compute the derivatives of column and row with respect to x, y and z."""
 
     @abstractmethod
-    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Components, Vector | None]:
         """Compute directions (of any length) of pixels, and the rays' origins minus C, (n, 3); None if they are C."""
 
     def project(
@@ -192,7 +192,7 @@ class CameraModel(ABC):
         return self._with(h=scale[0] * self.h + shift[0] * self.a, v=scale[1] * self.v + shift[1] * self.a, size=size)
 
     def _with(self: M, **changes: Any) -> M:
-        """Return a copy with changed fields."""
+        """Return a copy in which these fields have new values."""
         return cast(M, replace(cast(Any, self), **changes))
 
     @property
@@ -261,6 +261,7 @@ class CameraModel(ABC):
             raise ValueError("h and v must span an image plane with a: the three must be linearly independent")
 
     def _fields(self) -> Mapping[str, Any]:
+        """Return the values of all fields, which define equality, hash and pickling."""
         return {field.name: getattr(self, field.name) for field in fields(cast(Any, self))}
 
     def __eq__(self, other: object) -> bool:
@@ -285,11 +286,11 @@ class CameraModel(ABC):
         columns = (_cross(self.v, self.a), _cross(self.a, self.h), _cross(self.h, self.v))
         return np.stack(columns, axis=1) / self._determinant
 
-    def _subtract_centre(self, points: NDArray[Any]) -> Gradient:
+    def _subtract_centre(self, points: NDArray[Any]) -> Components:
         x, y, z = points.T
         return x - self.c[0], y - self.c[1], z - self.c[2]
 
-    def _compute_linear_directions(self, u: Vector, v: Vector) -> Gradient:
+    def _compute_linear_directions(self, u: Vector, v: Vector) -> Components:
         """Compute the directions of pixels of the camera without distortion."""
         matrix = self._direction_from_pixel
         x, y, z = (matrix[i, 0] * u + matrix[i, 1] * v + matrix[i, 2] for i in range(3))

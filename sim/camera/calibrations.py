@@ -327,7 +327,7 @@ def from_opencv_fisheye(
         h, v = start.h + scale * (start.h - hc * a), start.v + scale * (start.v - vc * a)
         return replace(start, h=h, v=v, r=start.r + np.array([0.0, *change[1:3]]), linearity=float(change[3]))
 
-    limits, scales = np.array([0.5, 10.0, 10.0, 1.0]), np.array([1e-3, 1e-3, 1e-3, 1e-1])
+    limits, scales = np.array([0.5, 10.0, 10.0, 1.0]), np.array([1e-3, 1e-3, 1e-3, 1e-1])  # of the changes
     return _fit_camera(start, modify_camera, (directions, pixels), scales, bounds=(-limits, limits))
 
 

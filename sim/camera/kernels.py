@@ -1,4 +1,8 @@
-"""Compiled projection through a lens with radial distortion, and its inverse; used by `marsyard.sim.camera.models`."""
+"""Compiled projection through a lens with radial distortion, and its inverse.
+
+`marsyard.sim.camera.models` uses these functions and defines their symbols: `Cahvor` (omega, tau, mu) and `RadialModel`
+(chi, f).
+"""
 
 from __future__ import annotations
 

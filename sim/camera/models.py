@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from marsyard.sim.camera import kernels
-from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Gradient, Number, Vector, Vector3Like, dot
+from marsyard.sim.camera.base import UNIT_TOLERANCE, CameraModel, Components, Number, Vector, Vector3Like, dot
 
 _ORIGIN = (0.0, 0.0, 0.0)
 #: A chi^2 above this is treated as infinite.
@@ -45,12 +45,12 @@ class Cahv(CameraModel):
         depth = dot(self.a, x, y, z)
         return dot(self.h, x, y, z) / depth, dot(self.v, x, y, z) / depth, depth > 0
 
-    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Components, Components]:
         depth = dot(self.a, x, y, z)
         u, v = dot(self.h, x, y, z) / depth, dot(self.v, x, y, z) / depth
         return _gradient(self.h, self.a, u, depth), _gradient(self.v, self.a, v, depth)
 
-    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Components, Vector | None]:
         return self._compute_linear_directions(u, v), None
 
     @classmethod
@@ -135,8 +135,8 @@ class Cahv(CameraModel):
         return cls.from_axes((hs, vs), size, axis=axis, right=right, centre=centre)
 
 
-def _gradient(image_vector: NDArray[np.float64], axis: NDArray[np.float64], pixel: Vector, depth: Vector) -> Gradient:
-    """Compute the derivative of a column or row with respect to x, y and z, without distortion."""
+def _gradient(image_vector: NDArray[np.float64], axis: NDArray[np.float64], pixel: Vector, depth: Vector) -> Components:
+    """Compute the gradient of a column or row of a pinhole camera; `image_vector` is H or V, `axis` is A."""
     x, y, z = ((image_vector[i] - pixel * axis[i]) / depth for i in range(3))
     return x, y, z
 
@@ -199,14 +199,16 @@ class RadialModel(CameraModel):
             return np.inf, np.inf
         return float(tau), float(tau * (k1 + tau * (k3 + tau * k5)) ** 2)
 
-    def _split_at_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Gradient, Vector]:
+    def _split_at_axis(self, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Components, Vector]:
         """Split P - C into its component along O and the vector lambda perpendicular to O; third value: its length."""
         axial = dot(self._axis, x, y, z)
         x, y, z = x - axial * self._axis[0], y - axial * self._axis[1], z - axial * self._axis[2]
         return axial, (x, y, z), np.sqrt(x * x + y * y + z * z)
 
-    def _radial_gradient(self, lateral: Gradient, kappa: Vector, kappa_gradient: Gradient) -> tuple[Gradient, Gradient]:
-        """Compute the gradients of the pixel of O + kappa lambda; `lateral` is lambda."""
+    def _radial_gradient(
+        self, lateral: Components, kappa: Vector, kappa_gradient: Components
+    ) -> tuple[Components, Components]:
+        """Compute the gradients of column and row of O + kappa lambda; `lateral` is lambda."""
         lateral_image = [dot(vector, *lateral) for vector in (self.h, self.v, self.a)]
         axis_image = self._axis_image
         depth = axis_image[2] + kappa * lateral_image[2]
@@ -262,7 +264,7 @@ class Cahvor(RadialModel):
         )
         return pixels
 
-    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Components, Components]:
         omega = dot(self._axis, x, y, z)
         tau = np.maximum((x * x + y * y + z * z) / (omega * omega) - 1, 0)
         kappa = (1 + (self.r[0] + tau * (self.r[1] + tau * self.r[2]))) / omega
@@ -274,8 +276,8 @@ class Cahvor(RadialModel):
         )
         return self._radial_gradient(lateral, kappa, (kappa_x, kappa_y, kappa_z))
 
-    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
-        direction: Gradient = kernels.compute_ray_directions(
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Components, Vector | None]:
+        direction: Components = kernels.compute_ray_directions(
             u, v, self._direction_from_pixel, self._axis, self._polynomial, self._limits
         )
         return direction, None
@@ -398,7 +400,7 @@ class Cahvore(RadialModel):
         gain = k1 + tau * (k3 + tau * k5)
         return gain * np.where(radius > 0, chi / radius, 1 / axial)
 
-    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Gradient, Gradient]:
+    def _compute_gradients(self, x: Vector, y: Vector, z: Vector) -> tuple[Components, Components]:
         axial, lateral, radius = self._split_at_axis(x, y, z)
         theta, upsilon = self._solve_theta(axial, radius)
         chi = self._chi_from_theta(theta)
@@ -417,7 +419,7 @@ class Cahvore(RadialModel):
         )
         return self._radial_gradient(lateral, kappa, (kappa_x, kappa_y, kappa_z))
 
-    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Gradient, Vector | None]:
+    def _compute_rays(self, u: Vector, v: Vector) -> tuple[Components, Vector | None]:
         axial, lateral, radius = self._split_at_axis(*self._compute_linear_directions(u, v))
         distorted_chi = radius / np.where(axial > 0, axial, np.nan)
         ratio = kernels.compute_undistortion_ratios(self._polynomial, self._limits, distorted_chi * distorted_chi)

@@ -29,16 +29,19 @@ from marsyard.sim.camera.calibrations import MAX_BYTES, MODELS, Source, create_c
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import rigid
 
+#: PDS3: group of a camera model, and its two names.
 _CAMERA_GROUP = "GEOMETRIC_CAMERA_MODEL"
 _CAMERA_GROUPS = (_CAMERA_GROUP, f"{_CAMERA_GROUP}_PARMS")
 #: Number of bytes in which the end of a label is searched first; then `MAX_BYTES`.
 _FIRST_BYTES = 1 << 16
+#: First line of a PDS3 label.
 _START = re.compile(rb"^\s*(?:PDS|ODL)_VERSION_ID\s*=", re.MULTILINE)
 #: Number of bytes in which the start of a label is searched.
 _START_BYTES = 4096
 _END = re.compile(rb"^END\s*$", re.MULTILINE)
+#: Units of C and E that are metres; without a unit, metres are assumed.
 _PDS3_METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
-#: Groups of the rover's pose; the second is Curiosity's.
+#: Names of the group with the rover's pose; the second is Curiosity's.
 _POSE_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
 #: The ^IMAGE line with one of `9`, `20481 <BYTES>`, `("A.IMG", 9)`, `("A.IMG", 20481 <BYTES>)`, `"A.IMG"`: the image's
 #: first record or byte (counted from 1), and its file. Groups: `file...` with both, `file_only`, `position`.
@@ -57,6 +60,7 @@ _QUATERNION_TOLERANCE = 1e-3
 #: End of the message for images that are refused by default.
 _SUBFRAME = "of a part of the detector or of averaged pixels"
 
+#: PDS4: start of an XML file, and names in the geometry dictionary.
 _XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
 _PARAMETERS = "Camera_Model_Parameters"
 _POSITION, _DIRECTION, _PIXEL = (tuple(f"{axis}_{kind}" for axis in "xyz") for kind in ("position", "unit", "pixel"))

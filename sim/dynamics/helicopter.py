@@ -232,7 +232,7 @@ def _draw_tilts(
         is_inside = (times > flight_pass.start_s) & (times < flight_pass.end_s)
         for axis in range(2):
             has_swing = rng.uniform() < p.swinging_fraction
-            amplitude = max_amplitude * rng.uniform(0.2, 1.0)
+            amplitude = max_amplitude * rng.uniform(0.2, 1.0)  # from a fifth of the maximum (assumed)
             amplitudes[axis, is_inside] = amplitude if has_swing else 0.0
     pointing = np.radians(p.pointing_deg * rng.standard_normal((2, times.size)) * on_pass)
     limit = np.maximum(np.radians(p.max_tilt_deg) - np.linalg.norm(amplitudes, axis=0), 0.0)

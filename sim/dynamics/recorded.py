@@ -248,6 +248,7 @@ def _read_parquet(path: str) -> Float64[np.ndarray, "n 8"]:
 
 
 def _column_indices(path: str, names: Sequence[str]) -> list[int]:
+    """Return the positions of `COLUMNS` among the names of a table. Raises TrajectoryFileError for a missing column."""
     missing = [name for name in COLUMNS if name not in names]
     if missing:
         raise TrajectoryFileError(f"{path}: has no column {', '.join(missing)}; allowed: {_ALLOWED}")
@@ -255,6 +256,7 @@ def _column_indices(path: str, names: Sequence[str]) -> list[int]:
 
 
 def _check_poses(path: str, digest: str, values: Float64[np.ndarray, "n 8"]) -> RecordedPoses:
+    """Check the rows of a table and convert them to poses. Raises TrajectoryFileError for the first invalid pose."""
     if len(values) < MIN_POSES:
         raise TrajectoryFileError(f"{path}: has {len(values)} poses; allowed: at least {MIN_POSES}")
     invalid = np.flatnonzero(~np.all(np.isfinite(values), axis=1))

@@ -1,4 +1,4 @@
-"""True motion of a body: states at one or many instants, the interface `Trajectory`, a body at rest; and the wind."""
+"""True motion of a body: state at one or many instants, the interface `Trajectory`, a body at rest. Wind model."""
 
 from __future__ import annotations
 

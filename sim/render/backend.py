@@ -48,7 +48,7 @@ def default_backend() -> Backend:
     raise RenderingError(f"{BACKEND_VARIABLE} is '{name}'; allowed: {', '.join(BACKENDS)}")
 
 
-#: OpenGL's camera looks along -z with y up.
+#: Rotation from OpenGL's camera axes (y up, looking along -z) to the view's axes (y down, z forward).
 _VIEW_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 #: Shaders that write the triangle's number as the colour of its fragments.
@@ -73,6 +73,7 @@ void main()
     colour = number_colour;
 }
 """
+#: Locations of the vertex shader's inputs.
 _POSITION, _NUMBER = 0, 1
 #: Numbers are encoded in the 24 bits of a colour, least significant byte first; the other bits are opacity.
 _NUMBER_BITS, _OPAQUE = 0xFFFFFF, 0xFF000000

@@ -25,8 +25,8 @@ class Objects:
     - normals: unit normals of the smooth surface at the triangles' corners
     - body_of_triangle: number of each triangle's body: row of `albedo`
     - first_triangle: first triangle of each body, and the number of triangles at the end
-    - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field, any
-      other object a negative number
+    - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field; a
+      user's mesh has a number from 2^30; rover and hills have negative numbers
     """
 
     triangles: Float64[np.ndarray, "triangles 3 3"]

@@ -20,10 +20,13 @@ def _edge_length(start: Array, end: Array) -> float:
 def rasterize_heights(
     triangles: Array, corner_x: float, corner_y: float, cell: float, max_spacing: float, top: Array
 ) -> None:
-    """Update `top`, the maximum height of the triangles in each cell (world, metres).
+    """Update `top`, the maximum height of the triangles in each cell (world, metres), shape (rows, columns).
 
-    Points are sampled on a regular grid of barycentric weights, at most `max_spacing` apart. The centre of cell
-    (row, column) is at corner + cell * (column, row). Points outside the grid are ignored.
+    Points of each triangle are sampled on a regular grid of barycentric weights. Points outside the grid are ignored.
+
+    - triangles: corners in world axes, metres, shape (n, 3, 3)
+    - corner_x, corner_y, cell: centre of cell (0, 0), and side of a cell, metres; column j is at corner_x + cell * j
+    - max_spacing: maximum distance between sample points, metres
     """
     rows, columns = top.shape
     for n in range(triangles.shape[0]):

@@ -129,7 +129,10 @@ def compute_aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array
 
 @njit(cache=True)
 def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """Right-hand side for the integrator; arguments are arrays, because numba converts named tuples slowly."""
+    """Compute the time derivatives of a state for SciPy's integrator; the other arguments are from `pack_constants`.
+
+    They are arrays, because numba converts named tuples slowly.
+    """
     chain = Chain(*to_fixed_tuple(constants[:CHAIN_SIZE], CHAIN_SIZE))
     wind = to_fixed_tuple(constants[CHAIN_SIZE:], FIELD_SIZE)
     rates: Array = compute_derivatives(y, chain, WindField(wind[0], wind[1], wind[2], wind[3], wind[4], waves))
@@ -137,7 +140,7 @@ def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Arr
 
 
 def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
-    """Convert the constants to the last two arguments of `state_derivative`."""
+    """Convert the constants of chain and wind to arrays: the last two arguments of `state_derivative`."""
     return np.array([*chain, *field[:FIELD_SIZE]]), field.waves
 
 

@@ -86,7 +86,7 @@ class Landing(NamedTuple):
 class Flight(NamedTuple):
     """A simulated flight.
 
-    - rows, autopilot: rows and state of the autopilot; the functions update both
+    - rows, autopilot: states at the knots, and state of the autopilot; the functions update both
     - heading: commanded yaw, radians
     - wind, gusts: mean wind (east, north, up), and its deviation at each row, m/s
     - step: time between knots, s

@@ -1,4 +1,4 @@
-"""Occlusion of the sun by triangles, with a two-level grid perpendicular to the sun's direction.
+"""Occlusion of the sun by triangles (shadow casters), with a two-level grid perpendicular to the sun's direction.
 
 All rays to the sun are parallel. Projected along the sun's direction, a ray is a point (u, v). The coordinate s of a
 triangle's plane and the barycentric weights are linear in u and v. The triangles of each body are listed in the cells
@@ -187,7 +187,7 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
 
 
 @njit(cache=True)
-def sun_hidden(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
+def find_occluded_positions(casters: Casters, x: Array, y: Array, z: Array, hidden: Flags) -> None:
     """Test whether a triangle occludes the sun at each position; `hidden` is the output.
 
     All positions are tested in one call, because passing the arrays takes longer than testing most positions.

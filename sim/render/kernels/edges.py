@@ -1,4 +1,4 @@
-"""Antialiasing kernels: select pixels at edges, compute subpixel rays, and intersect these with the scene."""
+"""Kernels of adaptive antialiasing: select pixels at edges, and trace several rays within each of these pixels."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ from marsyard.sim.terrain.kernels import Array
 MIN_EDGE_CONTRAST = 0.04
 #: Minimum relative contrast of a shadow edge; texture rarely has this contrast.
 MIN_SHADOW_CONTRAST = 0.25
-#: Minimum jump of an occlusion in range, relative to the range, and in inverse range, relative to neighbouring changes.
+#: An occlusion is a jump of the range by at least this fraction, and of the inverse range by at least this multiple of
+#: the changes between the neighbouring pixels.
 MIN_RANGE_JUMP, MIN_JUMP_RATIO = 0.02, 3.0
 #: Limits of the search for the ground, relative to the range of a neighbouring pixel.
 SEARCH_START, SEARCH_END = 0.95, 1.05
@@ -57,7 +58,10 @@ def _is_range_jump(range0: float, range1: float, range2: float, range3: float) -
 def _find_candidates(
     line: Array32, next_line: Array32, t: Array, next_t: Array, body: Ints, next_body: Ints, is_candidate: Flags
 ) -> None:
-    """Test a necessary condition of an edge between neighbouring pixels of two lines; `t` are distances."""
+    """Mark the pixels of a line that may have an edge towards their neighbour in the next line: a fast preselection.
+
+    `line` and `next_line` are radiances, `t` and `next_t` distances, `is_candidate` is the output.
+    """
     for j in range(next_line.size):
         first, second = line[j], next_line[j]
         brighter = first if first > second else second

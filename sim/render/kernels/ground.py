@@ -1,4 +1,7 @@
-"""Intersection of rays with the ground."""
+"""Intersection of rays with the ground: search along the ray, then root finding in the interval with a crossing.
+
+The ground is a B-spline surface, sampled from one level of the terrain. All distances are along the ray, in metres.
+"""
 
 from __future__ import annotations
 

@@ -81,11 +81,13 @@ def _gradient_2d(h: np.uint32) -> tuple[np.float32, np.float32]:
 
 @njit(cache=True, inline="always")
 def _fade(t: np.float32) -> np.float32:
+    """Compute Perlin's interpolation weight 6 t^5 - 15 t^4 + 10 t^3."""
     return t * t * t * (t * (t * _SIX - _FIFTEEN) + _TEN)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _locate_3d(x: Array, y: Array, z: Array, cell: float, seed: int, buffers: NoiseBuffers) -> None:
+    """Compute the hash sum of the lower corner of each point's lattice cell in space, and the offset from it."""
     lattice, offset, _noise = buffers
     per_metre, seed_term = 1.0 / cell, np.uint32(np.uint32(seed) * _HASH_SEED)
     for k in range(min(x.size, STRIP)):
@@ -98,7 +100,7 @@ def _locate_3d(x: Array, y: Array, z: Array, cell: float, seed: int, buffers: No
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def noise_3d(x: Array, y: Array, z: Array, cell: float, seed: int, buffers: NoiseBuffers) -> None:
-    """Compute noise in space at up to `STRIP` points: smooth, of mean zero, wavelengths of about one to two cells."""
+    """Compute smooth noise of mean zero in space at up to `STRIP` points; its wavelengths are one to two cells."""
     _locate_3d(x, y, z, cell, seed, buffers)
     lattice, offset, noise = buffers
     for k in range(min(x.size, STRIP)):
@@ -119,6 +121,7 @@ def noise_3d(x: Array, y: Array, z: Array, cell: float, seed: int, buffers: Nois
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _locate_2d(x: Array, y: Array, cell: float, seed: int, buffers: NoiseBuffers) -> None:
+    """Compute the hash sum of the lower corner of each point's lattice cell in the plane, and the offset from it."""
     lattice, offset, _noise = buffers
     per_metre, seed_term = 1.0 / cell, np.uint32(np.uint32(seed) * _HASH_SEED)
     for k in range(min(x.size, STRIP)):
@@ -131,7 +134,7 @@ def _locate_2d(x: Array, y: Array, cell: float, seed: int, buffers: NoiseBuffers
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def noise_2d(x: Array, y: Array, cell: float, seed: int, buffers: NoiseBuffers) -> None:
-    """Compute noise in the plane at up to `STRIP` points: mean zero, and its derivatives along x and y, per cell."""
+    """Compute noise of mean zero in the plane at up to `STRIP` points, and its derivatives along x and y, per cell."""
     _locate_2d(x, y, cell, seed, buffers)
     lattice, offset, noise = buffers
     for k in range(min(x.size, STRIP)):

@@ -1,4 +1,4 @@
-"""Kernels of sky brightness and surface texture."""
+"""Kernels of the sky's brightness (single scattering by dust) and of the surface texture (noise of the albedo)."""
 
 from __future__ import annotations
 

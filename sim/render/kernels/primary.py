@@ -1,4 +1,9 @@
-"""Kernel that traces the ray of each pixel to the ground or to an object's triangle."""
+"""Kernel that traces the ray of each pixel to the ground or to an object's triangle.
+
+OpenGL draws a mesh of the ground and the triangles of the objects into pinhole views. Each ray reads four neighbouring
+samples of its view: the depth of the mesh gives a first guess of the distance, which is refined on the exact surface,
+and the triangle numbers select the triangles that are tested.
+"""
 
 from __future__ import annotations
 

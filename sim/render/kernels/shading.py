@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.casters import Casters, sun_hidden
+from marsyard.sim.render.kernels.casters import Casters, find_occluded_positions
 from marsyard.sim.render.kernels.microrelief import add_relief_slopes, smith_shadowing
 from marsyard.sim.render.kernels.noise import NoiseBuffers, allocate_noise
 from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
@@ -388,7 +388,7 @@ def _cast_shadows(
                 sun_fraction = visible_sun_fraction(finest.field, finest.per_metre, shadow, (x, y, z), sun, radius)
         work[SUN_FRACTION + k] = sun_fraction
         if sun_fraction > 0.0 and has_objects and (on_object or _may_be_shaded(shadow_footprint, x, y)):
-            # an offset along the normal: without it, rounding errors would let a facet shade itself
+            # an offset along the normal, m (objects: plus 5 % of a pixel); rounding could let a facet shade itself
             offset = 1e-4 + (0.05 * distance[k] * pixel_angles[k] if on_object else 0.0)
             work[OBJECT_X + n_tested] = x + offset * work[NX + k]
             work[OBJECT_Y + n_tested] = y + offset * work[NY + k]
@@ -398,7 +398,7 @@ def _cast_shadows(
     if n_tested > 0:
         xs, ys = work[OBJECT_X : OBJECT_X + n_tested], work[OBJECT_Y : OBJECT_Y + n_tested]
         zs = work[OBJECT_Z : OBJECT_Z + n_tested]
-        sun_hidden(casters, xs, ys, zs, hidden)
+        find_occluded_positions(casters, xs, ys, zs, hidden)
         for m in range(n_tested):
             work[SUN_FRACTION + other[m]] *= 0.0 if hidden[m] else 1.0
 

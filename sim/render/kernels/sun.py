@@ -12,7 +12,7 @@ from marsyard.sim.terrain.kernels import Array, Level, sample
 
 #: Unit of the stored distances of shadow casters, in rows of the grid.
 CASTER_UNIT_ROWS = 4
-#: Margin above the shadow boundary, in grid spacings, within which the swept grid is not accurate enough.
+#: Margin at the shadow boundary, in grid spacings, within which the grid of `sweep_shadow` is not accurate enough.
 COARSE_GRID_MARGIN = 0.3
 #: Side of the blocks in which a grid is transposed: source and destination fit in the processor's first-level cache.
 BLOCK = 32
@@ -176,7 +176,7 @@ def visible_sun_fraction(
 
     The fraction follows from the minimum angle between the sun's centre and the terrain below it, in radii of the sun.
     The skyline is approximated by a horizontal line across the disc. Ground that faces away from the sun has the
-    fraction 0. The search ends where the swept shadow shows that the remaining path is clear. `field` is the finest
+    fraction 0. The search ends where the shadow grid shows that the remaining path is clear. `field` is the finest
     terrain level, `radius` the angular radius of the disc.
     """
     x, y, z = position

@@ -1,4 +1,4 @@
-"""Kernels for camera rays, the depth of pinhole views, and the ground's mesh."""
+"""Kernels that prepare the pinhole views drawn by OpenGL: angles of camera rays, depth conversion, ground mesh."""
 
 from __future__ import annotations
 
@@ -95,9 +95,10 @@ def depth_in_metres(depth_buffer: Array32, near: float, far: float) -> Array32:
 
 @njit(cache=True)
 def spans_in_hull(x: Array, y: Array, hull: Array) -> Longs:
-    """First cell, and end of the cells, that overlap a convex polygon in each strip between two lines of y.
+    """Select the cells of a grid that overlap a convex polygon; return first and end cell of each strip, (strips, 2).
 
-    The lines increase; `hull` contains the polygon's corners in order, shape (corners, 2).
+    A strip lies between two successive lines of y. `x` and `y` are increasing; `hull` contains the polygon's corners in
+    order, shape (corners, 2).
     """
     spans = np.empty((y.size - 1, 2), dtype=np.int64)
     for strip in range(y.size - 1):
@@ -125,7 +126,8 @@ def build_mesh(
 ) -> tuple[Array, NDArray[np.uint32]]:
     """Triangulate the selected cells of a grid: vertices, metres, and faces, counter-clockwise seen from above.
 
-    Heights come from the coarser level of the two lines at a vertex. `spans` are those of `spans_in_hull`.
+    `level_of_x` and `level_of_y` are the terrain levels of the grid lines; a vertex has the height of the coarser level
+    of its two lines. `spans` are those of `spans_in_hull`.
     """
     lines = y.size
     # the vertices of a line are the corners of the selected cells on both sides of it

@@ -10,7 +10,7 @@ from benchmarks.validation.raycast import Ground, cast_triangles
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.kernels.casters import sun_hidden
+from marsyard.sim.render.kernels.casters import find_occluded_positions
 from marsyard.sim.render.kernels.ground import height_range
 from marsyard.sim.render.scene import (
     NO_SHADOW,
@@ -131,7 +131,7 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
     positions = rng.uniform(-9.0, 9.0, (3000, 3))
     casters = casters_towards(objects, sun)
     result = np.empty(len(positions), dtype=np.bool_)
-    sun_hidden(casters, *positions.T.copy(), result)
+    find_occluded_positions(casters, *positions.T.copy(), result)
     rays = np.broadcast_to(sun.direction, positions.shape)
     expected = np.isfinite(cast_triangles(objects, positions, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
