@@ -24,6 +24,8 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 Command = Callable[..., tuple[int, str, str]]
+#: The lower bound of 10 cases without failure is 0.1^(1/10) = 79 % at 90 % confidence (PASS), and 0.05^(1/10) = 74 % at
+#: 95 % (INSUFFICIENT for two confirmations together).
 REQUIREMENT = """
 [[requirements]]
 id = "VELOCITY"
