@@ -90,7 +90,7 @@ def test_missing_backend_has_an_error_message() -> None:
         (WORKING_BACKEND, WORKING_BACKEND, "vulkan", Verdict.FAIL, "unset MARSYARD_GL"),
     ],
 )
-def test_verdict_of_the_selected_backend(
+def test_verdict_follows_the_selected_backend(
     monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, backend: str, verdict: Verdict, remedy: str
 ) -> None:
     monkeypatch.setenv("MARSYARD_GL", backend)

@@ -157,7 +157,7 @@ def test_table_has_a_row_per_estimate(products: dict[str, Any]) -> None:
     assert final[2] == ""
 
 
-def test_view_of_a_refused_descent() -> None:
+def test_view_of_a_refused_descent_has_one_row() -> None:
     case_view = view(refused_products(), "case4")
     assert [row.succeeded for row in case_view.rows] == [False]
     assert len(case_view.figures) == 2
