@@ -1,7 +1,7 @@
 """Tests of confirmations: runs on calibration seeds give no PASS; confirmation runs are recorded and shown.
 
 A confirmation (`marsyard run --confirm`) evaluates fixed options on a new seed. The seed is computed from namespace,
-campaign and number of the confirmation.
+campaign and number of the confirmation. Algorithm, options and requirements are frozen: with others there is no PASS.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Tests of `marsyard report`, `compare` and `dashboard`, and of campaigns that stop after a decided verdict."""
+"""Tests of `marsyard report`, `compare` and `dashboard`, and of campaigns that stop after a decided verdict.
+
+Exit status: 0 requirements met, 1 failed, 2 error, 3 no verdict.
+"""
 
 from __future__ import annotations
 

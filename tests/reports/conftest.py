@@ -160,7 +160,7 @@ def write_run(
     products: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> Path:
-    """Write a run folder; `changes` replace entries of the record."""
+    """Write a run folder; `products` are stored for case 3, and `changes` replace entries of the record."""
     directory.mkdir(parents=True, exist_ok=True)
     frame.to_parquet(directory / "cases.parquet")
     record = {**synthetic_record(frame, requirements), **changes}

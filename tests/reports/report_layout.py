@@ -187,7 +187,7 @@ class CampaignReport(_Model):
 
     report_schema: Literal[6] = Field(alias="schema")
     campaign: str
-    state: Any = Field(description="as in `campaign.json`, like seed, git_commit and both times")
+    state: Any = Field(description="copied from `campaign.json`, as are seed, git_commit, started_utc and finished_utc")
     seed: Any
     git_commit: Any
     started_utc: Any

@@ -78,6 +78,7 @@ def _make_two_tracker_rows(step_sizes: int = 5) -> pd.DataFrame:
 
 
 def test_step_rates_are_compared_with_fig_8() -> None:
+    """`good`: selectable targets that are tracked to the end."""
     frame = _make_two_tracker_rows()
     frame.loc[0, ["selectable", "tracked", "no_false_track"]] = False  # unselectable targets are excluded
     rates = step_rates(make_subject(frame, legs=[{"motion": "approach", "step_fraction": 0.05}]))
