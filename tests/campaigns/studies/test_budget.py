@@ -126,7 +126,7 @@ def test_sobol_indices_of_a_linear_model_are_variance_fractions(campaign_path: P
     overrides = ("gyro_sd=0.0", "radar_sd=0.0", "dispersions.load.sd=2.0")
     result = run_budget(campaign_path, tmp_path / "run", settings, *overrides)
     indices = {item.name: item for item in result.indices}
-    # the error is 2 load + floor, with variances 4 and 1; floor is a number of the random streams
+    # the error is 2 load + floor, with variances 4 and 1; floor is drawn from the random streams
     assert indices["load"].first == pytest.approx(0.8, abs=0.15)
     assert indices["load"].total == pytest.approx(0.8, abs=0.15)
     assert indices[STREAMS].total == pytest.approx(0.2, abs=0.08)

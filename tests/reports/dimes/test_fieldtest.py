@@ -43,7 +43,7 @@ def test_cells_are_compared_with_the_paper(make_run: MakeRun, field_frame: pd.Da
     assert same_direction["difference_points"] == pytest.approx(10.0)
     assert opposite_direction["paper_percent"] is None
     assert np.isnan(opposite_direction["difference_points"])
-    assert np.isnan(opposite_direction["largest"])  # error
+    assert np.isnan(opposite_direction["largest"])  # largest error
 
 
 def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
