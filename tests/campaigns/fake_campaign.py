@@ -47,7 +47,7 @@ def write_campaign(
     requirement: str = REQUIREMENT,
     extra_tables: str = "",
 ) -> Path:
-    """Write a campaign file; each argument is the TOML text of one part. Return its path."""
+    """Write a campaign file; the arguments are its TOML texts, in the order of the file. Return its path."""
     path = folder / "fake.toml"
     path.write_text(f"{top_level_keys}\n[parameters]\n{parameters}\n{dispersions}\n{requirement}\n{extra_tables}\n")
     return path

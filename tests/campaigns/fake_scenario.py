@@ -26,7 +26,13 @@ class Wind(BaseModel):
 
 
 class FakeParameters(BaseModel):
-    """Fields `*_cases` contain the numbers of the cases with this fault; `shared` is the number of shared inputs."""
+    """Parameters of `FakeScenario`.
+
+    - *_cases: numbers of the cases with this fault
+    - shared: number of shared inputs; fail_prepare: their preparation fails; cache: folder with a file per input
+    - table: path of an input file; products: "good", or "bad" for products that cannot be stored
+    - error_scale: standard deviation of each velocity error component, m/s; sleep_s: duration of a case
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

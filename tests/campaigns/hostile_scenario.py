@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from marsyard.scenarios.interface import CaseResult, record_conditions
 from marsyard.sim.streams import Streams
 
-#: Case number n has fault n modulo the number of faults.
+#: Case n has the fault with index n modulo the number of faults.
 FAULTS = (
     "no fault",
     "text in a metric",

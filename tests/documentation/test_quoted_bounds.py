@@ -55,6 +55,7 @@ def test_quoted_bounds_on_wrong_velocities_are_correct(column: int) -> None:
 
 
 def test_quoted_intervals_of_wrong_answers_are_correct() -> None:
+    """The page gives 1 of 5 and 3 of 10 wrong answers; so few answers cannot show a rate of one in 300."""
     page = read_page("dimes.md")
     for (wrong, answers), interval_text in (((1, 5), "0.5 to 71.6 %"), ((3, 10), "6.7 to 65.2 %")):
         low, high = proportion_interval(wrong, answers, 0.95)
@@ -81,6 +82,7 @@ def test_quoted_intervals_of_landings_are_correct() -> None:
 
 
 def test_quoted_bounds_of_landings_are_correct() -> None:
+    """The page gives 140 of 142, 15 of 15 and 31 of 33 successful flights."""
     page = read_page("hda.md")
     for successes, total in ((140, 142), (15, 15)):
         lower = f"{100.0 * proportion_lower(successes, total, 0.9):.1f}"
@@ -101,6 +103,7 @@ def test_groups_of_hazardous_flights_sum_to_all_flights() -> None:
 
 
 def test_quoted_bounds_of_runs_to_the_goal_are_correct() -> None:
+    """The page gives successful runs by camera (of 457 and 467), and completed runs and false tracks of 935 runs."""
     page = read_page("vtt.md")
     navcam, pancam = (100.0 * proportion_lower(*counts, 0.9) for counts in ((456, 457), (467, 467)))
     assert f"at least {navcam:.2f} and {pancam:.2f} % at 90 % confidence" in page
@@ -117,5 +120,6 @@ def test_quoted_sample_sizes_are_correct() -> None:
 def test_requirements_based_on_a_calibration_are_listed() -> None:
     page = read_page("explanation/statistics.md")
     assert "no requirement rests on it" not in page
+    # requirements whose verdicts depend on a calibrated option
     for name in ("HDA-TIME", "HDA-POS", "FIELD-VEL", "FIELD-ANSWER"):
         assert name in page

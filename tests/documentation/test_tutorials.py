@@ -21,6 +21,7 @@ pytestmark = [
 
 TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
 CODE_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+#: End of the text before a code block that is saved to a file.
 FILE_NAME = re.compile(r"Save\s+it\s+as\s+`([\w./-]+)`:\s*\Z")
 #: Files that exist after the tutorial.
 EXPECTED_FILES = {
@@ -48,6 +49,7 @@ EXPECTED_FILES = {
 }
 #: Folder of the packages that a tutorial installs.
 INSTALL_FOLDER = "installed"
+#: Comment after a command that states its exit status, if it is not 0.
 EXIT_CODES = re.compile(r"# exits with (\d)(?: or (\d))?")
 
 

@@ -1,6 +1,6 @@
 """Tests that names, docstrings, comments and pages use the standard terms of the field.
 
-The rejected words replaced standard terms in earlier versions. docs/glossary.md defines the accepted terms.
+The tables below map each rejected word to its standard term. docs/glossary.md defines the accepted terms.
 """
 
 from __future__ import annotations

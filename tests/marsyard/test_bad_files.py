@@ -63,6 +63,7 @@ def write_empty(path: Path) -> None:
     path.write_bytes(b"")
 
 
+#: TOML tables of a campaign that refer to a file.
 CAMERA = '[parameters.camera]\nmodel = "{}"'
 TERRAIN = '[parameters.terrain.source]\ndtm = "{}"'
 FLIGHT = '[parameters.flight]\nfile = "{}"\naxes = "enu"\nattitude_of = "body"'
@@ -158,6 +159,7 @@ def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], messag
 
 
 def run_and_expect_error(arguments: list[str], path: Path, message: str) -> None:
+    """Run a command; assert that it exits with status 2 and an error message that names the file."""
     result = CliRunner().invoke(app, arguments)
     assert (result.exit_code, type(result.exception)) == (2, SystemExit)
     output = result.output

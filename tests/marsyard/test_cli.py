@@ -1,4 +1,7 @@
-"""Tests of the command line: output, error messages, exit status and run folders."""
+"""Tests of the command line: output, error messages, exit status and run folders.
+
+Exit status: 0 requirements met, 1 requirement or case failed, 2 error, 3 no verdict.
+"""
 
 from __future__ import annotations
 
@@ -151,6 +154,7 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Comma
     append_result = marsyard("append", tmp_path / "run", 20, "--jobs", 1, "--allow-changed")
     assert append_result.status == 3
     assert "of 60" in append_result.out
+    # minimum number of cases for 99 % at 90 % confidence
     assert "takes at least 230 cases without a failure; the campaign has 60" in append_result.out
 
 

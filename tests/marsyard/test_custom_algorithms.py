@@ -53,6 +53,7 @@ def test_conformance_survives_crashes_and_hangs(tmp_path: Path, monkeypatch: pyt
     assert "FAIL dark" in result.output
     assert "CRASHED: the worker process died: SIGABRT (-6)" in result.output
     assert "FAIL saturated" in result.output
+    # a check may take 5 s plus two calls of 1 s
     assert "TIMED_OUT: took longer than its limit of 7 s" in result.output
     assert "to fix: it must return within the limits of time and memory" in result.output
     assert "7 of 9 checks passed" in result.output
@@ -83,6 +84,7 @@ def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: 
     monkeypatch.chdir(tmp_path)
     result = CliRunner().invoke(app, ["conformance", "state_changing:StateChanging"])
     assert result.exit_code == 1, result.output
+    # three uniform images: featureless, dark and saturated
     assert result.output.count("it changed the state of its process: the working folder") == 3
     assert "child processes that are still running (python)" in result.output
     assert "threads that are still running (Thread-" in result.output
@@ -132,6 +134,7 @@ def test_exported_cases_are_scored(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["score", str(cases), str(table)])
     assert result.exit_code == 2
     assert "no answer to 1 of 2 cases: 1" in result.output
+    # the true velocity is 12 m/s east and 7 m/s south
     table.write_text("case,velocity_east_m_s,velocity_north_m_s\n0,12.5,-7\n1,12,-7\n")
     result = CliRunner().invoke(
         app, ["score", str(cases), str(table), "--out", str(tmp_path / "scored"), "--jobs", "1"]

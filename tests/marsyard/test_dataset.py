@@ -1,4 +1,4 @@
-"""Tests of data sets for machine learning: shards, truth of each pixel and reproducible files."""
+"""Tests of data sets for machine learning: tar files of samples (shards), truth of each pixel, reproducible files."""
 
 from __future__ import annotations
 
@@ -83,6 +83,7 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
     shards = sorted((tmp_path / "set").glob("*.tar"))
     assert [path.name for path in shards] == ["shard-000000.tar", "shard-000001.tar"]
     files = read_shard(shards[1])
+    # one case per shard; samples are named by case and image
     assert {name.partition(".")[0] for name in files} == {"0000001-0", "0000001-1"}
 
     sample = json.loads(files["0000001-0.json"])
@@ -95,6 +96,7 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
     assert image.shape == rocks.shape == hazard.shape == distance.shape == normal.shape[:2]
     assert np.allclose(np.linalg.norm(normal, axis=2), 1.0, atol=1e-3)
     assert set(np.unique(rocks)) == {0, 1}
+    # safe, hazard, unknown
     assert set(np.unique(hazard)) <= {0, 1, 255}
     assert 0 in hazard
 
@@ -151,6 +153,7 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
         x, y, z = points[is_visible].T
         # the level of detail smooths the terrain over one pixel, about 2 m at 2000 m range
         assert np.median(abs(z - surface.height(x, y))) < 0.2
+        # descents at about 75 m/s
         assert sample["velocity_m_s"][2] < -60.0
 
 

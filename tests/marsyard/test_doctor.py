@@ -21,6 +21,7 @@ from rich.console import Console
 from marsyard import doctor, gl_probe
 from marsyard.doctor import Check, Probe, Verdict
 
+#: Results of a rendering test with an OpenGL backend that works, and with one that is not installed.
 WORKING_BACKEND = Probe(
     {"renderer": "r", "version": "v", "depth_error_m": 1e-5, "offset_px": [0.0, 0.0], "has_colour": True}
 )
@@ -36,6 +37,7 @@ def run_doctor(*, as_json: bool = False) -> tuple[int, str]:
 
 @pytest.fixture
 def set_check(monkeypatch: pytest.MonkeyPatch) -> Callable[[Check], None]:
+    """Return a function that replaces all checks by one."""
     return lambda check: monkeypatch.setattr(doctor, "run_checks", lambda: iter([check]))
 
 
@@ -88,7 +90,7 @@ def test_missing_backend_has_an_error_message() -> None:
         (WORKING_BACKEND, WORKING_BACKEND, "vulkan", Verdict.FAIL, "unset MARSYARD_GL"),
     ],
 )
-def test_verdict_of_the_selected_backend(
+def test_verdict_follows_the_selected_backend(
     monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, backend: str, verdict: Verdict, remedy: str
 ) -> None:
     monkeypatch.setenv("MARSYARD_GL", backend)

@@ -69,6 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     result = subprocess.run(
         [*command, "--jobs", "1", "--out", "run"], cwd=path, capture_output=True, text=True, timeout=120, check=False
     )
+    # no answer is valid, so that the requirement fails or remains undecided
     assert result.returncode in (1, 3), result.stderr
     return path
 

@@ -165,6 +165,7 @@ def test_deprecated_names_of_classes_are_accepted() -> None:
 
 
 def test_renamed_table_keeps_its_draws() -> None:
+    """Random streams have the deprecated names: the climb is uniform from -0.15 to 0, the tilt from 0 to 10 deg."""
     campaign = load_campaign("hda-mars")
     uniform = campaign.streams(0).generator("dispersion:flown.climb_share").random()
     assert campaign.draws(0)["image_poses.climb_fraction"] == pytest.approx(-0.15 * (1.0 - uniform), abs=1e-12)
@@ -204,7 +205,7 @@ def test_stored_campaign_is_read_with_current_names(campaign_files: tuple[Path, 
     assert run.record["requirements"][0]["population"] == "valid and feasible_overlap"
 
 
-def test_former_names_of_faults_are_accepted(campaign_files: tuple[Path, Path], tmp_path: Path) -> None:
+def test_deprecated_names_of_faults_are_accepted(campaign_files: tuple[Path, Path], tmp_path: Path) -> None:
     path = campaign_files[1]
     dispersion = 'faults = { distribution = "grid", values = [{ black_picture = 2 }], source = "test" }'
     path.write_text(path.read_text().replace("[dispersions]", f"[dispersions]\n{dispersion}"))
@@ -263,6 +264,7 @@ def test_current_names_exist_and_deprecated_names_do_not() -> None:
     for deprecated_name, current_names in RENAMED_NAMES["keys"].items():
         for current_name in [current_names] if isinstance(current_names, str) else current_names:
             assert f'"{current_name}": {{' in schemas, current_name
+        # short words may also be current keys of other tables, such as `placed` of rocks
         assert deprecated_name in ("own", "least", "most", "placed") or f'"{deprecated_name}": {{' not in schemas, (
             deprecated_name
         )

@@ -104,6 +104,7 @@ def test_contact_sheet_is_small(images: list[GalleryImage]) -> None:
 
 
 def test_map_to_grey_keeps_the_order_of_brightness() -> None:
+    """Ground of 800 counts under a sky of 3000 counts: the sky is white, and the ground uses the other grey levels."""
     rng = np.random.default_rng(3)
     ground = np.ones((120, 160), dtype=bool)
     ground[:20] = False

@@ -128,6 +128,7 @@ def test_invalid_options_write_no_campaign(working_folder: Path, arguments: tupl
 
 def test_invalid_answers_are_rejected_in_the_dialogue(working_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marsyard.cli.new._is_terminal", lambda: True)
+    # system, site, camera, flight file and bound; invalid answers are asked again
     answers = ["velocty", "velocity", "venus", "meridiani", "absent.yaml", "", "absent.csv", "", "-3", "many", "4"]
     result = CliRunner().invoke(app, ["new", "mine"], input="\n".join(answers) + "\n")
     assert result.exit_code == 0, result.output

@@ -76,6 +76,7 @@ def test_lines_print_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("marsyard.cli.progress.time.monotonic", clock)
     console = Console(file=io.StringIO(), force_terminal=False)
     lines = LineProgress(console)
+    # after one case of 12.5 s, seven cases need 87.5 s
     lines.begin("cases", 8)
     clock.now_s += 12.5
     lines.step()

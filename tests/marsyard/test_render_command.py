@@ -55,6 +55,7 @@ def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
         to_sun = np.array(metadata["sun_direction"])
         to_eye = (camera.c - points) / truth["range_m"][is_surface][:, None]
         np.testing.assert_allclose(np.cos(np.radians(truth["phase_deg"][is_surface])), to_eye @ to_sun, atol=1e-5)
+        # number of the body; -1: ground, -2: sky
         assert ((truth["object"] == -2) == ~is_surface).all()
         assert (truth["object"] >= 0).any()
         assert 0.0 < truth["shadow"][is_surface].mean() < 0.5

@@ -1,4 +1,7 @@
-"""Tests of `marsyard report`, `compare` and `dashboard`, and of campaigns that stop after a decided verdict."""
+"""Tests of `marsyard report`, `compare` and `dashboard`, and of campaigns that stop after a decided verdict.
+
+Exit status: 0 requirements met, 1 failed, 2 error, 3 no verdict.
+"""
 
 from __future__ import annotations
 
@@ -110,6 +113,7 @@ def test_two_campaigns_are_compared(make_run: MakeRun, marsyard: Command) -> Non
     runs = make_run("a"), make_run("b", 2, seed=8)
     status, out, err = marsyard("compare", *runs)
     assert (status, err) == (0, "")
+    # the rate of cases that were completed
     assert "came to an end" in out
     assert "different draws" in out
     comparison = json.loads(marsyard("compare", *runs, "--json")[1])
@@ -140,11 +144,13 @@ def test_dashboard_is_written_and_served_locally(make_run: MakeRun, marsyard: Co
 
 
 def _make_rows(n: int, failures: int) -> pd.DataFrame:
+    """Return cases whose first `failures` errors exceed the bound of 5 m/s."""
     errors = [6.0] * failures + [1.0] * (n - failures)
     return pd.DataFrame({"case": range(n), "outcome": "VALID", "answered": True, "velocity_error_m_s": errors})
 
 
 def _find_next_look(n: int, failures: int, max_cases: int, **changes: Any) -> int | None:
+    """Return the number of cases of the next evaluation after `n` cases; None if the campaign stops."""
     requirement = {
         "id": "R",
         "metric": "velocity_error_m_s",

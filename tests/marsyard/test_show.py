@@ -187,6 +187,7 @@ _random_values = st.recursive(
 
 
 def _format_toml(value: Any) -> str:
+    """Format a value as TOML on one line; each character of a text is escaped."""
     if isinstance(value, dict):
         return (
             "{"
@@ -201,6 +202,7 @@ def _format_toml(value: Any) -> str:
 
 
 def _change_document(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
+    """Return a copy of the campaign with another value at a path; `_MISSING` removes the key."""
     document = copy.deepcopy(_DOCUMENT)
     table: Any = document
     for part in path[:-1]:

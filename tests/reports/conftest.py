@@ -108,7 +108,8 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
             products[f"window_{pair}_{template}"] = rng.normal(1500, 300, (61, 61)).astype(np.float32)
             products[f"template_{pair}_{template}"] = rng.normal(1500, 300, (17, 17)).astype(np.float32)
             products[f"match_{pair}_{template}"] = np.array([33.4, 39.2])
-        # nadir camera with 5 m per pixel; the field of view of the rectified camera is 1.5 times as wide
+        # nadir camera with 5 m per pixel; the field of view of the rectified camera is 1.5 times as wide.
+        # Frame of the rectified image: west edge, north edge and lattice spacing, m
         lattice = np.stack(np.meshgrid(*(np.linspace(-64.0, 319.0, 17),) * 2), axis=-1)
         products |= {f"rectified_{pair}_{side}": lattice for side in (0, 1)}
         products[f"rectified_frame_{pair}"] = np.array([-64.0 - 128.0, 128.0 + 64.0, 383.0 / 16.0]) * 5.0
@@ -159,7 +160,7 @@ def write_run(
     products: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> Path:
-    """Write a run folder; `changes` replace entries of the record."""
+    """Write a run folder; `products` are stored for case 3, and `changes` replace entries of the record."""
     directory.mkdir(parents=True, exist_ok=True)
     frame.to_parquet(directory / "cases.parquet")
     record = {**synthetic_record(frame, requirements), **changes}

@@ -9,13 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field
 VerdictName = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
 
 
-class _Part(BaseModel):
-    """Base class of the parts of the report; undeclared keys are rejected, and null represents NaN and infinities."""
+class _Model(BaseModel):
+    """Base class of the models; undeclared keys are rejected, and null represents NaN and infinities."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ClusterEvidence(_Part):
+class ClusterEvidence(_Model):
     """Evidence from cases that share terrains; a terrain is a cluster."""
 
     terrains: int
@@ -28,7 +28,7 @@ class ClusterEvidence(_Part):
     upper: float
 
 
-class AllCases(_Part):
+class AllCases(_Model):
     """The same requirement on all cases."""
 
     status: VerdictName
@@ -42,7 +42,7 @@ class AllCases(_Part):
     )
 
 
-class Evidence(_Part):
+class Evidence(_Model):
     """Kind of evidence of the run, by its seed and its frozen algorithm."""
 
     kind: Literal[
@@ -63,7 +63,7 @@ class Evidence(_Part):
     text: str
 
 
-class RequirementVerdict(_Part):
+class RequirementVerdict(_Model):
     """Verdict on one requirement."""
 
     requirement_id: str
@@ -112,7 +112,7 @@ class RequirementVerdict(_Part):
     note: str
 
 
-class QuantileBounds(_Part):
+class QuantileBounds(_Model):
     """A quantile with one-sided bounds."""
 
     probability: float
@@ -121,7 +121,7 @@ class QuantileBounds(_Part):
     upper: float | None
 
 
-class ErrorStatistics(_Part):
+class ErrorStatistics(_Model):
     """Statistics of errors."""
 
     n: int
@@ -140,7 +140,7 @@ class ErrorStatistics(_Part):
     confidence: float
 
 
-class TerrainBank(_Part):
+class TerrainBank(_Model):
     """The terrains that cases can use."""
 
     terrains: int
@@ -148,7 +148,7 @@ class TerrainBank(_Part):
     in_turn: bool = Field(description="true: the cases use the terrains in turn; false: terrains are drawn at random")
 
 
-class SamplingDescription(_Part):
+class SamplingDescription(_Model):
     """Sampling design of the cases."""
 
     design: str = Field(description="`random`, `latin-hypercube` or `sobol`")
@@ -163,7 +163,7 @@ class SamplingDescription(_Part):
     text: str
 
 
-class AlgorithmDescription(_Part):
+class AlgorithmDescription(_Model):
     """An algorithm under test; unknown texts are empty."""
 
     name: str = Field(description="name in the campaign")
@@ -174,7 +174,7 @@ class AlgorithmDescription(_Part):
     source_hash: str
 
 
-class StudyDescription(_Part):
+class StudyDescription(_Model):
     """A study: its kind, its requirement, and its main result."""
 
     kind: str
@@ -182,12 +182,12 @@ class StudyDescription(_Part):
     sentence: str
 
 
-class CampaignReport(_Part):
+class CampaignReport(_Model):
     """Content of `report.json`: the results of a campaign's report."""
 
     report_schema: Literal[6] = Field(alias="schema")
     campaign: str
-    state: Any = Field(description="as in `campaign.json`, like seed, git_commit and both times")
+    state: Any = Field(description="copied from `campaign.json`, as are seed, git_commit, started_utc and finished_utc")
     seed: Any
     git_commit: Any
     started_utc: Any

@@ -1,4 +1,4 @@
-"""Tests of failure boundaries: known probabilities are found, and fits without skill are not drawn."""
+"""Tests of failure boundaries (fitted probability of a violation): true probabilities, and fits without skill."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_boundary_of_two_true_conditions_is_drawn() -> None:
     assert fit["drawn"]
     assert fit["skill_lower"] > 0.3
     assert len(section.blocks[0].figures) == 1
-    assert section.blocks[0].grid.rows[0][-1] == "yes"
+    assert section.blocks[0].grid.rows[0][-1] == "yes"  # column: boundary drawn
 
 
 def test_fitted_probability_is_close_to_the_true_one() -> None:

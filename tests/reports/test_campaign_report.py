@@ -22,6 +22,7 @@ MakeRun = Callable[..., Path]
 VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
 #: Minimum columns of a report.
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
+#: Text that would run a script or a template if it were not escaped.
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'&{{ 7*7 }}"
 
 

@@ -37,6 +37,7 @@ def test_figure_shows_marginals_and_pairs() -> None:
     assert {"east", "north", "heights\nm\n1", "kind"} <= set(texts)
     assert [text for text, weight in texts.items() if weight == "bold"] == ["+0.99"]
     points = next(collection for collection in pair_axes.collections if isinstance(collection, PathCollection))
+    # four parameters vary: six pairs
     assert np.shape(points.get_offsets())[0] == 6 * 300
 
 

@@ -58,6 +58,7 @@ def test_notable_cases_are_worst_unanswered_and_random_cases(make_rows: Rows, ma
     assert cases[:2] == errors.nlargest(2).index.tolist()
     unanswered_cases = frame.index[errors.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
     assert cases[2:4] == unanswered_cases[:2]
+    # two worst, two unanswered and two random cases
     assert len(cases) == len(set(cases)) == 6
     assert not set(cases) & set(frame.index[frame["outcome"].eq("CRASHED")])
     assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
@@ -68,6 +69,7 @@ def test_gallery_starts_with_first_worst_and_unanswered_cases(make_rows: Rows, m
     run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
     cases = gallery_cases(run)
     assert cases[0] == 7
+    # the selected case, two worst, two unanswered and two random cases
     assert len(cases) == len(set(cases)) == 7
     worst_cases = frame[METRIC].drop(7).sort_values(ascending=False).index[:2]
     assert cases[1:3] == worst_cases.tolist()

@@ -19,4 +19,4 @@ from marsyard.reports.sections import outcome_grid
 def test_outcome_has_the_meaning_of_its_system(scenario: str, meaning: str) -> None:
     rows = outcome_grid(pd.DataFrame({"outcome": ["VALID"] * 3}), scenario).rows
     assert len(rows) == 1
-    assert meaning in rows[0][3]
+    assert meaning in rows[0][3]  # column: meaning

@@ -166,6 +166,7 @@ def test_page_lists_regressions_and_interrupted_runs(tmp_path: Path) -> None:
         history.finish(_add_run(history, 1), INTERRUPTED)
         history.finish(_add_run(history, 2), FINISHED)
         later, earlier = history.nights()
+    # campaign, metric, is a rate, value before, value now, p-value, number of earlier nights
     changes_of_night = [
         Change("first", "DIMES-VEL", True, 0.95, 0.7, 2e-6, 7),
         Change("first", "error (m)", False, 2.0, 1.0, 1e-3, 7),

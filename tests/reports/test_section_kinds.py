@@ -1,4 +1,4 @@
-"""Tests of report sections that are declared as a list of parts: statistics, rates and figures."""
+"""Tests of declared report sections: a list of statistics, rates and figures with their columns."""
 
 from __future__ import annotations
 
@@ -66,6 +66,7 @@ def make_rows_of_two_altitudes() -> pd.DataFrame:
 def test_declared_section_contains_its_parts_in_order() -> None:
     section = ALTITUDE(make_subject(make_rows_of_two_altitudes()))
     assert section is not None
+    # statistics, distribution, rates, rates by condition (figure, table), scatter plot, note
     assert [len(block.figures) for block in section.blocks] == [0, 1, 0, 1, 0, 1, 0]
     assert section.blocks[-1].note == "Synthetic data."
     low, high = section.data["by_condition"]

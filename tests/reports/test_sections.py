@@ -66,6 +66,7 @@ def test_crashed_cases_of_unknown_overlap_count_as_failures(make_rows: Rows) -> 
     frame = make_rows(50, answer_rate=1.0, n_crashed=5)
     has_overlap: list[bool | None] = [True] * 45 + [None] * 5
     rates = answer_fractions(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
+    # crashed cases count as cases with feasible overlap; the last two rates exclude them
     assert [(rate.hits, rate.n) for rate in rates.values()] == [(45, 50), (45, 50), (0, 45), (0, 45)]
 
 
@@ -182,6 +183,7 @@ def test_sensitivity_is_large_for_the_true_driver_only() -> None:
     for name in ("descent_rate_m_s", "altitude_1_m"):
         assert abs(effects[name].effect[0]) < 0.1
     correlation = effects["attitude_rate_max_deg_s"].rank_correlation[0]
+    # column 2: attitude rate
     assert correlation == pytest.approx(make_sensitive_rows(600, 600).corr("spearman").loc[METRIC].iloc[2], abs=1e-9)
 
 

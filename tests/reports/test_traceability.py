@@ -17,6 +17,7 @@ from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_eviden
 from marsyard.reports.verdicts import evaluate_requirements
 
 Rows = Callable[..., pd.DataFrame]
+#: Text that a spreadsheet would evaluate and XML cannot contain.
 HOSTILE = '=HYPERLINK("x")\x00<&>'
 
 

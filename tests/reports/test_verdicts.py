@@ -40,7 +40,7 @@ def _evaluate(frame: pd.DataFrame, requirement: dict[str, Any], **changes: Any) 
 
 
 def test_verdict_passes_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
-    # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (docs/design.md)
+    # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (binomial distribution)
     assert _evaluate(_make_rows(230, 0), velocity).status is Status.PASS
     assert _evaluate(_make_rows(388, 1), velocity).status is Status.PASS
     undecided = _evaluate(_make_rows(229, 0), velocity)

@@ -1,4 +1,7 @@
-"""Tests of the isolation of cases: processes, threads and changed process state do not affect the next case."""
+"""Tests of the isolation of cases: processes, threads and changed process state do not affect the next case.
+
+A worker process runs a task once for each item; in campaigns the items are the case numbers.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,11 @@ def has_ended(process: int) -> bool:
 
 
 def start_endless_tasks(kind: str, folder: str, item: int) -> int:
-    """In item 0, start endless threads or processes and write their process ids to a file; return the own id."""
+    """In item 0, start endless threads or processes and write their process ids to a file; return this process's id.
+
+    Kinds: a thread; a pool of two processes; a forked child; a child in a separate session; an orphan, which is a
+    child whose parent has ended.
+    """
     processes = []
     if item == 0 and kind == "thread":
         threading.Thread(target=time.sleep, args=(3600,)).start()
@@ -156,7 +163,7 @@ def test_signal_to_supervisor_ends_only_the_case(signal_number: int, tmp_path: P
 
 
 def overwrite_board(item: int) -> int:
-    """Write 1 into every field of the status board, including process ids."""
+    """Write the integer 1 into all fields of the status board (shared memory: item and start time of the worker)."""
     assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:] = struct.pack("=q", 1) * (len(board) // 8)
@@ -164,7 +171,7 @@ def overwrite_board(item: int) -> int:
     return item
 
 
-def test_process_ids_written_by_a_case_are_not_signalled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_status_board_written_by_a_case_is_not_used_as_process_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     signalled_processes = []
     kill = os.kill
 
@@ -182,7 +189,7 @@ def test_process_ids_written_by_a_case_are_not_signalled(monkeypatch: pytest.Mon
         assert batch[0].error.outcome == TIMED_OUT
     assert worker is not None
     assert signalled_processes
-    assert min(signalled_processes) > 1  # the board contained process id 1
+    assert min(signalled_processes) > 1  # the value on the board is not signalled
 
 
 #: Changes of the process state, by their description in the notes of a campaign.
@@ -271,9 +278,9 @@ def test_environment_is_restored_after_import_in_case(tmp_path: Path, monkeypatc
 
 
 def crash_after_other_case(item: int) -> int:
-    """Crash if the previous item ran in this worker (its state is not restored); item 3 always crashes."""
+    """Report a crash if the previous item ran in this process, or in item 3. `_worker_state` is not restored."""
     if item in _worker_state or item == 3:
-        request_fresh_worker()  # reports the crash
+        request_fresh_worker()  # marks the item as crashed
         return -1
     _worker_state.append(item + 1)
     time.sleep(0.01)

@@ -1,4 +1,4 @@
-"""Tests of the local executor: limits, worker crashes, batches and memory accounting."""
+"""Tests of the local executor: limits, worker crashes, batches of items and memory accounting."""
 
 from __future__ import annotations
 
@@ -231,6 +231,7 @@ def test_used_memory_counts_only_private_pages(tmp_path: Path) -> None:
 
 
 def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
+    # 400 items, whose number is known, for 2 workers
     batches = Batches(range(400), 400, 2)
     sizes = []
     while batch := batches.next():
@@ -240,11 +241,11 @@ def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
     assert sizes[:5] == [1, 2, 4, 8, 16]
     assert max(sizes) == 20
     assert sizes[-1] == 1
-    # batches of empty cases reach the maximum size; slow cases run one by one
-    empty_cases = Batches(range(10_000), None, 2)
-    sizes = [len(empty_cases.next())]
-    while batch := empty_cases.next():
-        empty_cases.record_time(sizes[-1], 0.0)
+    # batches of cases without run time reach the maximum size (the total is unknown); slow cases run one by one
+    instant_cases = Batches(range(10_000), None, 2)
+    sizes = [len(instant_cases.next())]
+    while batch := instant_cases.next():
+        instant_cases.record_time(sizes[-1], 0.0)
         sizes.append(len(batch))
     assert max(sizes) == MAX_BATCH
     slow_cases = Batches(range(5), 5, 1)
@@ -254,6 +255,7 @@ def test_batches_last_about_one_second_and_shrink_at_the_end() -> None:
 
 
 def test_status_board_shows_item_and_start(tmp_path: Path) -> None:
+    """A worker writes its current item and the start time (s) to shared memory; None means idle."""
     board = StatusBoard.create(tmp_path / "board")
     assert board.read()[0] is None
     StatusBoard(tmp_path / "board").write(2**40, 1.5)

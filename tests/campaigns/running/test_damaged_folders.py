@@ -104,6 +104,7 @@ def test_stored_parameters_with_wrong_types_are_rejected(
     ],
 )
 def test_damaged_store_is_reported(tmp_path: Path, change: str, message: str) -> None:
+    """Each stored row refers to a layout: a list of column names in another table of the database."""
     path = tmp_path / ROWS_FILE
     create_store(path, {})
     with RowStore(path) as store:

@@ -37,7 +37,7 @@ def test_campaign_with_failing_cases_finishes(
     assert "in run" in rows[3]["traceback"]
     assert rows[5]["error"] == "the worker process died: SIGABRT (-6)"
     assert "fake_scenario.py" in rows[5]["traceback"]
-    # same rows with one worker, without the failing cases, and for single replayed cases
+    # no column differs with one worker, without the failing cases, and for single replayed cases
     single_worker_rows = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch, jobs=1))
     assert [differing_columns(*pair) for pair in zip(rows, single_worker_rows, strict=True)] == [()] * 12
     rows_without_faults = read_case_rows(run(campaign_file("unanswered_cases = [2]"), tmp_path / "no-faults", watch))
@@ -78,7 +78,7 @@ def test_record_describes_the_run(failing_campaign: Path) -> None:
     assert sorted(path.name for path in failing_campaign.iterdir()) == files
 
 
-def test_threads_and_hashes_are_pinned_in_workers(failing_campaign: Path) -> None:
+def test_workers_have_one_thread_and_the_same_hash_seed(failing_campaign: Path) -> None:
     rows = [row for row in read_case_rows(failing_campaign) if row["outcome"] != "CRASHED"]
     assert {row["threads"] for row in rows} == {"1"}
     assert len({row["hash_of_text"] for row in rows}) == 1

@@ -1,4 +1,7 @@
-"""Tests of the input files in a campaign's identity: `resume` and `append` detect changed files."""
+"""Tests of the input files of a campaign: their hashes belong to its identity.
+
+`resume` and `append` compare the identity, and reject changed files.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests of shared inputs (terrains): a campaign builds only used inputs, and its estimate includes their cost."""
+"""Tests of shared inputs (such as terrains): only used inputs are built, and the cost estimate includes them."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_used_inputs_are_shared_inputs_of_the_campaign(name: str) -> None:
     assert all(campaign.scenario.missing_bytes(parameters, shared_input) >= 0 for shared_input in used_inputs)
 
 
-def test_every_scenario_with_shared_inputs_selects_them() -> None:
-    """Scenarios of measured images have no shared inputs."""
+def test_every_scenario_with_shared_inputs_lists_those_of_a_case() -> None:
+    """`SelectsInputs` is the interface of scenarios that list the inputs of a case; measured images have no inputs."""
     names_without_selection = [name for name in scenario_names() if not isinstance(scenario(name), SelectsInputs)]
     assert names_without_selection == [name for name in scenario_names() if name.startswith("measured")]

@@ -1,4 +1,4 @@
-"""Tests of interrupted campaigns and of hostile cases: no row is lost, and the rows of other cases are unchanged."""
+"""Tests of interrupted campaigns and of failing cases: no row is lost, and the rows of other cases are unchanged."""
 
 from __future__ import annotations
 
@@ -51,6 +51,7 @@ def _find_workers(process: subprocess.Popen[bytes]) -> list[int]:
 
 
 def _has_ended(pid: int) -> bool:
+    """Return whether no process has this id, or the process is a zombie (state Z)."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
     except OSError:
@@ -89,7 +90,7 @@ def test_workers_end_when_their_parent_is_killed(campaign_file: CampaignFile, tm
 
 
 def _find_marked_processes(mark: str) -> list[int]:
-    """Return the ids of processes whose environment contains the text `mark`."""
+    """Return the ids of running processes whose environment contains the text `mark`."""
     processes = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
@@ -169,13 +170,13 @@ def test_changes_of_the_worker_process_are_reported(
         "case 4 changed its worker process: child processes that are still running (python)",
         "case 7 changed its worker process: the working folder",
     ]
-    # cases 3, 5 and 6 of `failing_campaign` have no result
+    # cases 3, 5 and 6 of `failing_campaign` crash
     for row, expected_row in zip(rows, read_case_rows(failing_campaign), strict=True):
         assert row["case"] in (3, 5, 6) or differing_columns(row, expected_row) == ()
 
 
 @pytest.mark.slow
-def test_hostile_cases_do_not_affect_other_cases(
+def test_failing_cases_do_not_affect_other_cases(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     faults = {
@@ -193,6 +194,7 @@ def test_hostile_cases_do_not_affect_other_cases(
     expected = dict(faults.values())
     outcomes = {row["case"]: row["outcome"] for row in rows if row["outcome"] not in ("VALID", "SILENT")}
     assert outcomes == expected
+    # the other cases have the rows of `failing_campaign`, whose cases 3, 5 and 6 crash
     for row, expected_row in zip(rows, read_case_rows(failing_campaign), strict=True):
         assert row["case"] in (*expected, 3, 5, 6) or differing_columns(row, expected_row) == ()
     stored_record = record.read(tmp_path / "hostile")

@@ -1,4 +1,4 @@
-"""Tests of exported cases: answers of an external algorithm are scored as in a normal run."""
+"""Tests of offline evaluation: measurements are exported, and the answers of an external algorithm are scored."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ confidence = 0.5
 
 
 class ExportFolders(NamedTuple):
-    """Folders of an exported campaign: the cases, and their truth."""
+    """Folders of an exported campaign: measurements of the cases, and ground truth."""
 
     directory: Path
     truth: Path
@@ -58,6 +58,7 @@ def export(tmp_path_factory: pytest.TempPathFactory) -> ExportFolders:
 
 
 def load_campaign_to_export(export: ExportFolders, *settings: str) -> Campaign:
+    """Load the campaign with the algorithm `export:FOLDER`, which writes the measurements of the cases to a folder."""
     path = str(export.directory.parent / "fake.toml")
     return load_campaign(path, ["retain.showcase=none", *settings], None, None, [f"export:{export.directory}"])
 

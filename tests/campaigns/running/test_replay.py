@@ -20,6 +20,7 @@ def test_replay_reports_differing_columns(failing_campaign: Path, tmp_path: Path
     altitudes[4] = np.nextafter(altitudes[4], np.inf)
     frame["altitude_m"] = altitudes
     frame.to_parquet(directory / "cases.parquet")
+    # without the database, `replay` reads the rows from the table
     (directory / "cases.sqlite").unlink()
     assert replay(directory, 4).differing == ("altitude_m",)
     with pytest.raises(CampaignError, match="has no case 12; allowed: 0 to 11"):

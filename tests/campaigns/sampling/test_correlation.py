@@ -20,6 +20,8 @@ N_CASES = 4000
 TOP_LEVEL_KEYS = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
 #: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds (normal distribution, two-sided).
 MAX_STANDARD_ERRORS = 4.0
+#: Minimum p-value of a test: a correct sampler fails for one of 1000 seeds. The seeds are fixed.
+MIN_P_VALUE = 1e-3
 
 #: Three correlated parameters of different distributions, and one outside the group.
 SKEWED = """
@@ -52,6 +54,7 @@ def load_correlated(
 
 
 def draw_table(campaign: Campaign, cases: int = N_CASES) -> np.ndarray:
+    """Return the sampled values, shape (cases, dispersions)."""
     return np.array([list(campaign.draws(case).values()) for case in range(cases)], dtype=np.float64)
 
 
@@ -93,7 +96,7 @@ def test_correlated_parameters_have_their_marginal_distributions(campaign_file: 
         lambda x: (stats.norm(2000, 100).cdf(x) - low) / (high - low),
     ]
     for column, cdf in enumerate(cdfs):
-        assert stats.kstest(draws[:, column], cdf).pvalue > 1e-3
+        assert stats.kstest(draws[:, column], cdf).pvalue > MIN_P_VALUE
 
 
 @pytest.mark.parametrize(
@@ -112,8 +115,8 @@ def test_normal_groups_have_the_specified_covariance(
     whitened_draws = np.linalg.solve(np.linalg.cholesky(covariance), (draws - [1.0, -2.0]).T)
     first, second = whitened_draws
     for row in (first, second, (first + second) / np.sqrt(2), (first - second) / np.sqrt(2)):
-        assert stats.kstest(row, stats.norm.cdf).pvalue > 1e-3
-    assert stats.kstest((whitened_draws**2).sum(axis=0), stats.chi2(2).cdf).pvalue > 1e-3
+        assert stats.kstest(row, stats.norm.cdf).pvalue > MIN_P_VALUE
+    assert stats.kstest((whitened_draws**2).sum(axis=0), stats.chi2(2).cdf).pvalue > MIN_P_VALUE
     # Wishart distribution: the variance of an entry s_ij is (c_ij^2 + c_ii c_jj) / (n - 1)
     variances = np.diag(covariance)
     standard_error = np.sqrt((covariance**2 + np.outer(variances, variances)) / (N_CASES - 1))

@@ -29,11 +29,13 @@ DISPERSIONS = """
 "heights_m.1" = {distribution = "beta", a = 2, b = 5}
 kind = {distribution = "choice", values = ["rough", "plain"]}
 """
+#: A correlated pair of the parameters in `DISPERSIONS`.
 GROUP = """
 [[correlations]]
 parameters = ["wind.north_m_s", "heights_m.1"]
 rank = [[1.0, 0.8], [0.8, 1.0]]
 """
+#: Two grid dispersions: 3 x 2 grid points.
 GRID = """
 terrain = {distribution = "grid", low = 0, high = 6, step = 3}
 error_scale = {distribution = "grid", values = [0.5, 2.0]}
@@ -50,13 +52,17 @@ def load_design(
     seed: int = 5,
     extra_keys: str = "",
 ) -> Campaign:
-    """Load a campaign of the fake scenario with a sampling design."""
+    """Load a campaign of the fake scenario with a sampling design.
+
+    With `nominal`, case 0 has the parameters of the campaign file instead of sampled ones.
+    """
     design = f'[design]\nkind = "{kind}"\nnominal = {str(nominal).lower()}\n'
     top_level_keys = TOP_LEVEL_KEYS.format(cases=cases, seed=seed) + extra_keys
     return load_campaign(str(campaign_file(top_level_keys=top_level_keys, dispersions=design + dispersions)))
 
 
 def read_probabilities(campaign: Campaign, cases: range) -> np.ndarray:
+    """Return the cases as points of the unit cube (one probability per dispersion), shape (cases, dispersions)."""
     return np.array([list((campaign.probabilities(case) or {}).values()) for case in cases])
 
 
@@ -106,6 +112,7 @@ def test_sobol_discrepancy_is_below_random_draws(campaign_file: CampaignFile) ->
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 @pytest.mark.parametrize("nominal", [False, True])
 def test_single_case_equals_case_of_full_design(campaign_file: CampaignFile, kind: str, nominal: bool) -> None:
+    # 16 cases at each of the 6 grid points, and the nominal case
     cases = 6 * 16 + nominal
     design: dict[str, Any] = {"dispersions": DISPERSIONS + GRID + GROUP, "nominal": nominal}
     campaign = load_design(campaign_file, kind, cases, **design)
@@ -164,7 +171,7 @@ def test_grid_is_a_full_factorial_in_all_designs(campaign_file: CampaignFile) ->
         points = [(draw["terrain"], draw["error_scale"]) for draw in draws]
         assert points[:6] == [(0.0, 0.5), (0.0, 2.0), (3.0, 0.5), (3.0, 2.0), (6.0, 0.5), (6.0, 2.0)]
         assert points == points[:6] * 8
-        if kind != "random":  # each grid point has its own design
+        if kind != "random":  # the 8 cases at each of the 6 grid points are stratified
             rows = read_probabilities(campaign, range(48))[:, 0].reshape(8, 6)
             assert np.all(np.sort(np.floor(8 * rows), axis=0) == np.arange(8)[:, None])
             assert len(np.unique(rows)) == 48

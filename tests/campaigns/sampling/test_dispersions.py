@@ -135,6 +135,7 @@ def test_scipy_distributions_give_finite_values_or_errors(name: str) -> None:
 
 
 def test_grids_have_the_expected_levels() -> None:
+    """For a grid, `extremes` returns all levels."""
     assert make_dispersion(distribution="grid", low=0, high=1, levels=5).extremes() == (0.0, 0.25, 0.5, 0.75, 1.0)
     assert make_dispersion(distribution="grid", low=-1, high=2, step=0.1).extremes()[::10] == (-1.0, 0.0, 1.0, 2.0)
     grid = make_dispersion(distribution="grid", values=["a", 2, {"b": 3.0}])
@@ -161,6 +162,7 @@ def test_formulas_use_draws_and_parameters(campaign_file: CampaignFile) -> None:
     assert stats.kstest(fraction, stats.uniform.cdf).pvalue > MIN_P_VALUE
     assert stats.kstest(values["heights_m.1"], stats.gamma(3, scale=3).cdf).pvalue > MIN_P_VALUE
     # formulas use the values of overrides
+    # with terrain 2, the mean altitude is 1500 + 100 * 2
     campaign_with_fixed_terrain = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
     assert (
         campaign_with_fixed_terrain.configuration.dispersions["altitude_m"]

@@ -1,4 +1,7 @@
-"""Tests of points of the sampling space: distributions, correlation, formulas, nominal values and text."""
+"""Tests of `Point`, a case as a point in standard normal space: distributions, correlation, nominal values and text.
+
+The arguments of a point are its coordinates, the number of its random streams, and the paths with nominal values.
+"""
 
 from __future__ import annotations
 
@@ -41,6 +44,7 @@ def campaign_path(tmp_path: Path) -> Path:
 
 def test_points_have_the_distributions_of_the_cases(campaign_path: Path) -> None:
     campaign, rng = load_campaign(str(campaign_path)), np.random.default_rng(1)
+    # five dispersions; the tolerances are three to four standard errors of 2000 points
     values = [campaign.draws_at(Point(tuple(rng.standard_normal(5)), 0)) for _ in range(2000)]
     east, north = (np.array([value[path] for value in values]) for path in ("wind.east_m_s", "wind.north_m_s"))
     assert np.quantile(east, [0.1, 0.5, 0.9]) == pytest.approx([-24.0, 0.0, 24.0], abs=2.0)

@@ -46,6 +46,7 @@ def test_showcase_follows_the_configuration(campaign_file: CampaignFile, tmp_pat
         {"case": 2, "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0},
         {"case": 3, "outcome": "VALID", "answered": True, "velocity_error_m_s": -2.0},
     ]
+    # the worst case has the largest absolute error
     create_store(tmp_path / "cases.sqlite", {})
     with RowStore(tmp_path / "cases.sqlite") as store:
         table = tmp_path / "cases.parquet"
@@ -88,12 +89,14 @@ def test_unsupported_products_do_not_stop_the_campaign(
         (["retain.products=every", "retain.every=3"], [0, 3]),
         (["retain.products=failed"], [1]),
         (["retain.products=worst", "retain.worst=2"], None),
+        # the budget of 1 kB is used by the products of the first case
         (["retain.products=all", "retain.budget_gb=1e-6"], [0]),
     ],
 )
 def test_products_of_configured_cases_are_stored(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch, overrides: list[str], cases: list[int] | None
 ) -> None:
+    # case 1 fails without an answer; case 2 crashes and has no products
     path = campaign_file("unanswered_cases = [1]\nraising_cases = [2]")
     directory = run(path, tmp_path / "run", watch, "cases=6", "retain.showcase=none", *overrides, jobs=1)
     rows = read_case_rows(directory)
@@ -124,7 +127,7 @@ def test_scaled_sum_of_columns_decides_failure() -> None:
         confidence=0.9,
         population="all",
     )
-    # times of the workstation: 60 x 0.03 s is below 2 s, 60 x 0.04 s is above
+    # the flight processor is 60 times slower than the workstation: 60 x 0.03 s = 1.8 s, 60 x 0.04 s = 2.4 s
     row = {"outcome": "VALID", "answered": True, "image_time_s": 0.02, "map_time_s": 0.01}
     assert compute_margin(row, requirement) == pytest.approx(0.2)
     assert compute_margin({**row, "map_time_s": 0.02}, requirement) == pytest.approx(-0.4)

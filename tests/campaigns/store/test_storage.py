@@ -32,7 +32,7 @@ def complete_row(row: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def open_store(folder: Path, rows: Iterable[dict[str, Any]]) -> Iterator[RowStore]:
-    """Create a store in `folder`, add completed rows and open it."""
+    """Create a store in `folder`, add completed rows and open it; `thorough` checks all pages of the file first."""
     create_store(folder / "cases.sqlite", {"identity": "abc"})
     with RowStore(folder / "cases.sqlite", thorough=True) as store:
         store.add(map(complete_row, rows))
@@ -142,6 +142,7 @@ def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
 
 
 def write_case_table(folder: Path, rows: Iterable[dict[str, Any]], measures: tuple[str, ...] = ()) -> Path:
+    """Write a Parquet table of rows; it has the columns `measures` even if no row has a value."""
     with open_store(folder, rows) as store:
         write_table(folder / "t.parquet", store, measures)
     return folder / "t.parquet"

@@ -1,4 +1,4 @@
-"""A fast scenario whose error has known contributions: gyro, radar, their interaction, and a part without a source."""
+"""A fast scenario for tests of error budgets: its error has known contributions of gyro and radar."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ confidence = 0.9
 class ErrorModelParameters(BaseModel):
     """Parameters of `ErrorModelScenario`; all errors have the same unit.
 
-    - load: dispersed part of the error that belongs to no error source
+    - load: dispersed error that belongs to no error source
     - unused: dispersed parameter without an effect
-    - gyro_sd, radar_sd, floor_sd: standard deviations of the errors of gyroscope and radar, and of the error that
-      remains without them (in a budget: the remaining part)
+    - gyro_sd, radar_sd: standard deviations of the errors of gyroscope and radar
+    - floor_sd: standard deviation of an error that belongs to no error source
     - drift: factor of the radar's error
     - interaction: factor of the product of the gyroscope's and the radar's errors
-    - fan: parameter of an inactive error source, which has no effect
+    - fan: parameter of an error source without an effect; False switches the source off
     - sleep_s: duration of a case
     - refused_fraction: fraction of cases without an answer; a negative value makes each case fail
     """
@@ -76,14 +76,16 @@ class ErrorModelParameters(BaseModel):
 class ErrorModelScenario:
     """The error of a case is the column `miss`.
 
-    It is ``load + floor f + gyro g + radar r drift + interaction gyro g radar r drift``, where f, g and r are standard
-    normal numbers of separate random streams. The mean square of the uniform drift is 4/3.
+    It is ``load + floor_sd f + e_g + e_r + interaction e_g e_r`` with ``e_g = gyro_sd g`` and
+    ``e_r = radar_sd r drift``, where f, g and r are standard normal numbers of separate random streams. The mean square
+    of the uniform drift is 4/3.
     """
 
     name = "error-model"
     parameters_type = ErrorModelParameters
+    #: Sources may name parameters that the scenario does not have.
     error_sources: ClassVar[tuple[ErrorSource, ...]] = (
-        ErrorSource("gyro", "gyroscope", ("gyro_sd", "gyro_of_a_custom_part")),
+        ErrorSource("gyro", "gyroscope", ("gyro_sd", "parameter_of_another_scenario")),
         ErrorSource("radar", "radar", ("radar_sd", "drift")),
         ErrorSource("fan", "fan", ("fan",)),
     )

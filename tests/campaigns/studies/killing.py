@@ -12,7 +12,11 @@ from pathlib import Path
 
 
 def kill_and_resume(arguments: Sequence[str], directory: Path, log_bytes: int) -> subprocess.CompletedProcess[str]:
-    """Run ``marsyard ARGUMENTS --out DIRECTORY``, kill it when its log exceeds `log_bytes`, and resume the study."""
+    """Run ``marsyard ARGUMENTS --out DIRECTORY``, kill it, and resume the study.
+
+    The process is killed when the write-ahead log of its SQLite database exceeds `log_bytes`. The log of an empty
+    database has about 8 kB, so that a larger log contains rows.
+    """
     marsyard = [sys.executable, "-m", "marsyard"]
     command = [*marsyard, *arguments, "--jobs", "2", "--out", str(directory)]
     with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:

@@ -44,9 +44,10 @@ confidence = 0.9
 
 
 class LimitStateParameters(BaseModel):
-    """The load is ``100 + u - beta`` with the standard normal number u.
+    """The load is ``100 + u - beta`` with the standard normal number u; its bound is 100.
 
     ``u = sqrt(1 - noise**2) (loads[0] + loads[1]) / sqrt(2) + noise n``, with a standard normal random number n.
+    `kind` has no effect.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -68,6 +68,7 @@ def test_contributions_of_independent_errors_are_their_variances(campaign_path: 
     for item in contributions.values():
         assert item.lower < item.mean < item.upper
     assert error_budget.closure == pytest.approx(1.0, abs=1e-9)
+    # six configurations: all sources, none, without gyro, without radar, only gyro, only radar
     assert (error_budget.common, result.violations, result.evaluated) == (200, 0, 200 * 6)
 
 
@@ -77,6 +78,7 @@ def test_coverage_of_the_intervals_equals_their_confidence() -> None:
     hits = 0
     for _ in range(200):
         floor, a, b = rng.standard_normal((3, 100)) * [[1.0], [3.0], [2.0]]
+        # all sources, none, without a, without b, only a, only b
         errors = np.array([floor + a + b, floor, floor + b, floor + a, floor + a, floor + b])
         error_budget = compute_budget(errors, np.arange(100), sources, is_centred=False, confidence=0.9)
         assert error_budget is not None
@@ -89,7 +91,8 @@ def test_interaction_of_two_sources_is_divided_between_them(campaign_path: Path,
     result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "interaction=0.5")
     assert result.budget is not None
     contributions = {item.source: item for item in result.budget.contributions}
-    # with both sources, the mean square of the interaction is 0.25 * 9 * 16/3 = 12
+    # mean square of the interaction: 0.5^2 * 9 * 16/3 = 12; it occurs only with both sources
+    # (removed: decrease without this source; alone: increase by this source only)
     for item in contributions.values():
         assert item.removed - item.alone == pytest.approx(12.0, rel=0.6)
     # half of the interaction belongs to each source, and the budget remains complete
@@ -109,6 +112,7 @@ def test_cases_without_an_error_in_a_configuration_are_excluded(campaign_path: P
 
 
 def test_margin_is_centred(campaign_path: Path, tmp_path: Path) -> None:
+    """The mean of a margin is subtracted: a mean load of 100 does not change the budget."""
     settings = replace(SETTINGS, requirement="MARGIN")
     result = run_budget(campaign_path, tmp_path / "run", settings, "dispersions.load.mean=100.0")
     assert (result.quantity, result.centred) == ("error_margin", True)
@@ -122,7 +126,7 @@ def test_sobol_indices_of_a_linear_model_are_variance_fractions(campaign_path: P
     overrides = ("gyro_sd=0.0", "radar_sd=0.0", "dispersions.load.sd=2.0")
     result = run_budget(campaign_path, tmp_path / "run", settings, *overrides)
     indices = {item.name: item for item in result.indices}
-    # the error is 2 load + floor
+    # the error is 2 load + floor, with variances 4 and 1; floor is drawn from the random streams
     assert indices["load"].first == pytest.approx(0.8, abs=0.15)
     assert indices["load"].total == pytest.approx(0.8, abs=0.15)
     assert indices[STREAMS].total == pytest.approx(0.2, abs=0.08)

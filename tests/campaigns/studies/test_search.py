@@ -49,6 +49,7 @@ def assert_reduced_to_causes(result: SearchResult) -> None:
     assert set(failure.values) == {"sun_deg", "yaw_deg"}
     assert 10.0 <= failure.values["sun_deg"] < 15.0
     assert 80.0 <= failure.values["yaw_deg"] <= 100.0
+    # the case violates the requirement in all four repetitions with new random streams
     assert failure.repeated == failure.repetitions == 4
 
 

@@ -113,6 +113,7 @@ def test_too_few_violations_have_no_density() -> None:
 
 
 def test_replicate_without_violation_has_no_lower_bound() -> None:
+    """Arguments: estimates of two replicates, whether each reached a violation, and the confidence."""
     interval = replicate_interval([1e-4, 1e-5], [True, False], 0.9)
     assert interval.lower == 0.0
     assert interval.upper >= 1e-4

@@ -28,7 +28,7 @@ def test_each_system_has_requirements_with_margins_and_error_sources(system: str
         campaign = load_campaign(name)
         requirements = campaign.configuration.requirements
         n_with_margin += any(item.bound is not None or item.margin is not None for item in requirements)
-        assert len(active_sources(campaign)[0]) >= 3, name
+        assert len(active_sources(campaign)[0]) >= 3, name  # error sources that have an effect in this campaign
     assert n_with_margin >= 1
 
 

@@ -28,6 +28,7 @@ from marsyard.reports.sections import script_hash
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
+#: Text that would run a script or leave the folder of the site if it were not escaped.
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'../../{{ 7*7 }}"
 
 
@@ -155,13 +156,13 @@ def test_pages_of_unchanged_campaigns_are_not_rewritten(make_rows: Rows, make_ru
 
 def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
     return RequirementVerdict(
-        "R",
-        "",
-        "PASS",
-        estimate,
-        0.9,
-        0.95,
-        margin,
+        requirement="R",
+        statement="",
+        status="PASS",
+        estimate=estimate,
+        lower=0.9,
+        probability=0.95,
+        margin=margin,
         n=10,
         failures=1,
         confidence=0.9,
@@ -175,7 +176,7 @@ def test_sparkline_rises_with_the_rate() -> None:
     line = sparkline([_make_verdict(0.9), _make_verdict(0.97), _make_verdict(1.0)])
     assert line is not None
     line_y = [float(point.split(",")[1]) for point in line.points.split()]
-    # y of SVG points down: a higher rate has a smaller y
+    # the y axis of SVG points down: a higher rate has a smaller y
     assert line_y[0] > line.required_y > line_y[1] > line_y[2]
     assert sparkline([_make_verdict(0.9)]) is None
     assert sparkline([_make_verdict(float("nan"))] * 3) is None

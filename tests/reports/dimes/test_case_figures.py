@@ -46,6 +46,7 @@ def test_case_figure_shows_all_tracks(dimes_products: dict[str, Any]) -> None:
 def test_images_are_binned_to_square_pixels(dimes_products: dict[str, Any]) -> None:
     figure = draw_dimes_pair(dimes_products, 0)
     sizes = [image.get_size() for axes in figure.axes for image in axes.get_images()]
+    # two rectified images, template and window of two tracks, two images of 1024 x 256 pixels binned to squares
     patches = [(17, 17), (61, 61), (17, 17), (61, 61)]
     assert sizes == [(384, 384), (384, 384), *patches, (256, 256), (256, 256)]
 

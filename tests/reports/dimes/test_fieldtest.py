@@ -21,7 +21,10 @@ MakeRows = Callable[..., pd.DataFrame]
 
 @pytest.fixture
 def field_frame(make_rows: MakeRows) -> pd.DataFrame:
-    """Return 20 image triples in each of three cells, with 20, 10 and 0 answers; the paper has values of two cells."""
+    """Return 20 image triples in each of three cells (category and run), with 20, 10 and 0 answers.
+
+    The paper has values of two of the cells.
+    """
     frame = make_rows(60, answer_rate=1.0)
     frame["category"] = ["short time"] * 20 + ["same direction"] * 20 + ["opposite direction"] * 20
     frame["run"] = ["Kelso Run 3"] * 40 + ["Mojave Run 9"] * 20
@@ -40,7 +43,7 @@ def test_cells_are_compared_with_the_paper(make_run: MakeRun, field_frame: pd.Da
     assert same_direction["difference_points"] == pytest.approx(10.0)
     assert opposite_direction["paper_percent"] is None
     assert np.isnan(opposite_direction["difference_points"])
-    assert np.isnan(opposite_direction["largest"])
+    assert np.isnan(opposite_direction["largest"])  # largest error
 
 
 def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: pd.DataFrame) -> None:

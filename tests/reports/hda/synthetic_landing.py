@@ -24,6 +24,7 @@ def synthetic_products() -> dict[str, Any]:
     rock = 0.5 * np.exp(-((x - 2.0) ** 2 + (y - 1.0) ** 2) / 0.1)
     ground = 0.1 * np.sin(x) + rock
     slope = np.arctan(np.abs(0.1 * np.cos(x)))
+    # 0: safe, 1: unknown, 2: hazard
     safety = np.where(np.hypot(x - 2.0, y - 1.0) < 2.0, 2, 0).astype(np.uint8)
     safety[:4] = 1
     pixels = np.stack([160.0 + FOCAL_PX * x / HEIGHT_M, 120.0 - FOCAL_PX * y / HEIGHT_M], axis=-1)
@@ -67,6 +68,7 @@ def synthetic_products() -> dict[str, Any]:
         "apriori": np.array([11.5, 15.5]),
         "surface_from_camera": np.diag([1.0, -1.0, -1.0]),
         "world_from_surface": np.eye(3),
+        # slope (rad), roughness (m) and footprint diameter (m)
         "limits": np.array([np.radians(15.0), 0.2, 2.0]),
         "camera_true": camera,
         "true_positions": np.stack([true_x, true_y], axis=-1),
@@ -133,6 +135,7 @@ def landing_frame(cases: int, seed: int = 1) -> pd.DataFrame:
             "fault_size": 0.0,
         }
     )
+    # classes of footprints by roughness or slope divided by its limit
     for kind in ("roughness", "slope"):
         for number, name in enumerate(("below_1", "1_to_1.5", "1.5_to_2", "2_to_3", "above_3")):
             frame[f"footprints_{kind}_{name}"] = 600 if number == 0 else 100

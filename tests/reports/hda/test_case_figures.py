@@ -67,6 +67,7 @@ def test_only_accepted_matches_are_drawn(hda_products: dict[str, Any]) -> None:
         tuple(point) for point in hda_products["grid"][hda_products["matches_accepted"]] + np.array([30.0, 0.0])
     }
     drawn_matches = {tuple(point) for point in np.array(squares.get_data()).T}
+    # at most 600 grid points are drawn
     assert 0 < len(grid) <= 600
     assert drawn_matches == accepted_matches & {tuple(point) for point in grid + np.array([30.0, 0.0])}
 
@@ -74,13 +75,14 @@ def test_only_accepted_matches_are_drawn(hda_products: dict[str, Any]) -> None:
 def test_maps_have_the_colours_of_the_paper(hda_products: dict[str, Any]) -> None:
     figure = draw_maps(hda_products)
     elevation, roughness, slope, safety = (axes.get_images()[0] for axes in figure.axes[:4])
+    # high ground is dark
     high, low = elevation.to_rgba(np.array([0.5, -0.5]))
     assert sum(high[:3]) < sum(low[:3])
     for image, limit in ((roughness, 0.2), (slope, 15.0)):
         colours = [to_hex(colour) for colour in image.to_rgba(limit * np.array([0.2, 0.95]))]
         assert colours == [GREEN, YELLOW]
         (hazard_colour,) = image.to_rgba(np.array([1.01 * limit]))
-        assert hazard_colour[0] > 1.8 * hazard_colour[1]
+        assert hazard_colour[0] > 1.8 * hazard_colour[1]  # red
     assert [to_hex(colour) for colour in safety.to_rgba(np.arange(3))] == [GREEN, YELLOW, RED]
 
 
@@ -164,4 +166,5 @@ def test_maps_with_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None
     unknown = {name: np.where(np.isnan(elevation), np.nan, hda_products[name]) for name in ("roughness", "slope")}
     pixels = np.where(np.isnan(elevation)[..., None], np.nan, hda_products["map_pixels"])
     case_view = view({**hda_products, **unknown, "elevation": elevation, "map_pixels": pixels}, "case1")
+    # all figures except Fig. 1, which the page omits
     assert len(case_view.figures) == 5

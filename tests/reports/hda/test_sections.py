@@ -70,6 +70,7 @@ def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
     assert section is not None
     assert section.data["cases"] == 20
     times = section.data["stages"]
+    # Table 1 of the paper: 0.77 s in total
     assert sum(entry["scaled_s"] for entry in times) == pytest.approx(0.77)
     # the stages of the synthetic rows take 6 + 4 + 6 + 1 ms
     assert section.data["factor"] == pytest.approx(0.77 / 0.017)
@@ -84,6 +85,7 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
     landings = frame[frame["landed"]]
     assert section.data["landings"] == len(landings)
     assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landings["touchdown_error_gps_m"].mean())
+    # landings 1, 3 and 4 of Table 2
     assert section.data["paper_m"] == {"1": 1.21, "3": 1.20, "4": 0.89}
     assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
     assert TOUCHDOWN(_make_subject(frame.assign(landed=False))) is None
@@ -114,6 +116,7 @@ def test_hazard_classes_have_their_limits_and_rates() -> None:
     assert {hazard_class.kind for hazard_class in classes[:5]} == {"roughness"}
     assert [hazard_class.low for hazard_class in classes[:5]] == [0.0, 1.0, 1.5, 2.0, 3.0]
     assert [hazard_class.high for hazard_class in classes[:5]] == [1.0, 1.5, 2.0, 3.0, float("inf")]
+    # 3 of 100 footprints of the class are reported as safe
     assert classes[1].called_safe.fraction == pytest.approx(0.03)
     assert classes[4].unflagged.fraction == 0.0
 
@@ -150,7 +153,10 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
 
 
 def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -> pd.DataFrame:
-    """Return flights with one motion change each; `fractions` of their 100 visible features are tracked."""
+    """Return flights with one motion change each; `fractions` of their 100 visible features are tracked.
+
+    The knee of the curve is the change at which the fraction falls to 90 % of that without change.
+    """
     frame = landing_frame(len(sizes)).assign(roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0, height_change_fraction=0.0)
     frame[column] = sizes
     return frame.assign(features_in_view=100, tracks_correct=100.0 * np.array(fractions), tracked_well=True)

@@ -17,6 +17,7 @@ def synthetic_products() -> dict[str, Any]:
     times = np.append(0.5 + 2.0 * np.arange(IMAGES), 11.0)
     true = np.array([100.0, -50.0]) + times[:IMAGES, np.newaxis] * np.array([8.0, 3.0])
     errors = rng.normal(0.0, 3.0, (IMAGES + 1, 3))
+    # time (s), errors and standard deviations east, north and up (m)
     track = np.column_stack([times, errors, np.full((IMAGES + 1, 3), (3.0, 3.0, 4.0))])
     estimated = np.vstack([true, true[-1]]) + errors[:, :2]
     track[:REFUSED], estimated[:REFUSED] = np.nan, np.nan
@@ -39,25 +40,25 @@ def synthetic_products() -> dict[str, Any]:
 
 
 def refused_products() -> dict[str, Any]:
-    """Return products of a descent without images, and with a refusal at its end."""
+    """Return products of a descent without images, whose only answer is a refusal."""
     products = synthetic_products()
     for name in ("image_1", "image_2", "landmarks_px", "landmarks_residual_px", "landmarks_used"):
         del products[name]
-    nothing = {
+    no_estimate = {
         "track": np.full((1, 7), np.nan),
         "estimated_xy_m": np.full((1, 2), np.nan),
         "inliers": np.array([np.nan]),
     }
-    return {**products, **nothing, "outcomes": ["NO_COARSE_FIX"]}
+    return {**products, **no_estimate, "outcomes": ["NO_COARSE_FIX"]}
 
 
-def localisation_frame(cases: int, fixed: float = 0.9, seed: int = 1) -> pd.DataFrame:
-    """Return rows of descents; the errors of reported positions are consistent with standard deviations of 4 m."""
+def localisation_frame(cases: int, fixed_fraction: float = 0.9, seed: int = 1) -> pd.DataFrame:
+    """Return rows of descents; `fixed_fraction` of them report a position with errors of 4 m (1 sigma) per axis."""
     rng = np.random.default_rng(seed)
-    is_fixed = rng.random(cases) < fixed
+    is_fixed = rng.random(cases) < fixed_fraction
     errors = rng.normal(0.0, 4.0, (cases, 3))
 
-    def reported(values: Any) -> Any:
+    def mask_unreported(values: Any) -> Any:
         return np.where(is_fixed, values, np.nan)
 
     horizontal = np.hypot(errors[:, 0], errors[:, 1])
@@ -68,19 +69,19 @@ def localisation_frame(cases: int, fixed: float = 0.9, seed: int = 1) -> pd.Data
             "answered": is_fixed,
             "fixed_in_time": is_fixed,
             "false_fix": False,
-            "fix_after_s": reported(rng.uniform(7.1, 9.0, cases)),
-            "position_error_at_10_s_m": reported(1.5 * horizontal),
-            "position_error_m": reported(horizontal),
-            "position_error_max_m": reported(2.0 * horizontal),
-            "position_error_world_m": reported(horizontal + 60.0),
-            "position_error_east_m": reported(errors[:, 0]),
-            "position_error_north_m": reported(errors[:, 1]),
-            "position_error_up_m": reported(errors[:, 2]),
-            "position_nees": reported((horizontal / 4.0) ** 2),
-            "velocity_error_m_s": reported(np.abs(rng.normal(0.0, 0.2, cases))),
-            "attitude_error_deg": reported(np.abs(rng.normal(0.0, 0.05, cases))),
-            "inliers_median": reported(rng.integers(40, 140, cases)),
-            "inliers_min": reported(rng.integers(12, 40, cases)),
+            "fix_after_s": mask_unreported(rng.uniform(7.1, 9.0, cases)),
+            "position_error_at_10_s_m": mask_unreported(1.5 * horizontal),
+            "position_error_m": mask_unreported(horizontal),
+            "position_error_max_m": mask_unreported(2.0 * horizontal),
+            "position_error_world_m": mask_unreported(horizontal + 60.0),
+            "position_error_east_m": mask_unreported(errors[:, 0]),
+            "position_error_north_m": mask_unreported(errors[:, 1]),
+            "position_error_up_m": mask_unreported(errors[:, 2]),
+            "position_nees": mask_unreported((horizontal / 4.0) ** 2),
+            "velocity_error_m_s": mask_unreported(np.abs(rng.normal(0.0, 0.2, cases))),
+            "attitude_error_deg": mask_unreported(np.abs(rng.normal(0.0, 0.05, cases))),
+            "inliers_median": mask_unreported(rng.integers(40, 140, cases)),
+            "inliers_min": mask_unreported(rng.integers(12, 40, cases)),
             "image_time_max_s": rng.uniform(0.5, 1.5, cases),
             "image_time_median_s": rng.uniform(0.1, 0.3, cases),
             "sun_difference_deg": rng.uniform(0.0, 60.0, cases),

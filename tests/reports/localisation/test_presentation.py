@@ -152,12 +152,12 @@ def test_table_has_a_row_per_estimate(products: dict[str, Any]) -> None:
     assert list(refused) == ["image 1", PositionOutcome.NO_COARSE_FIX.value, "", "", "", "", ""]
     assert valid[1:3] == [PositionOutcome.VALID.value, "80"]
     assert float(valid[3].replace("−", "-")) == pytest.approx(products["track"][REFUSED, 1], rel=0.05)
-    # sd of 3 m per axis: 4.24 m
+    # horizontal standard deviation: 3 m per axis, 4.24 m in total
     assert float(valid[6]) == pytest.approx(np.hypot(3.0, 3.0), rel=0.02)
     assert final[2] == ""
 
 
-def test_view_of_a_refused_descent() -> None:
+def test_view_of_a_refused_descent_has_one_row() -> None:
     case_view = view(refused_products(), "case4")
     assert [row.succeeded for row in case_view.rows] == [False]
     assert len(case_view.figures) == 2
@@ -206,7 +206,7 @@ def test_consistent_covariances_are_inside_the_interval() -> None:
 @pytest.mark.parametrize("section", [POSITION, CONDITIONS])
 def test_sections_of_refusals_report_their_rate(section: Any) -> None:
     """A campaign in which no descent has a position still reports that fact."""
-    created = section(_make_subject(localisation_frame(30, fixed=0.0)))
+    created = section(_make_subject(localisation_frame(30, fixed_fraction=0.0)))
     assert created is not None
     assert created.blocks
 

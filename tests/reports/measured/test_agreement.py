@@ -14,11 +14,16 @@ from marsyard.reports.stored import StoredRun
 
 
 def make_subject(**columns: object) -> Subject:
+    """Return the subject of a report on four cases with these columns."""
     frame = pd.DataFrame({"case": range(4), "outcome": ["VALID"] * 4, **columns})
     return Subject(StoredRun(Path("run"), frame, frame, {}, ()), None, None)
 
 
 def make_products(matches: int) -> dict[str, object]:
+    """Return two images and a table of matches; a quarter of the matches are outliers.
+
+    Columns: u and v in both images, residual in u and v (px), 1 for inliers.
+    """
     rng = np.random.default_rng(1)
     table = np.concatenate(
         [rng.uniform(0, 60, (matches, 4)), rng.normal(0, 0.5, (matches, 2)), np.ones((matches, 1))], 1

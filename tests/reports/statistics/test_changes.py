@@ -51,9 +51,11 @@ def test_tied_values_agree_with_the_hypergeometric_test() -> None:
     exact = stats.hypergeom.sf(4, 160, 11, 20)
     normal = stats.mannwhitneyu(new, old, use_continuity=False, method="asymptotic").pvalue
     assert normal < exact / 2.5
+    # at most 40,000 permutations
     assert difference_p_value(
         _make_single_terrain_sample(new), _make_single_terrain_sample(old), 40_000
     ) == pytest.approx(exact, rel=3 / math.sqrt(50))
+    # no permutation of 1000 has an equal difference: p = (0 + 1) / (1000 + 1)
     assert difference_p_value(
         _make_single_terrain_sample(np.full(20, 3.0)), _make_single_terrain_sample(old), 1_000
     ) == pytest.approx(1 / 1_001)

@@ -60,7 +60,8 @@ def test_circular_error_probable_of_normal_errors_is_the_median_radius() -> None
 
 
 def test_half_extent_of_an_ellipse_covers_its_bounding_box() -> None:
-    # semi-axes 3 and 1 rotated by 30 deg: half widths sqrt((3 cos 30)^2 + (sin 30)^2) = 2.6458 and 1.7321
+    # semi-axes 3 and 1 rotated by 30 deg: half width sqrt((3 cos 30)^2 + (sin 30)^2) = sqrt(7), half height sqrt(3).
+    # The half extent is the largest absolute coordinate of the box: 2 + sqrt(3) along y, 1.5 + sqrt(7) along x.
     ellipse = ErrorEllipse((0.5, -2.0), 3.0, 1.0, 30.0, 0.95, 0.9)
     assert ellipse.half_extent == pytest.approx(2.0 + math.sqrt(3.0))
     assert replace(ellipse, centre=(-1.5, 0.0)).half_extent == pytest.approx(1.5 + math.sqrt(7.0))

@@ -19,7 +19,7 @@ from marsyard.reports.statistics.proportions import (
     proportion_upper,
 )
 
-#: Minimum number of cases for (reliability, confidence), with 0 to 3 failures (docs/design.md).
+#: Minimum number of cases for (reliability, confidence), with 0 to 3 failures: binomial distribution.
 SAMPLE_SIZES = {
     (0.99865, 0.90): (1705, 2880, 3941, 4947),
     (0.9973, 0.90): (852, 1440, 1970, 2473),
@@ -32,6 +32,7 @@ COUNTS = st.integers(0, 400).flatmap(lambda n: st.tuples(st.integers(0, n), st.j
 
 
 def test_two_sided_interval_of_7_of_50_has_the_tabulated_bounds() -> None:
+    """Clopper-Pearson interval to four decimals."""
     lower, upper = proportion_interval(7, 50, 0.95)
     assert (round(lower, 4), round(upper, 4)) == (0.0582, 0.2674)
 

@@ -41,6 +41,7 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     frame.loc[:3, "designation_error_m"] = [0.0, 0.0, 0.0, 0.2]
     frame.loc[4:, "drift_px"] = [3.0, 4.0, 5.0, 0.0]
     navcam, pancam = measured_accuracy(frame)
+    # the errors have 0.1 m rms: 3 sigma in cm
     assert navcam["designation_cm"] == pytest.approx(300.0 * 0.1)
     assert navcam["disparity_px"] == pytest.approx(0.1 / 0.388)
     # Eq. 3 of the tracking paper: sqrt(0.1^2 + 0.05^2)
@@ -77,6 +78,7 @@ def _make_two_tracker_rows(step_sizes: int = 5) -> pd.DataFrame:
 
 
 def test_step_rates_are_compared_with_fig_8() -> None:
+    """`good`: selectable targets that are tracked to the end."""
     frame = _make_two_tracker_rows()
     frame.loc[0, ["selectable", "tracked", "no_false_track"]] = False  # unselectable targets are excluded
     rates = step_rates(make_subject(frame, legs=[{"motion": "approach", "step_fraction": 0.05}]))
@@ -188,6 +190,7 @@ def test_updates_and_minutes_are_listed_per_mode_of_table_4() -> None:
     legs_driven += [{"motion": "back-off", "autonav": True}, {"visual_odometry": True}]
     legs_driven += [{"motion": "approach", "autonav": True}]
     frame = make_rows(2)
+    # leg that ended at each update; -1: the start
     legs = [-1, 0, *[1] * 7, *[2] * 9, 3, *[4] * 4, *[5] * 4]
     for number, leg in enumerate(legs, start=1):
         frame[f"update_{number}_leg"], frame[f"update_{number}_time_s"] = float(leg), 60.0 * number

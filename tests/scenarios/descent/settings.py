@@ -54,11 +54,11 @@ NOISELESS_DETECTOR = {
 }
 
 
-def make_parameters(**parts: Any) -> DescentScenarioParameters:
-    """Return parameters of a descent over the small terrain; `parts` replaces tables."""
-    return DescentScenarioParameters.model_validate(SMALL_WORLD | {"descent": DESCENT} | parts)
+def make_parameters(**tables: Any) -> DescentScenarioParameters:
+    """Return parameters of a descent over the small terrain; `tables` replaces tables and options of the scenario."""
+    return DescentScenarioParameters.model_validate(SMALL_WORLD | {"descent": DESCENT} | tables)
 
 
-def run_descent(case: int = 0, /, **parts: Any) -> CaseResult:
-    """Run one descent over the small terrain; `parts` replaces tables of its parameters."""
-    return DescentScenario().run(make_parameters(**parts), Streams(1, "test", case))
+def run_descent(case: int = 0, /, **tables: Any) -> CaseResult:
+    """Run one descent over the small terrain; `tables` replaces tables and options of the scenario."""
+    return DescentScenario().run(make_parameters(**tables), Streams(1, "test", case))

@@ -22,7 +22,7 @@ RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"re
 N_CASES = 5
 
 
-def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
+def _run_descent(case: int, **tables: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
     """Run a descent with the full dispersion of motions and return the tracks that passed DIMES' checks."""
     rng = np.random.default_rng(case)
     motion = {
@@ -34,7 +34,7 @@ def _run_descent(case: int, **parts: Any) -> tuple[list[Track], list[State], Des
         "nod_phase_deg": rng.uniform(0.0, 360.0),
         "heading_deg": rng.uniform(0.0, 360.0),
     }
-    parameters = make_parameters(**IDEAL_INSTRUMENTS, descent=motion, detector=NOISELESS_DETECTOR, **parts)
+    parameters = make_parameters(**IDEAL_INSTRUMENTS, descent=motion, detector=NOISELESS_DETECTOR, **tables)
     world, streams = World.from_parameters(parameters), Streams(5, "accuracy", case)
     flight = create_flight(parameters, world.surface, streams)
     states = states_at_images(parameters, flight)

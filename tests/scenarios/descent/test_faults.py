@@ -38,6 +38,7 @@ from marsyard.sim.terrain import Environment, TerrainParameters
 from tests.scenarios.descent.settings import NOISELESS_DETECTOR, make_parameters, run_descent
 
 SMALL_CAMERA = CameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
+#: Sun at an azimuth of 4 rad and an elevation of 0.7 rad.
 SUN = Sun(direction(4.0, 0.7))
 
 
@@ -122,6 +123,7 @@ def test_images_can_be_repeated_or_black() -> None:
 def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
     faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
     altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, time_s) for time_s in (0.0, 1.0, 2.0)])
+    # 10 % in all readings, and another 20 % in the second
     assert [entry.altitude_m for entry in altitudes] == pytest.approx([110.0, 130.0, 110.0])
     # the heat shield moves away at 20 m/s
     readings = [AltitudeMeasurement(2000.0, time_s) for time_s in (0.0, 1.0, 2.0)]
@@ -134,9 +136,9 @@ def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
     assert tilts[0].as_rotvec()[2] == 0.0
 
 
-def _render_descent(faults: Mapping[str, Any], **parts: Any) -> list[np.ndarray]:
+def _render_descent(faults: Mapping[str, Any], **tables: Any) -> list[np.ndarray]:
     """Return the three images of a descent, in counts."""
-    parameters = make_parameters(faults=faults, detector=NOISELESS_DETECTOR, **parts)
+    parameters = make_parameters(faults=faults, detector=NOISELESS_DETECTOR, **tables)
     world, streams = World.from_parameters(parameters), Streams(1, "faults", 0)
     states = states_at_images(parameters, create_flight(parameters, world.surface, streams))
     optics = camera_optics(parameters.camera)
@@ -181,6 +183,7 @@ def test_calibration_errors_have_the_specified_standard_deviation() -> None:
     corners = np.stack([camera.project(corner)[0][0] for camera in cameras])
     corner_shifts = corners - centre_shifts - true_camera.project(corner)[0][0]
     radial_shifts = corner_shifts @ np.array([-1.0, -1.0]) / np.sqrt(2.0)
+    # the corner is 511.5 px from the centre along each axis
     expected = np.hypot(parameters.distortion_error_px, parameters.focal_error * np.hypot(511.5, 511.5))
     assert radial_shifts.std() == pytest.approx(expected, rel=0.15)
     assert np.abs(corner_shifts @ np.array([1.0, -1.0])).max() < 0.02

@@ -1,4 +1,4 @@
-"""Tests of the inertial increments that velocity estimators receive: truth, errors, order, and other random streams."""
+"""Tests of inertial increments, the angle and velocity changes that estimators receive: truth, errors and order."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -24,12 +24,12 @@ from tests.scenarios.descent.test_many_images import InertialEstimator
 
 RECORDER = "tests.scenarios.descent.test_increments:EventRecorder"
 FLAT_GROUND = Surface.from_samples(np.zeros((16, 16, 2), np.float32), 200.0)
-#: Events of the descents of `EventRecorder`.
+#: Measurements that `EventRecorder` received, in order.
 EVENTS: list[ImuIncrements | AltitudeMeasurement | DescentFrame] = []
 
 
 class EventRecorder(InertialEstimator):
-    """Stream that records its measurements."""
+    """Estimator that records its measurements in `EVENTS`."""
 
     def process_increments(self, increments: ImuIncrements) -> None:
         EVENTS.append(increments)
@@ -48,9 +48,12 @@ def _clear_events() -> Iterator[None]:
     EVENTS.clear()
 
 
-def measure(case: int = 0, /, **parts: Any) -> tuple[DescentMeasurements, DescentFlight]:
-    """Simulate a flight over flat ground; return measurements with its increments, and images of another descent."""
-    parameters, streams = make_parameters(**parts), Streams(1, "test", case)
+def measure(case: int = 0, /, **tables: Any) -> tuple[DescentMeasurements, DescentFlight]:
+    """Simulate a flight over flat ground; return measurements with its increments, and the flight.
+
+    The images of the measurements are those of `inputs.descent()`; the tests do not use them.
+    """
+    parameters, streams = make_parameters(**tables), Streams(1, "test", case)
     flight = create_flight(parameters, FLAT_GROUND, streams)
     measurements = add_increments(inputs.descent(), parameters, flight, streams)
     if measurements.increments is not None:
@@ -63,6 +66,7 @@ def propagate(measurements: DescentMeasurements, flight: DescentFlight) -> Inert
     increments, gravity = measurements.increments, measurements.gravity_m_s2
     assert increments is not None
     assert gravity is not None
+    # the increments start 0.1 s after the start of the flight
     start = flight.motion.state(-flight.lead_s + 0.1)
     return InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, gravity)
 

@@ -66,6 +66,7 @@ def test_illumination_follows_the_site() -> None:
     parameters = [DescentScenarioParameters.model_validate({"site": name} | small_terrain) for name in SITES]
     mars, earth = (World.from_parameters(site_parameters) for site_parameters in parameters)
     assert mars.ground is not None
+    # the sun's radius at 1.5 au
     assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)
     # Earth receives 1 / 0.44 of the sunlight on Mars; dust in the atmosphere of Mars increases the ratio.
     assert earth.brightness / mars.brightness > 1.0 / 0.44
@@ -73,6 +74,7 @@ def test_illumination_follows_the_site() -> None:
     earth_detector = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small_terrain
     world_with_earth_detector = World.from_parameters(DescentScenarioParameters.model_validate(earth_detector))
     assert world_with_earth_detector.brightness == pytest.approx(mars.brightness / 1.5**2)
+    # scene below the origin, for a last image at 1400 m with pixels of 0.82 mrad
     scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4)
     assert scene.photometry == mars.ground.photometry(mars.sun)
     assert len(scene.objects) > 0

@@ -81,8 +81,9 @@ def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:
         {"flight": {"file": file, "axes": "enu", "heading_offset_deg": 90.0}}
     )
     assert isinstance(parameters.flight, FlightFile)
+    # origin of the file in the world, and gravity (m/s^2)
     motion = parameters.flight.motion(np.array([100.0, 200.0, 30.0]), 3.7)
-    # The rotation by 90 deg turns east into south; after 5 s: 50 m south, 350 m lower.
+    # The rotation by 90 deg turns east into south. The first image is 5 s after the start: 50 m south, 350 m lower.
     assert np.allclose(motion.state(0.0).position_m, [100.0, 200.0 - 50.0, 30.0 + 2200.0 - 350.0])
     assert np.allclose(motion.state(0.0).velocity_m_s, [0.0, -10.0, -70.0])
     assert np.allclose(motion.state(0.0).specific_force_m_s2, [0.0, 0.0, 3.7], atol=1e-9)

@@ -20,6 +20,7 @@ def nominal_case() -> CaseResult:
 
 
 def _drop_times(row: Any) -> dict[str, Any]:
+    """Return the row without columns whose name contains "time"."""
     return {name: value for name, value in row.items() if "time" not in name}
 
 
@@ -226,6 +227,7 @@ def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
 def test_custom_algorithm_receives_the_measurements() -> None:
     result = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:InertialEstimator")
     assert result.outcome == "VALID"
+    # the wind of 14 m/s, with errors of the inertial velocity of a few m/s
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
 

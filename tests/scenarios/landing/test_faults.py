@@ -1,4 +1,4 @@
-"""Tests of flight faults in the readings of the instruments."""
+"""Tests of injected faults of a landing: receiver outages, altimeter faults, lost images and defective pixels."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ def test_receiver_outage_covers_images_and_landing() -> None:
     for outage_s, errors in position_errors_m.items():
         flight = add_receiver_outage(Faults(gps_outage_s=outage_s), HELICOPTER)
         for case in range(6):
+            # start (m), course and heading (rad), gravity (m/s^2)
             transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
             estimate = np.array(transit.pose(0).world_from_body.translation)
             errors.append(float(np.hypot(*(estimate - transit.state(0).position_m)[:2])))

@@ -14,6 +14,9 @@ from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
 
 GRAVITY_M_S2, HEIGHT_M = 9.8, 10.0
+#: Course and heading of the transit, counterclockwise from east.
+COURSE_RAD = HEADING_RAD = 0.5
+#: Landing site, and level ground of 30 m x 30 m around it with a spacing of 0.5 m.
 SITE = np.array([4.0, 3.0, 0.0])
 GROUND = GroundPatch(SITE[:2] - 15.0, 0.5, np.zeros((61, 61)))
 #: RTK receiver with floating solutions: errors of half a metre that change slowly.
@@ -23,7 +26,8 @@ FLOATING_RTK: dict[str, object] = {"rtk": {"float_fraction": 1.0}, "transit": {"
 def _fly_transit(case: int, **changes: object) -> tuple[Transit, Streams]:
     streams = Streams(7, "helicopter", case)
     parameters = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}} | changes)
-    return Transit.fly(parameters, np.array([0.0, 0.0, HEIGHT_M]), 0.5, 0.5, GRAVITY_M_S2, streams), streams
+    start_m = np.array([0.0, 0.0, HEIGHT_M])
+    return Transit.fly(parameters, start_m, COURSE_RAD, HEADING_RAD, GRAVITY_M_S2, streams), streams
 
 
 @cache
@@ -33,6 +37,7 @@ def _fly_landing(case: int) -> tuple[Transit, Touchdown]:
 
 
 def _land(transit: Transit, streams: Streams, stuck_m: float | None = None) -> Touchdown:
+    """Land at `SITE`; a stuck altimeter always reads `stuck_m`."""
     unit = RangingUnit.draw(LaserParameters(), streams.generator("laser"))
     touchdown = land(transit, SITE, GROUND, unit, streams, stuck_m)
     assert touchdown is not None
@@ -171,6 +176,7 @@ def test_missing_solutions_give_no_measured_touchdown() -> None:
 
 
 def test_stuck_altimeter_causes_a_hard_landing() -> None:
+    """Sink rates at touchdown: 0.3 m/s after the flare; 0.7 m/s, that of the descent, if the range stays at 8 m."""
     transit, streams = _fly_transit(0)
     assert -_land(transit, streams).state.velocity_m_s[2] == pytest.approx(0.3, abs=0.15)
     assert -_land(transit, streams, stuck_m=8.0).state.velocity_m_s[2] == pytest.approx(0.7, abs=0.15)

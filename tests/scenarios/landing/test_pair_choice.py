@@ -30,6 +30,7 @@ def _make_poses(step_m: float, count: int = 40, yaw_deg: float = 0.0, pitch_deg:
 
 def test_shortest_sufficient_baseline_has_max_overlap() -> None:
     choice = choose_pair(_make_poses(0.125), RANGES_M, CAMERA, PairParameters(max_baseline_fraction=0.2), HEIGHT_M)
+    # the maximum baseline, 0.2 x 10 m, is 16 steps of 0.125 m
     assert (choice.first, choice.second) == (0, 16)
     assert choice.baseline_m == pytest.approx(2.0)
     # Field width at 10 m: 640 px of 7.4 um and a focal length of 6 mm give 7.89 m, with lens distortion 8.04 m.

@@ -95,6 +95,7 @@ def test_footprint_outside_the_height_grid_is_rejected() -> None:
 
 
 def test_triangles_raise_the_ground() -> None:
+    """Heights below a triangle with corners at 1, 1 and 3 m are raised to it; the other heights do not change."""
     heights = np.zeros((5, 5))
     vertices = np.array([[0.0, 0.0, 1.0], [4.0, 0.0, 1.0], [0.0, 4.0, 3.0]])
     faces = np.array([[0, 1, 2], [0, 2, 1]], dtype=np.int32)

@@ -53,11 +53,11 @@ def make_truth(n_safe: int) -> GroundTruth:
     footprints = Footprints(zeros, zeros, zeros, safe)
     return GroundTruth(
         Relief(np.maximum(x, 0.0), -6.0, -6.0, 0.1),
-        Limits(2.0, 0.26, 0.2),
+        Limits(diameter_m=2.0, max_slope_rad=0.26, max_roughness_m=0.2),
         positions_m,
         footprints,
-        np.ones_like(safe),
-        1.0,
+        covered=np.ones_like(safe),
+        step_m=1.0,
     )
 
 

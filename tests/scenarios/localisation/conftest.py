@@ -1,4 +1,4 @@
-"""Flight shared by the tests of flight, instruments and stream."""
+"""Fixture of one simulated lander flight (parachute and powered descent) for the tests of localisation."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import pytest
 
 from marsyard.scenarios.localisation.flight import LanderFlight, ProfileParameters
 
+#: Height of the level ground.
 GROUND_M = -100.0
 GRAVITY_M_S2 = 3.72
 
 
 @pytest.fixture(scope="session")
 def flight() -> LanderFlight:
-    """Return a flight with the default parameters, whose start is not above the world's origin."""
+    """Return a flight with the default parameters that starts 4200 m above the ground, not above the world's origin."""
     start = np.array([300.0, -200.0, GROUND_M + 4200.0])
     parameters = ProfileParameters()
     rng = np.random.default_rng(1)

@@ -123,6 +123,7 @@ def test_inertial_navigation_errors_have_the_predicted_size(flight: LanderFlight
     After T = 51 s with the specific force f: accelerometer bias b T^2 / 2; misalignment m f T^2 / 2; gyro bias
     f w T^3 / 6; angular random walk f n sqrt(T^5 / 20); velocity random walk n sqrt(T^3 / 3).
     """
+    # number of units, time (s) and mean specific force (m/s^2)
     units, duration, force = 10, flight.end_s, 4.5
     p = LN200
     terms = [
@@ -133,7 +134,7 @@ def test_inertial_navigation_errors_have_the_predicted_size(flight: LanderFlight
         1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G * np.sqrt(duration**3 / 3.0),
     ]
     expected = float(np.linalg.norm(terms))
-    assert expected == pytest.approx(4.0, abs=0.5)
+    assert expected == pytest.approx(4.0, abs=0.5)  # m
     errors = np.empty((units, 2))
     for unit in range(units):
         rng = np.random.default_rng(unit)
@@ -147,8 +148,8 @@ def test_inertial_navigation_errors_have_the_predicted_size(flight: LanderFlight
     assert 0.8 * low < square_sum < 1.2 * high
 
 
-def test_attitudes_are_rotations_of_small_steps(flight: LanderFlight) -> None:
-    """The heading at the end is the heading at separation: the guidance does not turn the lander."""
+def test_guidance_does_not_change_the_heading(flight: LanderFlight) -> None:
+    """The heading at the end is the heading at separation; heading: rotation about the vertical without the tilt."""
     headings = []
     for time in (flight.separation_s, flight.end_s):
         attitude = flight.state(time).attitude

@@ -41,6 +41,7 @@ def _heights() -> np.ndarray:
 def _write_site(folder: Path, *, posting_m: float = POST_M) -> dict[str, str]:
     """Write a DTM and an orthoimage with a bright eastern half and texture of 12 m; return the table of the source."""
     folder.mkdir(exist_ok=True)
+    # map coordinates of the north-western corner, m
     corner = (8_142_406.0, -276_455.0)
     dtm = write_tif(
         folder, values=_heights() - 4450.0, transform=Affine(posting_m, 0, corner[0], 0, -posting_m, corner[1])
@@ -84,7 +85,7 @@ def test_map_and_images_show_the_imported_ground(tmp_path: Path) -> None:
     # differences: half a post and half a sample of hills with slopes of some degrees, and fine relief
     np.testing.assert_allclose(np.corrcoef(product.elevation_m.ravel(), posts.ravel())[0, 1], 1.0, atol=0.02)
     assert np.abs(product.elevation_m - posts).mean() < 3.0
-    # slopes change the mean light of a half by some per cent
+    # the columns near the edge of brightness are left out; slopes change the mean light of a half by some per cent
     east, west_half = (product.appearance[:, half].mean() for half in (slice(140, None), slice(None, 116)))
     assert east / west_half == pytest.approx(EAST_BRIGHTNESS, rel=0.1)
     # images and map have the same surface
@@ -96,6 +97,7 @@ def test_map_and_images_show_the_imported_ground(tmp_path: Path) -> None:
     above_m = state.position_m[2] - descent.world.surface.height(*state.position_m[:2])
     is_east = state.position_m[0] - above_m * rays[:, 0] / rays[:, 2] > CENTRE_M
     counts = image.counts[16:48, 16:48].ravel() - float(image.calibration.offset_dn)
+    # at least 100 of the 32 x 32 pixels are in each half
     assert 100 < np.count_nonzero(is_east) < 924
     assert counts[is_east].mean() / counts[~is_east].mean() == pytest.approx(EAST_BRIGHTNESS, rel=0.1)
 
@@ -154,4 +156,5 @@ def test_example_accepts_a_valid_site(tmp_path: Path) -> None:
     campaign = load_campaign(str(example), [f"terrain.source.{name}={path}" for name, path in source.items()])
     parameters = campaign.parameters(3)
     assert isinstance(parameters, LocalisationScenarioParameters)
+    # the example varies the position by 500 m around the centre of its terrain
     assert abs(parameters.location.east_m - 8192.0) <= 500.0

@@ -35,7 +35,7 @@ def test_unknown_site_is_rejected() -> None:
 
 
 def test_sites_differ_in_relief_and_contrast() -> None:
-    # every eighth sample, with the same extent
+    # the same extent with an eighth of the samples along each axis
     changes = {"samples": 512, "spacing_m": 32.0, "crater_diameter_min_m": 128.0, "craters_per_km2": 1.0}
     statistics = {
         name: terrain_statistics(synthesise(localisation_site(name).terrain(changes=changes), np.random.default_rng(1)))
@@ -46,7 +46,8 @@ def test_sites_differ_in_relief_and_contrast() -> None:
     assert statistics["highland"].contrast > 3.0 * statistics["plain"].contrast
 
 
-def test_one_scene_serves_all_heights() -> None:
+def test_scenes_for_different_heights_have_equal_ranges() -> None:
+    """The scene for images from 2000 m shows the same surface as that for images from 500 m."""
     site = localisation_site("highland")
     terrain = site.terrain(changes={"samples": 512, "crater_diameter_max_m": 300.0})
     detector = DetectorParameters()
@@ -73,5 +74,5 @@ def test_one_scene_serves_all_heights() -> None:
     first, second = (process_renderer(default_backend()).render(scene, rays, pose) for scene in (coarse, fine))
     assert np.isfinite(first.range_m).all()
     difference = np.abs(first.range_m - second.range_m)
-    # all but pixels at hidden slopes
+    # except 0.1 % of the pixels, at the edges of hidden slopes
     assert np.quantile(difference, 0.999) < 0.01

@@ -22,9 +22,10 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.render import Frame, PixelRays, process_renderer
 from marsyard.sim.render.backend import default_backend
 
-#: Side of the test terrain, m; centre and size of the test maps. A map must not be symmetric to the terrain's period.
+#: Side of the test maps, and position of their centre (m), which is no symmetry point of the periodic terrain.
 SIDE_PX = 96
 CENTRE = np.array([700.0, 1150.0])
+#: Parameters of a map without errors.
 EXACT = MapParameters(
     side_px=SIDE_PX,
     signal_to_noise=1e12,
@@ -56,12 +57,14 @@ def _make_world(azimuth_deg: float = 120.0, optical_depth: float | None = None) 
     )
 
 
-def _make(world: LocalisationWorld, parameters: MapParameters = EXACT, seed: int = 1, **changes: Any) -> Any:
+def _make_map(world: LocalisationWorld, parameters: MapParameters = EXACT, seed: int = 1, **changes: Any) -> Any:
+    """Return a map product and its ground truth; `changes` replaces parameters."""
     parameters = MapParameters(**{**parameters.model_dump(), **changes})
     return make_map(world, parameters, CENTRE, np.random.default_rng(seed), default_backend())
 
 
 def _pixel_positions() -> tuple[Float64[np.ndarray, "side side"], Float64[np.ndarray, "side side"]]:
+    """Return the east and north coordinates of the pixel centres, m."""
     offsets = (np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)) * EXACT.pixel_m
     east, north = np.meshgrid(CENTRE[0] + offsets, CENTRE[1] + offsets)
     return east, north
@@ -83,11 +86,12 @@ def _render_under_map_sun(
 
 
 def _orbiter(world: LocalisationWorld) -> Float64[np.ndarray, "3"]:
+    """Return the position of the orbiter, above the centre of the maps."""
     return np.array([*CENTRE, float(world.surface.height(*CENTRE)) + EXACT.orbit_height_m])
 
 
 def test_elevation_without_errors_is_the_height_of_the_surface(world: LocalisationWorld) -> None:
-    product, _ = _make(world)
+    product, _ = _make_map(world)
     east, north = _pixel_positions()
     # single precision of heights of up to 500 m
     np.testing.assert_allclose(product.elevation_m, world.surface.height(east, north), atol=3e-5)
@@ -96,7 +100,7 @@ def test_elevation_without_errors_is_the_height_of_the_surface(world: Localisati
 
 
 def test_appearance_without_errors_equals_an_orthographic_render(world: LocalisationWorld) -> None:
-    product, _ = _make(world)
+    product, _ = _make_map(world)
     east, north = _pixel_positions()
     orbiter = _orbiter(world)
     perspective = orbital_rays(world.surface, orbiter, east, north, EXACT.pixel_m)
@@ -118,9 +122,9 @@ def test_appearance_without_errors_equals_an_orthographic_render(world: Localisa
 
 
 def test_map_equals_the_orthorectified_image_of_a_pinhole_camera(world: LocalisationWorld) -> None:
-    """Independent path: an image of a pinhole camera at 300 km, and its interpolation at the projected points."""
+    """Independent method: an image of a pinhole camera at 300 km, interpolated at the projected map points."""
     # a high sun: at edges of shadows the map's radiance is a mean over the area of a pixel
-    product, _ = _make(world, optical_depth=0.0, sun_elevation_deg=75.0)
+    product, _ = _make_map(world, optical_depth=0.0, sun_elevation_deg=75.0)
     world = LocalisationWorld(replace(world.ground, site=world.ground.site.with_dust(0.0)), world.sun)
     # image pixels of 2 m on the ground, so that interpolation is exact enough; the footprint is that of a map pixel
     columns, rows = SIDE_PX * 3 + 40, SIDE_PX * 3 + 40
@@ -152,7 +156,7 @@ def test_rays_from_300_km_hit_the_surface_points_of_a_whole_map(world: Localisat
 
 
 def test_position_errors_are_those_of_the_truth(world: LocalisationWorld) -> None:
-    product, truth = _make(world, registration_sd_m=80.0, distortion_sd_m=6.0, distortion_length_m=300.0)
+    product, truth = _make_map(world, registration_sd_m=80.0, distortion_sd_m=6.0, distortion_length_m=300.0)
     assert np.linalg.norm(truth.shift_m) > 1.0
     map_m = np.stack(_pixel_positions(), axis=-1)
     world_m = truth.world_position(map_m)
@@ -162,26 +166,26 @@ def test_position_errors_are_those_of_the_truth(world: LocalisationWorld) -> Non
     assert 0.5 < distortion.std() / 6.0 < 2.0
     np.testing.assert_allclose(distortion, truth.distortion(map_m), atol=1e-9)
     # the appearance is displaced with the elevation: a map without errors around the shifted centre is equal
-    shifted, truth = _make(world, registration_sd_m=80.0)
+    shifted, truth = _make_map(world, registration_sd_m=80.0)
     expected, _ = make_map(world, EXACT, CENTRE - truth.shift_m, np.random.default_rng(1), default_backend())
     # the orbiter is above another point, so the emission angles differ by up to 0.02 deg
     assert np.median(np.abs(shifted.appearance / expected.appearance - 1.0)) < 3e-4
 
 
 def test_map_does_not_depend_on_the_light_of_the_landing(world: LocalisationWorld) -> None:
-    first, _ = _make(world, optical_depth=0.8)
-    second, _ = _make(_make_world(azimuth_deg=300.0, optical_depth=0.2), optical_depth=0.8)
+    first, _ = _make_map(world, optical_depth=0.8)
+    second, _ = _make_map(_make_world(azimuth_deg=300.0, optical_depth=0.2), optical_depth=0.8)
     np.testing.assert_array_equal(first.appearance, second.appearance)
-    other_sun, _ = _make(world, optical_depth=0.8, sun_azimuth_deg=95.0)
+    other_sun, _ = _make_map(world, optical_depth=0.8, sun_azimuth_deg=95.0)
     correlation = np.corrcoef(first.appearance.ravel(), other_sun.appearance.ravel())[0, 1]
     assert correlation < 0.5
-    clear, _ = _make(world, optical_depth=0.1)
+    clear, _ = _make_map(world, optical_depth=0.1)
     assert first.appearance.std() / first.appearance.mean() < 0.8 * clear.appearance.std() / clear.appearance.mean()
 
 
 def test_noise_counts_and_elevation_errors_have_the_stated_size(world: LocalisationWorld) -> None:
-    clean, _ = _make(world)
-    noisy, truth = _make(world, signal_to_noise=50.0, bits=8, elevation_sd_m=5.0, elevation_length_m=60.0)
+    clean, _ = _make_map(world)
+    noisy, truth = _make_map(world, signal_to_noise=50.0, bits=8, elevation_sd_m=5.0, elevation_length_m=60.0)
     assert noisy.appearance.min() >= 0.0
     assert noisy.appearance.max() == 255.0
     np.testing.assert_array_equal(noisy.appearance, np.rint(noisy.appearance))
@@ -196,8 +200,8 @@ def test_noise_counts_and_elevation_errors_have_the_stated_size(world: Localisat
 
 
 def test_posts_smooth_the_elevation(world: LocalisationWorld) -> None:
-    exact, _ = _make(world)
-    posts, _ = _make(world, elevation_post_m=20.0)
+    exact, _ = _make_map(world)
+    posts, _ = _make_map(world, elevation_post_m=20.0)
     difference = (posts.elevation_m - exact.elevation_m).astype(np.float64)
     # relief within 20 m on slopes of about 6 deg with a Hurst exponent near 1
     assert 0.02 < difference.std() < 1.5
