@@ -1,4 +1,4 @@
-"""Tests that the requirements of the catalogue's campaigns use columns that their scenarios report."""
+"""Test that the requirements of the catalogue's campaigns use columns that their scenarios report."""
 
 from __future__ import annotations
 
