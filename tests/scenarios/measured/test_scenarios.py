@@ -1,4 +1,4 @@
-"""Tests of scenarios with ingested images: answers equal those of the original measurements; pose errors are visible."""
+"""Tests of scenarios with ingested images: answers equal those of the original measurements; pose errors are seen."""
 
 from __future__ import annotations
 

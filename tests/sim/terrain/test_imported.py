@@ -10,7 +10,7 @@ from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthe
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, fill_holes, read_rasters
 from marsyard.sim.terrain.surface import terrain_statistics
 
-#: Size of the synthetic DEM; its posts are 1 m apart.
+#: Size of the synthetic elevation model of the tests, in posts (1 m apart in `tile.npz`).
 ROWS, COLUMNS = 90, 110
 
 
