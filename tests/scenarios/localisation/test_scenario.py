@@ -251,7 +251,7 @@ def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: flo
 
 @pytest.mark.parametrize("offset_s", [-1.0, 0.3, 1.0])
 def test_wrong_image_clock_does_not_crash(offset_s: float) -> None:
-    """Offsets above 0.2 s exceed the nominal margins of the inertial data, before the start and after the last image."""
+    """Offsets above 0.2 s exceed the margins of the inertial data before the start and after the last image."""
     result = _run(clock=ClockParameters(offset_s=offset_s), compared=("inertial", "sift"), **COARSE)
     assert result.failure is None
     assert result.row["images"] == 4
