@@ -48,6 +48,7 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
     circle = {"legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}]}
     parameters: dict[str, Any] = {
         "descent": {**SMALL_WORLD, "descent": DESCENT, **algorithms},
+        # one run, only image triples of the category "short time"
         "fieldtest": {
             **make_parameters().model_dump(),
             "runs": [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}],
@@ -168,7 +169,7 @@ def test_conditions_are_recorded_before_the_algorithm_runs(name: str, flags: set
 
 
 def test_runs_with_a_tracker_exception_count_as_failures() -> None:
-    """The tracker raises an exception in 5 of 20 runs. Their rows have no column of the metric."""
+    """The tracker raises an exception in 5 of 20 runs. Their rows have no column of the metric, `handed_over`."""
     crashed_case, complete_case = (run_small_case("rover", spy, case=4) for spy in ("RaisingTracker", "TrackerSpy"))
     assert crashed_case.outcome == "CRASHED"
     assert crashed_case.row["selectable"] is complete_case.row["selectable"] is True
@@ -184,6 +185,6 @@ def test_runs_with_a_tracker_exception_count_as_failures() -> None:
 
 
 def test_row_of_a_rejected_answer_has_no_site_columns() -> None:
-    """If the columns are absent, a verdict counts the case as a reported unsafe site."""
+    """A verdict counts a case without these columns as a failure: a reported unsafe site."""
     row = run_small_case("landing", "ForcedSiteWriter").row
     assert not {"site_reported", "no_site_reported", "converged"} & row.keys()

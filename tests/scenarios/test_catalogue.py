@@ -1,4 +1,4 @@
-"""Tests that the requirements of the catalogue's campaigns use columns that their scenarios report."""
+"""Test that the requirements of the catalogue's campaigns use columns that their scenarios report."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ def _run_small_case(scenario: str) -> Row:
             for system in systems()
             for name, settings in system.compilation_campaigns.items()
         }
+        # The field test has no small campaign: its first case is run.
         campaign = load_campaign(*small_campaigns.get(scenario, ("dimes-fieldtest", ())))
         result = campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
     return {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}

@@ -82,6 +82,7 @@ def format_estimator(lines: str) -> str:
         ("inputs", "m.images[0].counts[:] = 0\nreturn NO_ANSWER", "it changed its input"),
         ("inputs", "m.interval_velocities_m_s[0] -= 1\nreturn NO_ANSWER", "it changed its input"),
         ("deterministic", "return VelocityEstimate(Outcome.VALID, np.random.random(2))", "differ between two calls"),
+        # The answer is the mean brightness of the previous case.
         (
             "deterministic",
             "global LAST_MEAN\nprevious = globals().get('LAST_MEAN', 0.0)\nLAST_MEAN = m.images[0].counts.mean()\n"

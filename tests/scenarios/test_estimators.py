@@ -1,4 +1,7 @@
-"""Tests of algorithm selection by name, import path and entry point, and of several algorithms in one case."""
+"""Tests of algorithm selection by name, import path and entry point, and of several algorithms in one case.
+
+An algorithm `x` has the published options, `x-plus` has improved ones, and `x-custom` those of the campaign file.
+"""
 
 from dataclasses import replace
 from importlib.metadata import EntryPoint

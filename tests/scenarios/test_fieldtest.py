@@ -57,10 +57,12 @@ def make_parameters(**changes: Any) -> FieldTestParameters:
 
 
 def make_ivanpah_run(**changes: Any) -> Run:
+    """Simulate run 4 of the campaign, Ivanpah Run 3, with seed 5."""
     return simulate_run(RunKey(make_parameters(**changes), 4, 5, "test"))
 
 
 def compute_attitude_errors_deg(run: Run) -> np.ndarray:
+    """Compute the errors of the fitted attitudes, rotation vectors in world axes, shape (images, 3)."""
     errors: np.ndarray = np.degrees((run.attitudes * run.truth.attitudes.inv()).as_rotvec())
     return errors
 

@@ -145,6 +145,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
     """Time tags are not compared: as in the paper (III.D), their intervals equal the virtual interval."""
     from tests.scenarios.test_fieldtest import make_parameters
 
+    # one run, only image triples of the category "short time"
     runs = [make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
     parameters = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE)
     row = FieldTestScenario().run(parameters, Streams(5, "test", case)).row

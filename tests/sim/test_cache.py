@@ -30,13 +30,13 @@ def test_files_are_evicted_in_order_of_last_use(folder: Path) -> None:
     assert _list_files(folder) == {"2", "3", "4"}
 
 
-def test_recently_touched_file_is_kept(folder: Path) -> None:
+def test_touched_file_counts_as_recently_used(folder: Path) -> None:
     touch(folder / "0")
     evict_files(folder, 150)
     assert _list_files(folder) == {"0", "3", "4"}
 
 
-def test_files_in_use_are_kept_beyond_the_limit(folder: Path) -> None:
+def test_files_in_use_are_not_evicted(folder: Path) -> None:
     evict_files(folder, 10_000, {folder / "1"})
     assert _list_files(folder) == {"1"}
 

@@ -1,4 +1,4 @@
-"""Tests of reference frames and rigid transforms."""
+"""Tests of reference frames (world: east, north, up; site: north, east, down) and of rigid transforms."""
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ def test_rigid_transform_rotates_then_translates() -> None:
 
 
 def test_unchecked_transforms_match_scipy() -> None:
+    """`rigid_from_axes` and `compose` omit the checks and the normalisation of SciPy's transforms."""
     rotations, positions = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
     for rotation, position in zip(rotations, positions, strict=True):
         transform = RigidTransform.from_components(position, rotation)

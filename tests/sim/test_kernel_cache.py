@@ -1,4 +1,4 @@
-"""Tests of the cache of compiled kernels."""
+"""Tests of the disk cache of compiled (Numba) kernels: its folder, and the marks of scenarios that are compiled."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Tests of random number streams and their keys."""
+"""Tests of random number streams and their keys: seed, campaign, case and name of the stream."""
 
 import numpy as np
 from hypothesis import given

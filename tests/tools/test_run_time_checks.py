@@ -24,6 +24,7 @@ def test_correct_shape_is_accepted() -> None:
 
 
 def test_kernel_modules_are_not_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Two temporary modules with the same function, imported as marsyard.algorithms.kernels and .functions.
     source = "def f(x: int) -> int:\n    return x\n"
     for package, module in (("marsyard.algorithms", "kernels"), ("marsyard.algorithms", "functions")):
         (tmp_path / f"{module}.py").write_text(source)

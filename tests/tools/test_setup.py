@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+#: All shell scripts of the repository.
 SCRIPTS = sorted([*(ROOT / "tools").glob("*.sh"), ROOT / ".ci" / "run"])
 
 
@@ -24,7 +25,7 @@ def write_executable(path: Path, text: str) -> Path:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """Create a checkout with the scripts, a pip that installs nothing and an apt-get that fails."""
+    """Create a checkout with the scripts, a fake pip that installs nothing and a fake apt-get that fails."""
     root = tmp_path / "checkout"
     shutil.copytree(ROOT / "tools", root / "tools", ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "constraints.txt"):
@@ -124,6 +125,7 @@ def test_setup_fails_if_the_backend_does_not_render(checkout: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    # Exit codes of the campaign and of the demo, and the campaign's verdict.
     ("status", "expected", "verdict"),
     # The demo reads the verdict from the report, because several verdicts have exit code 3.
     [(0, 0, "PASS"), (3, 0, "INSUFFICIENT"), (3, 0, "MET BY RATE"), (1, 1, "FAIL"), (2, 2, "FAIL")],

@@ -1,4 +1,7 @@
-"""Tests of exported descents and tables of answers: a table is scored like the estimator that wrote it."""
+"""Tests of offline position estimators, which read exported descents and write tables (CSV) of their answers.
+
+A table is scored like the estimator that wrote it.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +59,10 @@ def simulate() -> LocalisationMeasurements:
 
 
 def write_line(case: int, estimate: PositionEstimate) -> str:
-    """Write an answer; the columns are in the order of the documentation."""
+    """Format an answer as a line of the table; the columns are in the order of the documentation."""
     cells: list[Any] = [case, estimate.outcome.name, float(estimate.time_s)]
     if estimate.covariance is None or estimate.world_from_body is None:
+        # empty cells of position, velocity, quaternion and covariance
         return ",".join(map(str, cells)) + "," * (3 + 3 + 4 + 45)
     for values in (estimate.position_m, estimate.velocity_m_s, estimate.world_from_body.as_quat()):
         cells += np.asarray(values).tolist()
@@ -103,6 +107,7 @@ def test_table_columns() -> None:
         *("world_from_body_x", "world_from_body_y", "world_from_body_z", "world_from_body_w"),
         *("covariance_0_0", "covariance_0_1"),
     )
+    # case, outcome and time; position; velocity; quaternion; upper triangle of the 9 x 9 covariance
     assert len(POSITION_FORMAT.columns) == 3 + 3 + 3 + 4 + 45
     assert POSITION_FORMAT.columns[-1] == "covariance_8_8"
 
@@ -125,10 +130,10 @@ def test_exported_descent_equals_the_measurements(tmp_path: Path) -> None:
         np.testing.assert_allclose(image.camera.rays(pixels)[1], original.camera.rays(pixels)[1], atol=1e-8)
     np.testing.assert_array_equal(exported.initial.position_m, measurements.initial.position_m)
     np.testing.assert_array_equal(exported.initial.covariance, measurements.initial.covariance)
-    turn = exported.initial.world_from_body * measurements.initial.world_from_body.inv()
-    assert turn.magnitude() < 1e-12
+    rotation_error = exported.initial.world_from_body * measurements.initial.world_from_body.inv()
+    assert rotation_error.magnitude() < 1e-12
     assert [type(event) for event in exported.events] == [type(event) for event in measurements.events]
-    # the table has no truth
+    # no other files: the export does not contain the truth
     assert {path.name for path in folder.iterdir() if path.suffix not in (".png", ".cahvor")} == {
         *("case.json", "map.json", "appearance.f32", "elevation.f32", "flat_field_1.f64")
     }
@@ -143,7 +148,7 @@ def test_lossy_export_compresses_the_images(tmp_path: Path) -> None:
         np.abs(image.counts.astype(float) - original.counts).mean()
         for image, original in zip(exported.images, measurements.images, strict=True)
     ]
-    # counts of 8 bits
+    # the counts have 8 bits: at most 255
     assert all(0.0 < difference < 20.0 for difference in differences)
 
 
@@ -177,6 +182,7 @@ def test_table_answers_every_image(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_lines_are_rejected(tmp_path: Path, lines: list[str], message: str) -> None:
+    """The names in braces stand for cells: 55 or 52 empty ones, or the covariance (identity matrix or zeros)."""
     identity = "".join(f",{float(row == column)}" for row in range(9) for column in range(row, 9))
     parts = {"empty": "," * 55, "short": "," * 52, "identity": identity, "zeros": ",0" * 45}
     path = write_table(tmp_path / "answers.csv", [line.format(**parts) for line in lines])
@@ -207,7 +213,7 @@ def test_export_and_score_equal_a_normal_run(tmp_path: Path) -> None:
     assert (scored["outcome"], scored["valid_images"]) == ("VALID", 3)
     assert scored["algorithm"] == "answers"
     assert {"position_error_m", "position_nees", "attitude_error_deg", "fix_after_s", "image_hash"} <= set(normal)
-    # attitudes are normalised when they are read, so that their last digits change
+    # quaternions are normalised when they are read, which changes their last digits
     changed = set(differing_columns(scored, normal))
     assert changed <= {"algorithm", "attitude_error_deg"}
     assert scored["attitude_error_deg"] == pytest.approx(normal["attitude_error_deg"], rel=1e-9)

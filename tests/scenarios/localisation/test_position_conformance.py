@@ -70,6 +70,7 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
         ("answer", "def image(self, image): image.counts[:] = 0", "it raised ValueError"),
         ("black", "def image(self, image): return 1 // int(image.counts.max())", "it raised ZeroDivisionError"),
         ("saturated", "def image(self, image): assert image.counts.min() < 255", "it raised AssertionError"),
+        # duplicated image
         (
             "repeated",
             """
@@ -81,6 +82,7 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
             """,
             "it raised AssertionError",
         ),
+        # the next two read an attribute that exists only after the first altitude or image
         (
             "no-altitudes",
             """
@@ -114,6 +116,7 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
             """,
             "its answers to the same case differ between two calls",
         ),
+        # `start` does not reset the counters of the next two
         (
             "deterministic",
             """
@@ -157,6 +160,7 @@ def test_slow_estimator_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert finding.requirement == "answers each image within 0.01 s"
 
 
+#: A program of the file exchange. It executes its argument, Python code, before each answer to `image` and `finish`.
 PROGRAM = """
 import json, sys, time
 print(json.dumps({"exchange": 2, "ready": True}), flush=True)
@@ -202,7 +206,7 @@ def test_program_without_memory_of_earlier_descents_passes(tmp_path: Path) -> No
     assert {name: finding.problem for name, finding in findings.items() if not finding.passed} == {}
 
 
-def test_the_suite_is_registered_by_the_task_of_the_system() -> None:
+def test_estimators_and_programs_have_the_localisation_suite() -> None:
     assert subject_kinds()[:4] == ("velocity", "tracking", "landing", "localisation")
     assert [determine_task(name) for name in ("lvs", "sift", "inertial")] == ["localisation"] * 3
     assert determine_task("marsyard.algorithms.localisation.estimator:MapRelativeEstimator") == "localisation"
@@ -213,14 +217,14 @@ def test_the_suite_is_registered_by_the_task_of_the_system() -> None:
 
 
 def test_inertial_data_are_exact() -> None:
-    """Propagation from the true initial state ends at the true position."""
+    """Propagation preserves the error of the initial position: the increments have no errors."""
     case = inputs.ordinary_descent()
     navigation = NavigationFilter.from_initial(case.initial)
     for event in case.events:
         if isinstance(event, ImuIncrements):
             navigation.propagate(event)
     error = navigation.estimate(case.end_s)[0] - inputs.true_position(case.end_s)
-    # the initial error (160, -110, 20) m is constant; the trapezoidal rule is exact for a constant force
+    # (160, -110, 20) m is the error of the initial position; the trapezoidal rule is exact for a constant force
     np.testing.assert_allclose(error, [160.0, -110.0, 20.0], atol=1e-3)
 
 
@@ -241,5 +245,5 @@ def test_unusual_descents_differ_as_described() -> None:
     )
     jittered, tags = inputs.descent_with_jitter(), [image.time_s for image in images]
     assert [image.time_s for image in select(jittered, DetectorImage)] != tags
-    boundaries = np.concatenate([part.times_s[1:] for part in select(jittered, ImuIncrements)])
+    boundaries = np.concatenate([increments.times_s[1:] for increments in select(jittered, ImuIncrements)])
     assert np.diff(boundaries).min() == 0.0

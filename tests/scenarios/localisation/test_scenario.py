@@ -39,8 +39,9 @@ SMALL: dict[str, Any] = {
     "images": {"coarse_interval_s": 1.5, "interval_s": 2.5},
     "initial": {"horizontal_sd_m": 100.0, "horizontal_max_m": 300.0},
 }
-#: Changes for descents of which only the measurements are of interest.
+#: A smaller map and camera, for tests that do not need an accurate position.
 COARSE: dict[str, Any] = {"map": {"side_px": 64}, "camera": {"pixels": 64, "pixel_mrad": 26.0}}
+#: A map without errors of position and elevation.
 EXACT_MAP = {"registration_sd_m": 0.0, "distortion_sd_m": 0.0, "elevation_sd_m": 0.0, "elevation_post_m": 0.0}
 LOC_CAMPAIGNS = [name for name in catalogue() if name.startswith("loc-")]
 
@@ -66,6 +67,7 @@ def _simulate(**fault: float) -> LocalisedDescent:
 
 
 def _drop_times(row: Any) -> dict[str, Any]:
+    """Remove the columns of run times, which differ between runs."""
     return {name: value for name, value in row.items() if "_time_" not in name}
 
 
@@ -79,16 +81,16 @@ def test_small_case_is_located_on_the_map() -> None:
     row: Any = result.row
     assert (result.outcome, result.answered, result.failure) == ("VALID", True, None)
     assert (row["images"], row["valid_images"], row["fault"], row["false_fix"]) == (4, 2, "none", False)
-    # the third image completes the coarse stage; the clock's errors are milliseconds
+    # the third image, 0.5 s + 2 x 1.5 s after the start, completes the coarse stage; clock errors are milliseconds
     assert row["fix_after_s"] == pytest.approx(3.5, abs=0.01)
     # two pixels of the image
     assert row["position_error_m"] <= row["position_error_max_m"] < 20.0
     assert row["position_error_m"] == pytest.approx(
         np.hypot(row["position_error_east_m"], row["position_error_north_m"])
     )
-    # relative to the world, the map's shift is added
+    # relative to the world, the map's shift and its distortion (6 m, 4 standard deviations) are added
     assert abs(row["position_error_world_m"] - row["map_shift_m"]) < row["position_error_m"] + 4.0 * 6.0
-    # inertial navigation keeps the initial error, but for its velocity error of 1 m/s per axis
+    # inertial navigation has the initial position error, plus that of a velocity error of 1 m/s per axis over 5 s
     assert row["inertial.position_error_m"] == pytest.approx(row["initial_error_m"], abs=25.0)
     assert row["inertial.fix_after_s"] < 0.6
 
@@ -138,10 +140,11 @@ def test_exact_instruments_and_map_give_a_small_error() -> None:
 
 
 def test_initial_error_is_the_drawn_one() -> None:
-    """The column is the drawn error without map errors; with them, the error relative to the map's distorted ground."""
+    """With an exact map the column is the drawn error; otherwise the map's local shift is added to the drawn error."""
     exact = _run(algorithm="inertial", exact_instruments=True, **{**COARSE, "map": {"side_px": 64, **EXACT_MAP}})
     descent = _simulate()
     p, truth = descent.p, descent.flight.state(-LEAD_S)
+    # the drawn position depends neither on the time of 0 s nor on the gravity of 3.71 m/s2
     drawn = p.initial.draw(truth, 0.0, 3.71, Streams(1, "loc tests", 0).generator("initial state"))
     error = truth.position_m[:2] - drawn.position_m[:2]
     assert 0.0 < np.hypot(*error) <= p.initial.horizontal_max_m
@@ -150,11 +153,11 @@ def test_initial_error_is_the_drawn_one() -> None:
     shifted: Any = _run(algorithm="inertial", **COARSE).row
     on_map = descent.map_truth.map_position(truth.position_m[:2]) - truth.position_m[:2]
     assert shifted["initial_error_m"] == pytest.approx(np.hypot(*(error + on_map)), abs=1e-9)
-    turn = (truth.attitude * drawn.world_from_body.inv()).magnitude()
-    assert shifted["initial_attitude_error_deg"] == pytest.approx(np.degrees(turn), abs=1e-9)
+    attitude_error_rad = (truth.attitude * drawn.world_from_body.inv()).magnitude()
+    assert shifted["initial_attitude_error_deg"] == pytest.approx(np.degrees(attitude_error_rad), abs=1e-9)
 
 
-def test_lost_images_reduce_the_number() -> None:
+def test_lost_images_are_missing_in_the_measurements() -> None:
     assert len(_simulate().images) == 4
     half = _simulate(lost_images=0.5)
     assert 0 < len(half.images) < 4
@@ -168,14 +171,14 @@ def test_lost_images_reduce_the_number() -> None:
     assert result.products["track"].shape == (1, 7)
 
 
-def test_remaining_images_are_those_without_losses() -> None:
-    """Losses have their own random stream."""
+def test_losses_do_not_change_the_remaining_images() -> None:
+    """Losses have a separate random stream."""
     complete = {image.time_s: image.counts for image in _simulate().images}
     for image in _simulate(lost_images=0.5).images:
         np.testing.assert_array_equal(image.counts, complete[image.time_s])
 
 
-def test_black_image_is_delivered_and_survived() -> None:
+def test_black_image_is_delivered_and_causes_no_false_fix() -> None:
     result = _run(faults={"black_image": 2})
     assert (result.row["fault"], result.row["fault_size"]) == ("black_image", 2.0)
     assert result.row["images"] == 4
@@ -205,11 +208,11 @@ def test_wrong_map_needs_another_terrain() -> None:
 
 
 def test_attitude_error_tilts_the_initial_attitude() -> None:
-    """The fault is an additional rotation about a horizontal axis; the errors of the draw are the same."""
+    """The fault is an additional rotation about a horizontal axis; the drawn initial errors are the same."""
     clean, tilted = (descent.measurements.initial for descent in (_simulate(), _simulate(attitude_error_deg=2.0)))
-    turn = np.degrees((tilted.world_from_body * clean.world_from_body.inv()).as_rotvec())
-    assert np.hypot(*turn[:2]) == pytest.approx(2.0, abs=1e-9)
-    assert turn[2] == pytest.approx(0.0, abs=1e-9)
+    rotation_deg = np.degrees((tilted.world_from_body * clean.world_from_body.inv()).as_rotvec())
+    assert np.hypot(*rotation_deg[:2]) == pytest.approx(2.0, abs=1e-9)
+    assert rotation_deg[2] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(tilted.position_m, clean.position_m)
     np.testing.assert_array_equal(tilted.covariance, clean.covariance)
     assert isinstance(tilted.world_from_body, Rotation)
@@ -217,9 +220,9 @@ def test_attitude_error_tilts_the_initial_attitude() -> None:
 
 @pytest.mark.parametrize("error_deg", [2.0, 5.0, 6.0, 7.0, 10.0])
 def test_wrong_attitude_gives_no_position(error_deg: float) -> None:
-    """The error is 20 to 100 standard deviations of the stated one: 50 to 280 m on the ground.
+    """The error is 20 to 100 times the standard deviation in the covariance: 50 to 280 m on the ground.
 
-    A search that ignores the stated covariance finds a consistent position that is wrong by this distance.
+    A search that ignores the covariance would find a consistent position that is wrong by this distance.
     """
     result = _run(faults={"attitude_error_deg": error_deg})
     assert result.row["initial_attitude_error_deg"] == pytest.approx(error_deg, abs=0.5)
@@ -231,7 +234,7 @@ def test_wrong_attitude_gives_no_position(error_deg: float) -> None:
 @pytest.mark.parametrize("key", ["clock", "altimeter"])
 @pytest.mark.parametrize("offset_s", [-0.95, 0.95])
 def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: float) -> None:
-    """Also tags before the nominal start of the inertial data, 0.2 s before the start, and after their end."""
+    """The inertial data, nominally from 0.2 s before the start, are extended if a clock error exceeds this margin."""
     clock = {"offset_s": offset_s}
     parameters = _make_parameters(**COARSE, **{key: clock if key == "clock" else {"clock": clock}})
     descent = LocalisedDescent.simulate(parameters, Streams(1, "loc tests", 0))
@@ -248,15 +251,15 @@ def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: flo
 
 @pytest.mark.parametrize("offset_s", [-1.0, 0.3, 1.0])
 def test_wrong_image_clock_does_not_crash(offset_s: float) -> None:
-    """Above 0.2 s the tags left the inertial data."""
+    """Offsets above 0.2 s exceed the margins of the inertial data before the start and after the last image."""
     result = _run(clock=ClockParameters(offset_s=offset_s), compared=("inertial", "sift"), **COARSE)
     assert result.failure is None
     assert result.row["images"] == 4
     assert len(result.products["outcomes"]) == 5
 
 
-def test_images_outside_of_the_flight_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tags outside of the flight have no inertial data; the other images are answered."""
+def test_image_tagged_after_the_flight_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There are no inertial data at the time tag of this image; the other images are answered."""
     monkeypatch.setattr(Clock, "tags", _late_tags)
     result = _run(algorithm="inertial", compared=("lvs", "sift"), **COARSE)
     assert result.failure is None
@@ -264,7 +267,7 @@ def test_images_outside_of_the_flight_are_refused(monkeypatch: pytest.MonkeyPatc
 
 
 def _late_tags(_: Clock, times_s: np.ndarray, __: np.random.Generator) -> np.ndarray:
-    """Return exact tags, that of the last of four images 60 s late."""
+    """Return exact tags, except that of the last of four images, which is 60 s late."""
     return times_s + (60.0 * (np.arange(times_s.size) == 3) if times_s.size == 4 else 0.0)
 
 

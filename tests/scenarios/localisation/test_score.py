@@ -1,4 +1,4 @@
-"""Tests of the score of position estimates with known truth: a straight flight over a shifted map."""
+"""Tests of the scores of position estimates: columns and stored products, for a straight flight over a shifted map."""
 
 from __future__ import annotations
 
@@ -20,11 +20,16 @@ from marsyard.scenarios.localisation.stream import ProcessorTimes, StreamAnswers
 from marsyard.scenarios.systems import row_columns
 from marsyard.sim.dynamics import State
 
+#: Shift of the map relative to the world, east and north, m.
 SHIFT_M = np.array([30.0, -40.0])
+#: Position at time 0 (m) and constant velocity (m/s) of the flight, world axes.
 START_M, VELOCITY_M_S = np.array([100.0, 200.0, 4000.0]), np.array([10.0, 5.0, -90.0])
 ATTITUDE = Rotation.from_rotvec([0.0, 0.02, 0.5])
+#: Covariance of the errors of position (m), velocity (m/s) and attitude (rad).
 COVARIANCE = np.diag([4.0, 9.0, 25.0, 1.0, 1.0, 1.0, 1e-4, 1e-4, 1e-4])
+#: Time tags of the inertial unit minus true times, s.
 IMU_OFFSET_S = 0.5
+#: True times of the images and of the final estimate, s.
 IMAGE_TIMES_S = (2.0, 6.0, 9.9, 14.0)
 END_S = 15.0
 
@@ -67,7 +72,10 @@ def _make_descent(**changes: Any) -> Any:
 def _estimate(
     true_time_s: float, error_m: Sequence[float], covariance: np.ndarray = COVARIANCE, details: object = None
 ) -> PositionEstimate:
-    """Return a valid estimate with this error relative to the map, tagged by the clock of the inertial unit."""
+    """Return a valid estimate with this error relative to the map; its time tag is on the inertial unit's clock.
+
+    The velocity error is 0.5 m/s, the attitude error 0.2 deg.
+    """
     position = START_M + VELOCITY_M_S * true_time_s + np.append(SHIFT_M, 0.0) + np.asarray(error_m)
     velocity = VELOCITY_M_S + np.array([0.3, 0.0, -0.4])
     attitude = Rotation.from_rotvec([np.radians(0.2), 0.0, 0.0]) * ATTITUDE
@@ -81,7 +89,7 @@ def _refusal(true_time_s: float, outcome: PositionOutcome = PositionOutcome.NO_C
 
 
 def _answers(*estimates: PositionEstimate) -> StreamAnswers:
-    """Return the answers to images and the final one; an image takes 0.1 s, the second one 0.7 s."""
+    """Return the answers to images and the final one; the second image takes 0.7 s, the others 0.1 s."""
     image_s = tuple(0.7 if number == 1 else 0.1 for number in range(len(estimates) - 1))
     return StreamAnswers(estimates, ProcessorTimes(0.0, (), (), image_s, 0.0))
 
@@ -104,14 +112,14 @@ def test_errors_are_relative_to_map_and_world() -> None:
     assert errors.time_s == 6.0 + IMU_OFFSET_S
 
 
-def test_distortion_is_part_of_the_reference() -> None:
+def test_reference_position_includes_the_map_distortion() -> None:
     estimate = _estimate(6.0, [3.0, 0.0, 0.0])
     errors = EstimateErrors.from_estimate(estimate, _StraightFlight().state(6.0), _make_map_truth(SHIFT_M, 7.0))
     np.testing.assert_allclose(errors.position_m, [-4.0, 0.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(errors.world_m, [33.0, -40.0], atol=1e-9)
 
 
-def test_nees_is_that_of_error_and_covariance() -> None:
+def test_nees_uses_the_full_horizontal_covariance() -> None:
     covariance = COVARIANCE.copy()
     covariance[:2, :2] = [[4.0, 3.0], [3.0, 9.0]]
     errors = EstimateErrors.from_estimate(
@@ -172,12 +180,12 @@ def test_false_fix_is_an_error_above_40_m_of_any_estimate(error_m: float, is_fal
     assert _row(exact, exact, wrong)["false_fix"] is is_false
     # also if the estimator withdraws the position later
     assert _row(wrong, _refusal(9.0, PositionOutcome.INCONSISTENT), _refusal(END_S))["false_fix"] is is_false
-    # the height has no part in it
+    # a height error does not make a fix false
     assert _row(exact, _estimate(9.0, [0.0, 0.0, 500.0]))["false_fix"] is False
 
 
 def test_first_position_after_10_s_is_late() -> None:
-    """10 s are on the clock of the inertial unit: the third image, 9.9 s after the start, has the tag 10.4 s."""
+    """The limit of 10 s applies to time tags: the third image, 9.9 s after the start, has the tag 10.4 s."""
     row = _row(_refusal(2.0), _refusal(6.0), _estimate(9.9, [1.0, 0.0, 0.0]), _estimate(END_S, [2.0, 0.0, 0.0]))
     assert row["fixed_in_time"] is False
     assert np.isnan(row["position_error_at_10_s_m"])
@@ -188,7 +196,7 @@ def test_first_position_after_10_s_is_late() -> None:
     assert in_time["position_error_at_10_s_m"] == pytest.approx(1.0)
 
 
-def test_row_of_refusals_is_nan() -> None:
+def test_row_of_refusals_has_nan_errors() -> None:
     row = _row(_refusal(2.0), _refusal(6.0), _refusal(END_S))
     assert (row["fixed_in_time"], row["false_fix"], row["valid_images"]) == (False, False, 0)
     numbers = {name for name, value in row.items() if isinstance(value, float) and np.isnan(value)}

@@ -30,11 +30,13 @@ from marsyard.sim.sensor import Clock, Imu, RadarAltimeter
 from marsyard.sim.sensor.imu import LN200, true_increments
 from marsyard.sim.terrain import Surface
 
+#: True start and end of the inertial data, s.
 SPAN_S = (0.0, 6.0)
 CAMERA = true_camera(CameraParameters(pixels=64, pixel_mrad=26.0))
 
 
 def _make_image(tag_s: float) -> DetectorImage:
+    """Return a black image of 64 x 64 pixels with a time tag; its calibration is not used."""
     calibration = DetectorCalibration(np.ones((64, 64)), 150e-6, 0.0, 0.0, 1, 2.0, 255)
     return DetectorImage(np.zeros((64, 64), dtype=np.uint16), tag_s, CAMERA, calibration)
 
@@ -46,6 +48,7 @@ def increments(flight: LanderFlight) -> ImuIncrements:
     return Imu.draw(LN200, SPAN_S, rng).increments(flight, *SPAN_S, rng)
 
 
+#: Initial state and map; the recorded estimator does not use their values.
 INITIAL = InitialState(0.0, np.zeros(3), np.zeros(3), Rotation.identity(), np.eye(9), 3.72)
 MAP = MapProduct(
     np.zeros((2, 2), dtype=np.float32), np.zeros((2, 2), dtype=np.float32), np.zeros(2), 6.0, 1.0, 1.0, 1.0
@@ -108,28 +111,31 @@ def run(increments: ImuIncrements) -> tuple[Recorder, StreamAnswers]:
 def test_increments_until_a_measurement_arrive_before_it(
     run: tuple[Recorder, StreamAnswers], increments: ImuIncrements
 ) -> None:
-    """The last boundary is the first one that is not before the measurement; no increment is lost or repeated."""
+    """Increments arrive in batches between measurements. No increment is lost or repeated.
+
+    A batch ends at the first boundary that is not before the next measurement.
+    """
     calls = run[0].calls[2:]
-    parts: list[ImuIncrements] = []
+    batches: list[ImuIncrements] = []
     latest = -np.inf
     for call in calls:
         if isinstance(call, ImuIncrements):
             assert call.times_s.size == len(call.delta_angles_rad) + 1 == len(call.delta_velocities_m_s) + 1 > 1
-            if parts:
-                assert call.times_s[0] == parts[-1].times_s[-1]
-            parts.append(call)
+            if batches:
+                assert call.times_s[0] == batches[-1].times_s[-1]
+            batches.append(call)
         else:
             assert isinstance(call, AltitudeMeasurement | DetectorImage)
             assert call.time_s >= latest
             latest = call.time_s
-            assert parts[-1].times_s[-2] < call.time_s <= parts[-1].times_s[-1]
+            assert batches[-1].times_s[-2] < call.time_s <= batches[-1].times_s[-1]
     np.testing.assert_array_equal(
-        np.concatenate([part.delta_angles_rad for part in parts]), increments.delta_angles_rad
+        np.concatenate([batch.delta_angles_rad for batch in batches]), increments.delta_angles_rad
     )
     np.testing.assert_array_equal(
-        np.concatenate([part.delta_velocities_m_s for part in parts]), increments.delta_velocities_m_s
+        np.concatenate([batch.delta_velocities_m_s for batch in batches]), increments.delta_velocities_m_s
     )
-    assert parts[-1].times_s[-1] == increments.times_s[-1]
+    assert batches[-1].times_s[-1] == increments.times_s[-1]
 
 
 def test_each_image_has_an_answer(run: tuple[Recorder, StreamAnswers], increments: ImuIncrements) -> None:
@@ -152,14 +158,14 @@ def test_arrays_of_the_caller_stay_writable(run: tuple[Recorder, StreamAnswers],
 
 
 def test_measurements_outside_of_the_increments_are_first_or_last(increments: ImuIncrements) -> None:
-    """They are delivered, because an instrument with a wrong clock delivers them; no increment is lost."""
+    """A wrong clock causes such time tags. The measurements are still delivered, and no increment is lost."""
     early, late = AltitudeMeasurement(4000.0, -0.5), _make_image(6.5)
     events = merge(increments, [early], [late, _make_image(3.0)])
     assert events[0] is early
     assert events[-1] is late
-    parts = [event for event in events if isinstance(event, ImuIncrements)]
-    assert [part.times_s[0] for part in parts] == [increments.times_s[0], parts[0].times_s[-1]]
-    assert parts[-1].times_s[-1] == increments.times_s[-1]
+    batches = [event for event in events if isinstance(event, ImuIncrements)]
+    assert [batch.times_s[0] for batch in batches] == [increments.times_s[0], batches[0].times_s[-1]]
+    assert batches[-1].times_s[-1] == increments.times_s[-1]
 
 
 def test_images_follow_the_schedule(flight: LanderFlight) -> None:

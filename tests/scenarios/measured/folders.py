@@ -15,15 +15,19 @@ from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.measurements import DescentMeasurements, DetectorImage, LandingMeasurements
 
-#: OpenCV's camera axes in the axes of a body whose camera looks along -z.
+#: Rotation from OpenCV's camera axes to the axes of a body whose camera looks along -z.
 CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+#: Bits of the detector.
 BITS = 12
 
 
 def write_velocity_folder(
     folder: Path, cases: Mapping[str, DescentMeasurements], truth: Mapping[str, np.ndarray], *, ned: bool = False
 ) -> Path:
-    """Write a folder of descents; with `ned` in north-east-down and camera axes, otherwise in Marsyard's axes."""
+    """Write a folder of descents; with `ned` in north-east-down and camera axes, otherwise in Marsyard's axes.
+
+    `truth` contains true mean horizontal velocities (east, north), m/s, by case.
+    """
     rows = []
     for name, measurements in cases.items():
         for number, image in enumerate(measurements.images):
@@ -49,7 +53,7 @@ def write_velocity_folder(
 def write_landing_folder(
     folder: Path, measurements: LandingMeasurements, task: str, *, true_poses: bool = False
 ) -> Path:
-    """Write a folder of one flight, for landing or matching."""
+    """Write a folder of one flight; `task` is landing or matching."""
     rows = []
     for number, (image, pose) in enumerate(zip(measurements.images, measurements.poses, strict=True)):
         rotation, position = pose.world_from_body.rotation, pose.world_from_body.translation

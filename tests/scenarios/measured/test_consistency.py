@@ -1,4 +1,4 @@
-"""Tests of the offsets of matches from the epipolar curves of given camera poses, and of their summary in a row."""
+"""Tests of the offsets of matched pixels from the epipolar curves of given camera poses, and of their summary."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from marsyard.scenarios.measured.consistency import PairAgreement, PairMatches, 
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import rigid
 
+#: Camera of 640 x 480 pixels that looks along -z, with a focal length of 800 px and lens distortion.
 CAMERA = Cahvor.from_cahv(
     Cahv(
         np.zeros(3),

@@ -24,6 +24,7 @@ Rows = list[dict[str, str]]
 
 
 def ingest_and_expect_error(folder: Path, tmp_path: Path) -> str:
+    """Ingest an invalid folder; return the error message."""
     out = tmp_path / "out"
     out.mkdir()
     with pytest.raises(ValueError, match=str(tmp_path)) as error_info:
@@ -32,6 +33,7 @@ def ingest_and_expect_error(folder: Path, tmp_path: Path) -> str:
 
 
 def change_cells(rows: Rows, row_number: int, **cells: str) -> Rows:
+    """Replace cells of one row; row 0 is line 2 of the file."""
     return [row | cells if number == row_number else row for number, row in enumerate(rows)]
 
 

@@ -1,4 +1,4 @@
-"""Tests of ingested cases: answers equal those of the original measurements; residuals show pose errors."""
+"""Tests of scenarios with ingested images: answers equal those of the original measurements; pose errors are seen."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ TRUE_VELOCITY_M_S = inputs.DESCENT_VELOCITY_M_S[:2]
 
 
 def run_ingested(folder: Path, out: Path, **parameters: object) -> CaseResult:
+    """Ingest a folder, and run its first case in the scenario of its task."""
     out.mkdir()
     path, stored_cases = ingest(folder, out)
     scenarios = (MatchingScenario(), MeasuredLandingScenario(), MeasuredVelocityScenario())
@@ -86,6 +87,7 @@ def test_missing_truth_gives_no_error_column(tmp_path: Path) -> None:
 
 
 def test_positions_replace_inertial_velocities_and_truth(tmp_path: Path) -> None:
+    """The images are 3.75 s apart."""
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     rows = read_rows(folder)
     for number, table_row in enumerate(rows):

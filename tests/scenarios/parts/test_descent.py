@@ -1,4 +1,4 @@
-"""Tests of descents with custom motions, instruments and scores."""
+"""Tests of the descent scenario with user-defined (custom) motions, instruments and scores."""
 
 from __future__ import annotations
 

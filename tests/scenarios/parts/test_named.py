@@ -1,4 +1,4 @@
-"""Tests of custom parts: lookup by path or entry point, options, and error messages."""
+"""Tests of custom parts (user-defined motions, instruments and scores): lookup, options, and error messages."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _add_examples_to_path(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def find_problem(**parts: Any) -> tuple[str, str]:
-    """Validate descent parameters with one error; return its key and message."""
+    """Validate descent parameters that contain one error; return its key and message."""
     with pytest.raises(ValidationError) as error_info:
         DescentScenarioParameters.model_validate(parts)
     ((key, message),) = validation_problems(error_info.value, DescentScenarioParameters)

@@ -1,4 +1,4 @@
-"""Tests of the conformance suite for custom parts: the documented examples pass, and defects are reported."""
+"""Tests of the conformance suite for custom motions, instruments and scores: examples pass, defects are reported."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ def poses(inputs, east=0.0):
 
 
 def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
+    """Run the given checks, or all checks, of a part; return the findings by name of the check."""
     subject = Subject(spec, determine_task(spec), 60.0)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (checks or names)}
@@ -163,7 +164,7 @@ def test_score_defects_are_reported(
 
 
 def test_nearest_ground_distance_in_a_cone_matches_the_plane() -> None:
-    """Independent method: intersect a grid of rays in the cone with the plane z = 0.05 x."""
+    """Independent method: intersect a grid of rays in the cone with the suite's ground, the plane z = 0.05 x."""
     apex = np.array([30.0, -20.0, 500.0])
     tilt = 0.4
     axis = np.array([np.sin(tilt), 0.0, -np.cos(tilt)])
@@ -176,5 +177,6 @@ def test_nearest_ground_distance_in_a_cone_matches_the_plane() -> None:
         + (np.sin(off_axis) * np.sin(azimuth))[..., None] * lateral_axis
     )
     ranges = (apex[2] - 0.05 * apex[0]) / (0.05 * directions[..., 0] - directions[..., 2])
+    # maximum range 10 km
     nearest = part_checks.instrument_cases()[0].nearest_ground(apex, axis, half_angle_rad, 1e4)
     assert nearest == pytest.approx(float(ranges.min()), rel=1e-4)

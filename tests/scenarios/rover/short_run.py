@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-#: A short approach from 3.6 m to 3.3 m over a small terrain with few rocks.
+#: A short approach to a rock of 0.8 m, from 3.6 m to 3.3 m, over a small terrain with few other rocks.
 SHORT_RUN: dict[str, Any] = {
     "world": {"samples": 1024, "rock_abundance": 0.005, "bank": 1},
     "start": {"distance_m": 3.6},

@@ -28,6 +28,7 @@ def run_slipping_rover(seed: int = 4, **changes: Any) -> Run:
 
 
 def _position_error_m(run: Run) -> float:
+    """Compute the horizontal distance between estimated and true final position."""
     vehicle = run.vehicle
     return float(np.linalg.norm((vehicle.estimated_pose.translation - vehicle.stance.world_from_rover.translation)[:2]))
 
@@ -44,7 +45,7 @@ def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
     assert errors[True] < 0.02 * 1.4 + 0.03
 
 
-def test_visual_odometry_without_overlap_falls_back_to_the_wheels() -> None:
+def test_wheel_odometry_replaces_visual_odometry_without_image_overlap() -> None:
     leg = {"motion": "straight", "step_m": 3.0, "steps": 1, "visual_odometry": True, "visual_odometry_step_m": 3.0}
     run = run_slipping_rover(legs=[leg], slip={"flat": 0.01})
     assert run.visual_odometry_updates == run.visual_odometry_failures == 1

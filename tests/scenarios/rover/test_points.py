@@ -41,7 +41,7 @@ def test_outline_points_are_on_the_visible_face(sphere: np.ndarray) -> None:
     front = outline.point(0.0, 0.5)
     assert np.linalg.norm(front - [5.0, 0.0, 0.5]) == pytest.approx(0.5, abs=1e-3)
     assert front[0] < 4.6
-    # For a view along +x, the right side is at -y.
+    # Arguments of `point`: from left (-1) to right (1), from foot (0) to top (1). For a view along +x, right is -y.
     assert outline.point(0.8, 0.5)[1] < -0.3 < 0.3 < outline.point(-0.8, 0.5)[1]
     assert outline.point(0.0, 0.9)[2] > front[2] > outline.point(0.0, 0.1)[2]
 

@@ -1,4 +1,4 @@
-"""Tests of the drive commands that each kind of route leg computes from the estimated target position."""
+"""Tests of the drive commands that each type of route leg computes from the estimated target position."""
 
 import numpy as np
 import pytest
@@ -39,6 +39,7 @@ def test_drive_commands_end_at_the_position(angle_deg: float) -> None:
 
 
 def test_step_length_is_limited() -> None:
+    # The second argument of `plan_drive` is the maximum length, m.
     commands = list(plan_drive(np.array([3.0, 0.4]), 0.5))
     assert sum(command.length_m for command in commands) == pytest.approx(0.5)
 

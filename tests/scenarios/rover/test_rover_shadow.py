@@ -1,4 +1,4 @@
-"""Tests of the shadow of rover and mast on a template patch."""
+"""Tests of the shadow of rover and mast on a template patch, the surface around a target that the tracker matches."""
 
 import numpy as np
 import pytest
@@ -21,6 +21,7 @@ def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> Non
     shadow = head - head[2] / sun[2] * sun
 
     def is_shaded(east_m: float, north_m: float) -> bool:
+        # The patch has a half angle of 2 mrad, seen from the head. The mast points ahead.
         position = shadow + np.array([east_m, north_m, 0.0])
         patch = sample_template(head, position, 0.002)
         return rover_shades_patch(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)

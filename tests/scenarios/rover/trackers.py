@@ -48,6 +48,7 @@ class LosingTracker(OffsetTracker):
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
         """See `TargetTracker`."""
+        # At the first update the target is designated, but not yet seen.
         if self.paper_tracker.track is not None and self.paper_tracker.track.sighting is None:
             return self.paper_tracker.update(measurements)
         position = np.array([3.0, 0.0, 0.3])

@@ -312,6 +312,7 @@ def test_fisheye_pose_is_applied() -> None:
     assert np.allclose(camera.project(point)[0], expected_pixels.ravel(), rtol=0, atol=1e-6)
 
 
+#: File, text that is replaced, its replacement, and the expected message.
 FAULTS = [
     (OPENCV, "image_width: 640\n", "", "image_width, image_height or resolution.*allowed: two positive integers"),
     (OPENCV, "image_width: 640", "image_width: -640", "allowed: two positive integers"),

@@ -27,6 +27,7 @@ from marsyard.sim.camera import (
 )
 from marsyard.sim.sensor import CustomCamera, CustomCameraChoice
 
+#: A label in the format of Opportunity's products, with the model of the front hazcam.
 LABEL = """PDS_VERSION_ID                    = PDS3
 RECORD_TYPE                       = FIXED_LENGTH
 ^IMAGE                            = 3
@@ -155,6 +156,7 @@ def test_subframes_require_subframe_folded_in(tmp_path: Path) -> None:
         assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
 
 
+#: Text of the label that is replaced, its replacement, and the expected message.
 LABEL_FAULTS = [
     ("= GEOMETRIC_CAMERA_MODEL", "= OTHER_MODEL", "GEOMETRIC_CAMERA_MODEL: missing"),
     ("= CAHVORE\n", "= CAHVORES\n", "MODEL_TYPE: 'CAHVORES'; allowed: CAHV, CAHVOR, CAHVORE"),
@@ -260,6 +262,7 @@ def test_round_trip_is_exact(
     assert read_camera(tmp_path / "camera.cahvore") == camera
 
 
+#: Text of the file that is replaced, its replacement, and the expected message.
 CMOD_TEXT_FAULTS = [
     ("Model = CAHVOR = perspective, distortion\n", "", "Model: missing"),
     ("Model = CAHVOR =", "Model = CAHVOX =", "Model: 'CAHVOX.*allowed: CAHV, CAHVOR, CAHVORE1"),

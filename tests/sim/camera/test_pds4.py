@@ -89,6 +89,7 @@ LABEL = """<?xml version="1.0" encoding="UTF-8"?>
   </File_Area_Observational>
 </Product_Observational>
 """
+#: The label without a subframe: first line and sample are 1.
 FULL_FRAME = LABEL.replace(">953<", ">1<").replace(">1273<", ">1<")
 
 
@@ -142,6 +143,7 @@ def test_cahvor_and_cahv_are_read(tmp_path: Path) -> None:
         assert np.array_equal(camera.v, [-168.067, 400.716, 3088.89])
 
 
+#: Text of the label that is replaced, its replacement, and the expected message.
 FAULTS = [
     ("geom:Camera_Model_Parameters", "geom:Other", "Camera_Model_Parameters: missing"),
     (">CAHVORE<", ">PSPH<", "model_type: 'PSPH'; allowed: CAHV, CAHVOR, CAHVORE"),

@@ -9,6 +9,7 @@ import pytest
 
 from marsyard.sim.camera import CameraFileError, read_pds3_product
 
+#: Image of the synthetic products, 3 x 4 counts, and their label.
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 300
 LABEL = """PDS_VERSION_ID = PDS3
 RECORD_BYTES = 512

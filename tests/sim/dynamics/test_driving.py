@@ -19,6 +19,7 @@ COMMANDS = [
     DriveCommand(left_m=0.5),
     DriveCommand(forward_m=1.2, turn_left_rad=-0.8),
     DriveCommand(turn_left_rad=2.0),
+    # circle around a target 7 m ahead
     DriveCommand(left_m=-7.0 * 0.3, turn_left_rad=0.3),
 ]
 
@@ -140,6 +141,7 @@ def test_soil_step_and_heading_errors_have_the_specified_deviation() -> None:
         np.degrees(drive(MER, ground, random_heading, start, DriveCommand(forward_m=0.09), rng).end.azimuth_rad) - 90.0
         for _ in range(120)
     ]
+    # The heading error is a random walk: 1 deg times the square root of 0.09 m.
     assert np.std(headings) == pytest.approx(0.3, abs=0.078)
 
 

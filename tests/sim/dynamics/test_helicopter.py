@@ -7,10 +7,12 @@ import pytest
 
 from marsyard.sim.dynamics.helicopter import HelicopterFlight, HelicopterParameters, draw_helicopter_flight
 
+#: Ground point under the middle of the flight line, world axes, m.
 ORIGIN = np.array([100.0, -200.0, 35.0])
 
 
 def make_flight(**changes: object) -> HelicopterFlight:
+    """Draw a flight with an azimuth of 70 deg and gravity of 9.8 m/s2."""
     parameters = HelicopterParameters.model_validate(changes)
     return draw_helicopter_flight(parameters, ORIGIN, np.radians(70.0), 9.8, np.random.default_rng(7))
 

@@ -51,6 +51,12 @@ def _fly_landing(
     craft: RotorcraftParameters = CRAFT,
     **wind: float,
 ) -> RotorcraftFlight:
+    """Simulate transit and landing.
+
+    - east_error_m: constant navigation error to the east
+    - slope: slope of the ground, which rises to the east
+    - stuck_m: constant reading of a failed laser altimeter
+    """
     air = _make_air(seed, **wind)
     flight = _fly_transit(air, craft)
     # Navigation errors in nine columns; the first one is the east position.
@@ -63,7 +69,7 @@ def _fly_landing(
 
 
 def test_air_shorter_than_the_flight_is_rejected() -> None:
-    """Otherwise the kernels would read beyond the end of the gust samples."""
+    """The kernels do not check the end of the gust samples."""
     air = Air.draw(AirParameters(), CRAFT.step_s, TRANSIT.lead_s + TRANSIT.imaging_duration_s, np.random.default_rng(0))
     with pytest.raises(ValueError, match="the flight can have"):
         _fly_transit(air)

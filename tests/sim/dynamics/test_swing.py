@@ -1,4 +1,7 @@
-"""Tests of the two-stage swing (`sim.dynamics.swing`): conservation laws, linear theory and initial conditions."""
+"""Tests of the descent on a parachute, a double pendulum: conservation laws, linear theory and initial conditions.
+
+In the slow mode the line below the canopy cones; in the fast mode the lander nods on its bridle.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from marsyard.sim.dynamics import SwingDescent, SwingParameters
 from marsyard.sim.dynamics.kernels.swing import Chain, WindField, compute_aerodynamic_force, compute_derivatives
 from marsyard.sim.dynamics.swing import Modes, build_chain
 
+#: Position of the first image, m; height of the ground, m; gravity, m/s2.
 START = np.array([100.0, -50.0, 2100.0])
 GROUND_M = 100.0
 GRAVITY = 3.72
@@ -50,6 +54,7 @@ def _compute_off_nadir_deg(descent: SwingDescent, times_s: np.ndarray) -> np.nda
 
 
 def _make_calm_wind() -> WindField:
+    """Return a field without mean wind and gusts."""
     return WindField(GROUND_M, 0.0, 0.0, 500.0, 0.03, np.zeros((0, 7)))
 
 

@@ -9,6 +9,7 @@ from scipy.integrate import quad
 from marsyard.sim.dynamics import Wind, WindParameters
 from marsyard.sim.dynamics.trajectory import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
 
+#: Height of the ground, m; the wind depends on the height above it.
 GROUND_M = -1900.0
 
 
@@ -20,6 +21,7 @@ def test_mean_wind_is_logarithmic_in_layer_and_constant_above() -> None:
     wind = _make_wind(wind_east_m_s=20.0, wind_north_m_s=-5.0, gust_intensity_m_s=0.0)
     above_ground = np.array([0.0, 1.0, 100.0, 500.0, 2000.0])
     result = wind.velocities(GROUND_M + above_ground)
+    # defaults: roughness length 0.03 m, boundary layer 500 m
     fraction = np.minimum(np.log1p(above_ground / 0.03) / np.log1p(500.0 / 0.03), 1.0)
     np.testing.assert_allclose(result, fraction[:, None] * [20.0, -5.0, 0.0], atol=1e-12)
     np.testing.assert_array_equal(wind.velocities(np.array([GROUND_M - 10.0])), 0.0)
@@ -55,6 +57,7 @@ def test_gusts_have_dryden_spectra(lag_m: float) -> None:
     tolerance = 4.0 * np.sqrt(2.0 / n_draws)
     np.testing.assert_allclose(velocities_m_s[:, 0].var(axis=0), 4.0, rtol=tolerance)
     structure = np.mean((velocities_m_s[:, 1] - velocities_m_s[:, 0]) ** 2, axis=0) / 4.0
+    # The default length scale is 533 m.
     np.testing.assert_allclose(structure[:2], _compute_structure_function("transverse", lag_m, 533.0), rtol=tolerance)
     np.testing.assert_allclose(structure[2], _compute_structure_function("longitudinal", lag_m, 533.0), rtol=tolerance)
 

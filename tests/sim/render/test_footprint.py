@@ -1,4 +1,4 @@
-"""Tests of shadow footprints: they contain all ground that objects may shade, and little other ground."""
+"""Tests of shadow footprints, grids that mark the ground that objects may shade, and of the culling of objects."""
 
 from dataclasses import replace
 
@@ -64,6 +64,7 @@ def test_footprint_does_not_change_images() -> None:
     scene = site_scene(ground, Viewpoint.from_pose(rays, pose, ground.surface), Sun(direction(1.0, 0.3)))
     assert len(scene.objects) > 50
     frame = process_renderer(default_backend()).render(scene, rays, pose)
+    # Replace the cached property: no pixel is excluded from the shadow test.
     full_scene = replace(scene)
     full_scene.__dict__["footprint"] = ALL_GROUND
     full_frame = process_renderer(default_backend()).render(full_scene, rays, pose)

@@ -149,7 +149,10 @@ def test_rough_ground_ranges_match_independent_ray_cast(
 
 @pytest.mark.parametrize("use_ceilings", [True, False], ids=["by ceilings", "by steps"])
 def test_grazing_rays_intersect_the_first_occluding_crest(terrain: Surface, use_ceilings: bool) -> None:
-    """Rays graze rough ground at distances of hundreds of samples. The reference marches in steps of 1/30 sample."""
+    """Rays graze rough ground at distances of hundreds of samples. The reference marches in steps of 1/30 sample.
+
+    Ceilings are upper bounds of the ground height in blocks of samples; blocks below a ray are skipped.
+    """
     rng = np.random.default_rng(3)
     count, ground = 400, Ground(terrain)
     origins = np.column_stack([rng.uniform(0.0, terrain.period_m, (count, 2)), np.full(count, ground.highest + 60.0)])

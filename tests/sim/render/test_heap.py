@@ -1,4 +1,4 @@
-"""Test that freed memory stays allocated between images and is returned to the system on request."""
+"""Test that the process retains freed memory between images, and returns it to the operating system on request."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ def _measure_memory(mode: str) -> tuple[int, int]:
     return bytes_after_free, bytes_after_return
 
 
-def test_freed_memory_stays_allocated_until_it_is_returned() -> None:
+def test_process_retains_freed_memory_until_it_is_returned() -> None:
     bytes_after_free, bytes_after_return = _measure_memory("keep")
     assert bytes_after_free > 0.9 * SIZE
     assert bytes_after_return < 0.1 * SIZE

@@ -11,6 +11,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.terrain import Surface
 
+#: Pose of a camera 1 km above the origin that looks down.
 NADIR = rigid(Rotation.identity(), np.array([0.0, 0.0, 1000.0]))
 
 

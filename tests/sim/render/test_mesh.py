@@ -13,6 +13,7 @@ from marsyard.sim.terrain import Surface
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))
 def test_offsets_have_the_given_extent_and_spacing(finest: float, stretch: float, count: int) -> None:
     half_width = stretch * finest * (count - 1) / 2
+    # Grid lines relative to the viewpoint, m: dense near it, and sparser with distance.
     offsets = graded_offsets(half_width, finest, count)
     gaps = np.diff(offsets)
     assert offsets[-1] == pytest.approx(half_width, rel=1e-6)

@@ -50,12 +50,15 @@ def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def _add_slopes(x: np.ndarray, y: np.ndarray, footprint_m: np.ndarray, relief: MicroRelief) -> list[np.ndarray]:
-    """Compute slopes along x and y, and resolved and unresolved variance of slope, strip by strip."""
+    """Compute slopes along x and y, and resolved and unresolved variance of slope.
+
+    The kernel processes a strip of at most `STRIP` positions in one call.
+    """
     outputs, buffers = [np.zeros(x.size) for _ in range(4)], allocate_noise()
     for first in range(0, x.size, STRIP):
         strip = slice(first, first + STRIP)
-        parts = (output[strip] for output in outputs)
-        add_relief_slopes(x[strip], y[strip], footprint_m[strip], relief, buffers, *parts)
+        output_strips = (output[strip] for output in outputs)
+        add_relief_slopes(x[strip], y[strip], footprint_m[strip], relief, buffers, *output_strips)
     return outputs
 
 

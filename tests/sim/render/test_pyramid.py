@@ -1,4 +1,4 @@
-"""Test of the number of resolution levels that kernels receive."""
+"""Test that rendering kernels receive a constant number of resolution levels of the ground, for any terrain size."""
 
 import numpy as np
 import pytest

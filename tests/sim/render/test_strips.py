@@ -1,4 +1,4 @@
-"""Test that the vectorised spline evaluation of the shading kernels equals the evaluation of single positions."""
+"""Test of the shading kernels: evaluating the ground's spline for a strip of pixels equals evaluating each position."""
 
 import numpy as np
 

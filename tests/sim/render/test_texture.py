@@ -13,7 +13,10 @@ POSITIONS = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
 
 
 def _log_albedo(positions: np.ndarray, footprint_m: np.ndarray, coarsest_m: float, octaves: np.ndarray) -> np.ndarray:
-    """Compute the logarithm of the relative albedo at positions, shape (n, 3), strip by strip."""
+    """Compute the logarithm of the relative albedo at positions, shape (n, 3).
+
+    The kernel processes a strip of at most `STRIP` positions in one call.
+    """
     log_albedo, buffers = np.zeros(len(positions)), allocate_noise()
     for first in range(0, len(positions), STRIP):
         strip = slice(first, first + STRIP)

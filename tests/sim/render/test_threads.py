@@ -19,6 +19,7 @@ from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 
 @pytest.mark.parametrize(("pixels", "count"), [(100_001, 1), (100_001, 2), (99_999, 7), (20_001, 3), (5, 2)])
 def test_every_pixel_belongs_to_one_part(pixels: int, count: int) -> None:
+    """A part is a slice of the pixels, computed by one of `count` threads."""
     visits = np.zeros(pixels, dtype=np.int64)
 
     def visit(pixels_of_part: slice) -> None:

@@ -1,4 +1,4 @@
-"""Tests of inertial errors during the approach, against a propagation at the full rate of the inertial unit."""
+"""Tests of inertial errors from cruise to the start of the descent, against propagation at the unit's full rate."""
 
 from __future__ import annotations
 
@@ -64,6 +64,7 @@ def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[
 
 
 def test_rates_are_the_derivative_of_attitude() -> None:
+    # The approach ends at -2 s, the start of the descent.
     approach = Approach(SHORT, -2.0)
     times = np.linspace(approach.start_s + 1.0, approach.end_s - 1.0, 200)
     step_s = 1e-4

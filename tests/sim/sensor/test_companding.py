@@ -1,4 +1,4 @@
-"""Tests of square-root companding of image counts."""
+"""Tests of square-root companding, the compression of image counts to codes of 8 bits."""
 
 import numpy as np
 import pytest

@@ -8,6 +8,7 @@ import pytest
 
 from marsyard.sim.sensor.compression import compress
 
+#: Smooth random relief, and its image in counts of 12 bits.
 SCENE = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 384)), (0, 0), 2.0)
 COUNTS = np.clip(2000.0 + 4000.0 * SCENE, 0.0, 4095.0).astype(np.uint16)
 

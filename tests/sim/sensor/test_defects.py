@@ -1,4 +1,4 @@
-"""Tests of the correction of known bad pixels."""
+"""Tests of the replacement of known bad pixels by the mean of their good neighbours."""
 
 from __future__ import annotations
 

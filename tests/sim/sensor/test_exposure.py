@@ -1,4 +1,4 @@
-"""Tests of automatic exposure."""
+"""Tests of automatic exposure: convergence, a region of the image, and limits."""
 
 import numpy as np
 import pytest

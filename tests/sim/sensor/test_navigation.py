@@ -62,7 +62,9 @@ def _run_filter(
 def _compute_state_errors(
     path: SimulatedPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray
 ) -> np.ndarray:
-    """Compute the true minus the estimated state, fifteen columns (position, velocity, attitude, two biases).
+    """Compute the true minus the estimated state: position, velocity, attitude, biases of gyro and accelerometer.
+
+    The result has fifteen columns. `indices` select the samples of the inertial unit.
 
     Scale and misalignment errors of the accelerometer count as a bias: their product with gravity.
     """

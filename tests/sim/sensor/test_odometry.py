@@ -38,6 +38,7 @@ def _compute_error_rad(estimate: PoseEstimate, true_pose: RigidTransform) -> np.
 def _estimate_poses(
     drives: list[Drive], parameters: OdometryParameters, seed: int, visual: bool = False
 ) -> tuple[Odometer, PoseEstimate]:
+    """Return the odometer, and its estimate at the end of the drives; `visual` selects visual odometry."""
     rng = np.random.default_rng(seed)
     odometer = Odometer.draw(parameters, drives[0].start.world_from_rover, rng)
     estimate = odometer.initial_estimate

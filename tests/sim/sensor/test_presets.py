@@ -9,6 +9,8 @@ from marsyard.sim.sensor import PRESETS, Detector, DetectorChoice, DetectorParam
 
 
 class _Campaign(BaseModel):
+    """Parameters with a detector that is a preset, or a preset with changed values."""
+
     detector: DetectorChoice = DetectorParameters()
 
 

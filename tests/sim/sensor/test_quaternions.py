@@ -1,4 +1,4 @@
-"""Tests of quaternion products against SciPy's rotations."""
+"""Tests of quaternion products, which integrate gyro increments, against SciPy's rotations."""
 
 import numpy as np
 import pytest

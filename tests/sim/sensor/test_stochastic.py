@@ -1,4 +1,4 @@
-"""Tests of the Gauss-Markov process: variance, correlation and span."""
+"""Tests of the first-order Gauss-Markov process of slowly varying instrument errors: variance, correlation, span."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tests of the terrain bank and its disk cache."""
+"""Tests of the terrain bank, the numbered terrains of a campaign, and of its disk cache."""
 
 import errno
 import hashlib
@@ -58,7 +58,7 @@ def test_damaged_file_is_rebuilt(cache: Path, damage: bytes | None) -> None:
 
 
 def test_zeroed_cache_file_is_rebuilt(cache: Path) -> None:
-    """The process has already verified the file. Writing zeros changes its modification time."""
+    """A file that this process has already verified is verified again if its modification time has changed."""
     bank = TerrainBank(SMALL, seed=1)
     expected = _read_bytes(bank, 0)
     assert _read_bytes(bank, 0) == expected

@@ -1,4 +1,4 @@
-"""Tests of imported terrain: heights at the posts, filled holes, brightness, and the border to synthetic terrain."""
+"""Tests of terrain from elevation models (DTM): heights at posts, holes, brightness, border to synthetic terrain."""
 
 import sys
 from pathlib import Path
@@ -10,6 +10,7 @@ from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthe
 from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, fill_holes, read_rasters
 from marsyard.sim.terrain.surface import terrain_statistics
 
+#: Size of the synthetic elevation model of the tests, in posts (1 m apart in `tile.npz`).
 ROWS, COLUMNS = 90, 110
 
 

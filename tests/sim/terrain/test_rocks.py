@@ -256,7 +256,10 @@ def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None
 @pytest.mark.parametrize("number", [0, 9, 15, 16, 27, 32, 47, 50, 63, 70])
 @pytest.mark.parametrize("detail", [COARSEST, COARSE, MEDIUM, FINE])
 def test_coarse_rock_deviates_from_the_finest_by_a_quarter_pixel(number: int, detail: int) -> None:
-    """The RMS distance above the ground to the plane of the nearest coarse triangle is about 0.25 px (requirement)."""
+    """At the largest apparent diameter for which a level of detail is used, it deviates by about 0.25 px (requirement).
+
+    The deviation is the RMS distance from points above the ground to the plane of the nearest coarse triangle.
+    """
     coarse = make_mesh(rock_shapes(detail), number)
     samples, triangles = trimesh.sample.sample_surface(coarse, 200_000, seed=1)
     finest = trimesh.sample.sample_surface(make_mesh(rock_shapes(FINEST), number), 4_000, seed=2)[0]

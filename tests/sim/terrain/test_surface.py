@@ -1,4 +1,4 @@
-"""Tests of terrain surfaces: height, gradient and levels against SciPy's cubic B-spline, and bounds of the height."""
+"""Tests of terrain surfaces: height, gradient and resolution levels against SciPy's cubic B-spline; height bounds."""
 
 import numpy as np
 import pytest

@@ -94,6 +94,7 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
 
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    # A crater of radius 30 m and depth 3 m, filled up to a flat floor. Columns: see `stamp_craters`.
     crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(7), 0.0]
     stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)

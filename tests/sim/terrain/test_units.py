@@ -1,4 +1,4 @@
-"""Tests of surface units, crater populations, tracks of dust devils, wind tails of craters, and rocks of the units.
+"""Tests of surface units (patches of ground with different albedo, roughness and rocks), craters and wind marks.
 
 `log_albedo` is the natural logarithm of the albedo divided by the mean albedo.
 """
@@ -20,12 +20,14 @@ from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
 
+#: Types of units: fraction of the area, albedo, and factors of roughness, texture amplitude and rock density.
 KINDS: list[dict[str, Any]] = [
     {"name": "plain", "fraction": 0.5},
     {"name": "dust", "fraction": 0.3, "log_albedo": 0.2, "roughness": 0.3, "texture": 0.2, "rocks": 0.1},
     {"name": "rubble", "fraction": 0.2, "log_albedo": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
 ]
 PLAIN = [{"name": "plain", "fraction": 1.0}]
+#: An empty table of craters; columns: see `stamp_craters`.
 NO_CRATERS = np.empty((0, 16))
 
 

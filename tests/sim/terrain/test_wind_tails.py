@@ -1,4 +1,4 @@
-"""Tests of wind tails: shape of one ridge, and terrains with tails in the bank."""
+"""Tests of wind tails, the sand ridges downwind of rocks: shape of one ridge, and terrains with tails in the bank."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import pytest
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface, TerrainBank, TerrainParameters
 from marsyard.sim.terrain.rocks.tails import WindTails
 
+#: Spacing (m), samples per side and albedo of the ground; diameter, height and coordinates of the rock's centre, m.
 SPACING_M, SIDE, ALBEDO = 0.02, 256, 0.25
 DIAMETER_M, HEIGHT_M, CENTRE_M = 0.4, 0.2, 2.5
 
@@ -58,7 +59,9 @@ def test_rocks_narrower_than_four_samples_have_no_tail() -> None:
     assert _make_surface_with_tail(WindTails(), diameter_m=4.1 * SPACING_M).levels[0][..., 0].any()
 
 
-def test_bank_includes_tails_and_keeps_the_positions_of_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tails_in_the_bank_do_not_change_the_positions_of_rocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
     without_tails = TerrainParameters(samples=256, spacing_m=0.05, rocks=RockParameters(abundance=0.05, smallest_m=0.2))
     with_tails = without_tails.with_changes({"rocks": {"tails": {}}})
