@@ -131,7 +131,7 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
         for item in budget["contributions"]
     ]
     rows.append(
-        [REMAINING, signed_percent(budget["remaining"] / total), "", "", _format_root(budget["remaining"]), "", "", ""]
+        [REMAINING, signed_percent(budget["remaining"] / total), "", "", _format_root(budget["remaining"]), "", ""]
     )
     statistic, name = _statistic(result), label(result["quantity"]).split(" (")[0]
     figure = svg_figure(

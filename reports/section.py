@@ -146,11 +146,19 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of texts, and the number of omitted rows."""
+    """A table of texts, and the number of omitted rows.
+
+    Raises ValueError if a row does not have one cell per column.
+    """
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     n_omitted: int = 0
+
+    def __post_init__(self) -> None:
+        for row in self.rows:
+            if len(row) != len(self.head):
+                raise ValueError(f"row {list(row)} has {len(row)} cells; allowed: {len(self.head)}, as the head has")
 
 
 def build_grid(records: Iterable[T], columns: Mapping[str, Callable[[T], str]]) -> Grid:

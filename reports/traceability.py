@@ -176,7 +176,7 @@ def junit_xml(
             suite, "testcase", classname=_clean_xml(campaign), name=_clean_xml(verdict.requirement_id)
         )
         message = _clean_xml(
-            f"{verdict.failures} of {verdict.n} failed; at least {verdict.lower:.6g}, "
+            f"{verdict.failures} of {verdict.n} failed; {_format_lower_bound(verdict.lower)}, "
             f"required {verdict.probability:g}. {verdict.note}"
         )
         if verdict.status is Status.FAIL:
@@ -189,6 +189,10 @@ def junit_xml(
         Xml.SubElement(completion, "failure", message=f"{count(overall.crashed, 'case')} crashed", type="CRASHED")
     Xml.indent(suite)
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
+
+
+def _format_lower_bound(lower: float) -> str:
+    return "no lower bound" if math.isnan(lower) else f"at least {lower:.6g}"
 
 
 def _clean_xml(text: str) -> str:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from marsyard.scenarios.meshes import FIRST_MESH_NUMBER
 from marsyard.sim.render import Frame, Objects, Scene
 from marsyard.sim.terrain import RockField
 from marsyard.sim.terrain.sites import Hill
@@ -78,8 +79,9 @@ def add_unresolved_rocks(
     area of these rocks per square metre, and e is the angle between the line of sight and level ground. Range and
     normals are not changed.
     """
-    # bodies -1 (ground) and -2 (sky) select the two appended names, which are negative like all names except rocks
-    is_rock = np.append(scene.objects.names, [-2, -1])[frame.body] >= 0
+    # bodies -1 (ground) and -2 (sky) select the two appended numbers, which are negative, as no rock's number is
+    numbers = np.append(scene.objects.names, [-2, -1])[frame.body]
+    is_rock = (numbers >= 0) & (numbers < FIRST_MESH_NUMBER)
     if rocks is None or len(rocks) == 0 or not np.any(is_rock):
         return frame
     order = np.argsort(rocks.diameter_m)

@@ -245,7 +245,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
     how = f"{len(covers)} images from 2 km over flat ground, {2 if quick else 8} layers; cover {parameters.cover:g}"
     yield Measure(
         "fraction of the ground in cloud shadows, difference from the specified cover",
-        abs(float(np.mean(covers)) - 0.3),
+        abs(float(np.mean(covers)) - parameters.cover),
         "",
         0.1,
         how,

@@ -199,13 +199,13 @@ def check_isolation(quick: bool) -> Iterator[Measure]:
     healthy = result.faults.count("")
     fault_types = len(set(result.faults)) - 1
     how = f"{cases} cases, {cases - healthy} of which misbehave in {fault_types} ways; killed {result.kills} times"
-    yield Measure("soak: campaigns that did not end by themselves", float(not result.finished), "", 0, how)
-    yield Measure("soak: outcomes that do not match the fault of the case", len(result.wrong_outcomes), "", 0, how)
+    yield Measure("soak: campaigns that did not end by themselves", float(not result.finished), "1", 0, how)
+    yield Measure("soak: outcomes that do not match the fault of the case", len(result.wrong_outcomes), "1", 0, how)
     yield Measure(
-        "soak: rows of valid cases that differ from the campaign without faults", len(result.changed_cases), "", 0, how
+        "soak: rows of valid cases that differ from the campaign without faults", len(result.changed_cases), "1", 0, how
     )
-    yield Measure("soak: remaining processes", result.remaining_processes, "", 0, how)
-    yield Measure("soak: remaining temporary files", result.remaining_files, "", 0, how)
+    yield Measure("soak: remaining processes", result.remaining_processes, "1", 0, how)
+    yield Measure("soak: remaining temporary files", result.remaining_files, "1", 0, how)
     yield Measure("soak: time of the campaign", result.seconds, "s", None, how)
     for text in result.wrong_outcomes:
         print(text)

@@ -265,9 +265,7 @@ def test_current_names_exist_and_deprecated_names_do_not() -> None:
         for current_name in [current_names] if isinstance(current_names, str) else current_names:
             assert f'"{current_name}": {{' in schemas, current_name
         # short words may also be current keys of other tables, such as `placed` of rocks
-        assert deprecated_name in ("own", "least", "most", "placed") or f'"{deprecated_name}": {{' not in schemas, (
-            deprecated_name
-        )
+        assert deprecated_name == "placed" or f'"{deprecated_name}": {{' not in schemas, deprecated_name
     column_sets = [columns for name in scenario_names() if (columns := row_columns(name)) is not None]
     for deprecated_name, current_name in RENAMED_NAMES["columns"].items():
         assert any(current_name in (*columns.flags, *columns.numbers) for columns in column_sets), current_name

@@ -70,6 +70,13 @@ def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, veloci
     assert _read_message(completion_case, "failure") == "2 cases crashed"
 
 
+def test_junit_states_that_no_case_gives_no_lower_bound(make_rows: Rows, velocity: dict[str, Any]) -> None:
+    frame = make_rows(0)
+    verdicts = evaluate_requirements(frame, [velocity])
+    suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, combine_verdicts(verdicts, frame)))  # noqa: S314
+    assert "0 of 0 failed; no lower bound, required 0.99" in _read_message(suite[0], "skipped")
+
+
 def test_report_writes_matrix_and_junit_files(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     directory = make_run(make_rows(24)[["case", "outcome", "answered", "velocity_error_m_s"]])
     write_report(directory)

@@ -372,7 +372,7 @@ def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, An
     )
     assert message in verdict.note
     assert message in combine_verdicts([verdict], frame).sentence
-    assert "would do" not in combine_verdicts([verdict], frame).sentence
+    assert "additional case" not in combine_verdicts([verdict], frame).sentence
     # 253 draws of 2300 terrains have 230 different terrains in more than 99 % of campaigns
     rng = np.random.default_rng(3)
     assert np.mean([np.unique(rng.integers(0, 2300, 253)).size >= 230 for _ in range(1000)]) > 0.99

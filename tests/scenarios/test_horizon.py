@@ -11,10 +11,11 @@ import pytest
 
 from marsyard.cli.images import ImageRequest, RenderedImage, render_images
 from marsyard.scenarios.horizon import HILL_NAME, add_unresolved_rocks, hill_objects
+from marsyard.scenarios.meshes import FIRST_MESH_NUMBER
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene
 from marsyard.sim.render.objects import ROVER_NAME
-from marsyard.sim.terrain import site
+from marsyard.sim.terrain import RockField, site
 from marsyard.sim.terrain.sites import Hill
 
 HILL = Hill(azimuth_deg=60.0, distance_m=3000.0, width_m=800.0, depth_m=600.0, height_m=90.0)
@@ -105,6 +106,13 @@ def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_ima
     is_near = is_ground & (frame.range_m < 3.0)
     assert blended.radiance[is_near].max() < 0.01
     np.testing.assert_array_equal(blended.radiance[~is_ground], black_ground.radiance[~is_ground])
+
+
+def test_meshes_of_users_are_not_rocks() -> None:
+    """An image without rocks has no mean radiance of rocks, even if it shows a lander."""
+    frame = SimpleNamespace(body=np.array([[GROUND, 0]]), radiance=np.ones((1, 2)))
+    scene = SimpleNamespace(objects=SimpleNamespace(names=np.array([FIRST_MESH_NUMBER])))
+    assert add_unresolved_rocks(cast(Frame, frame), cast(Scene, scene), cast(RockField, [None]), 1e-3, 0.0) is frame
 
 
 def test_ground_without_rocks_is_unchanged() -> None:
