@@ -50,9 +50,9 @@ def format_catalogue() -> str:
     header = [
         "# Catalogue",
         "",
-        "This page lists the campaigns that are included in Marsyard: the scenario that simulates the cases, the number of",
-        "cases of the campaign file, and a description. `marsyard run NAME` runs a campaign. `marsyard show NAME` prints its",
-        "dispersions with their sources, and its requirements. [Terms](../../glossary.md) are defined in the glossary.",
+        "This page lists the campaigns that are included in Marsyard: the scenario that simulates the cases, the",
+        "number of cases, and a description. `marsyard run NAME` runs a campaign. `marsyard show NAME` prints its",
+        "dispersions with their sources, and its requirements. The [glossary](../../glossary.md) defines the terms.",
         "",
     ]
     return "\n".join([*header, "| campaign | scenario | cases | description |", "|---|---|---|---|", *rows, ""])
@@ -66,9 +66,9 @@ def format_parameters(name: str) -> str:
         "",
         description,
         "",
-        "This table lists every parameter that a campaign of this scenario can set or disperse. Keys are below `[parameters]`",
-        "in the campaign file, and on the command line in `--set KEY=VALUE`. SD is the standard deviation. Units are in the",
-        "names of the keys (`_m`, `_deg`, `_s`, `_px`) or in the description.",
+        "This table lists every parameter that a campaign of this scenario can set or disperse. Keys are below",
+        "`[parameters]` in the campaign file, or in `--set KEY=VALUE` on the command line. Units are in the names of the",
+        "keys (`_m`, `_deg`, `_s`, `_px`) or in the description; SD is the standard deviation.",
         "",
     ]
     rows = [
