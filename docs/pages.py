@@ -67,8 +67,8 @@ def format_parameters(name: str) -> str:
         description,
         "",
         "This table lists every parameter that a campaign of this scenario can set or disperse. Keys are below",
-        "`[parameters]` in the campaign file, or in `--set KEY=VALUE` on the command line. Units are in the names of the",
-        "keys (`_m`, `_deg`, `_s`, `_px`) or in the description; SD is the standard deviation.",
+        "`[parameters]` in the campaign file, or in `--set KEY=VALUE` on the command line. Units are in the names of",
+        "the keys (`_m`, `_deg`, `_s`, `_px`) or in the description; SD is the standard deviation.",
         "",
     ]
     rows = [
