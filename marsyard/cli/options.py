@@ -42,7 +42,7 @@ MaxHolesOption = Annotated[
         metavar="F",
         min=0.0,
         max=0.99,
-        help="Accept a DTM with up to this fraction of missing elevations, which are filled; by default 0.2.",
+        help="Accept a DTM with up to this fraction of missing elevations, which are filled; by default 0.05.",
     ),
 ]
 CasesOption = Annotated[
