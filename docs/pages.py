@@ -47,7 +47,14 @@ def format_catalogue() -> str:
     for name, path in catalogue().items():
         campaign = tomllib.loads(path.read_text(encoding="utf-8"))
         rows.append(f"| `{name}` | `{campaign['scenario']}` | {campaign['cases']:,} | {campaign['description']} |")
-    header = ["# Catalogue", "", "`marsyard show NAME` prints a campaign: dispersions, sources, requirements.", ""]
+    header = [
+        "# Catalogue",
+        "",
+        "This page lists the campaigns that are included in Marsyard: the scenario that simulates the cases, the",
+        "number of cases, and a description. `marsyard run NAME` runs a campaign. `marsyard show NAME` prints its",
+        "dispersions with their sources, and its requirements. The [glossary](../../glossary.md) defines the terms.",
+        "",
+    ]
     return "\n".join([*header, "| campaign | scenario | cases | description |", "|---|---|---|---|", *rows, ""])
 
 
@@ -59,7 +66,9 @@ def format_parameters(name: str) -> str:
         "",
         description,
         "",
-        "Keys are below `[parameters]`, as in `--set KEY=VALUE`.",
+        "This table lists every parameter that a campaign of this scenario can set or disperse. Keys are below",
+        "`[parameters]` in the campaign file, or in `--set KEY=VALUE` on the command line. Units are in the names of",
+        "the keys (`_m`, `_deg`, `_s`, `_px`) or in the description; SD is the standard deviation.",
         "",
     ]
     rows = [
@@ -83,7 +92,8 @@ def format_ingest_keys() -> str:
         [
             "# Keys and columns of real images",
             "",
-            "Keys and columns that `marsyard ingest` reads in a folder; see [real images](../../real-images.md).",
+            "This page lists the keys and columns that `marsyard ingest` reads in a folder of recorded images. [Real",
+            "images](../../real-images.md) describes the folder and gives an example.",
             "",
             "## `ingest.toml`",
             "",

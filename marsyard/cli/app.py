@@ -50,11 +50,12 @@ class _Group(_FlagsWithoutType, TyperGroup):
 
 
 app = typer.Typer(
+    name="marsyard",
     cls=_Group,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="A virtual Mars Yard: run vision software on rendered cases with ground truth, and report whether it "
-    "meets its requirements at a given confidence level.",
+    help="Run vision software on simulated Mars images with ground truth, and report whether it meets its requirements "
+    "at a stated confidence level.",
     epilog="Exit status: 0 all requirements met, or no requirements; 1 a requirement failed, or a case crashed; "
     "2 the command or a file is invalid; 3 no verdict: too few cases, or cases that are not independent random draws.",
 )
@@ -101,7 +102,7 @@ def show(
     ] = None,
     as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
 ) -> None:
-    """Show a campaign: parameters, dispersions with their sources, requirements; with --draw, values of its cases."""
+    """Show a campaign: parameters, dispersions with their sources, requirements; with --draw its random values."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError
     from marsyard.cli.showing import describe_campaign, show_campaign, show_draws, write_draws_figure

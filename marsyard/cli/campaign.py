@@ -36,8 +36,7 @@ class RunOptions:
         False
     )
     until_decided: Annotated[
-        bool,
-        Option("--until-decided", help="Stop early once the verdicts are decided; the number of cases is the maximum."),
+        bool, Option("--until-decided", help="Stop as soon as the verdicts are decided; --cases is the maximum.")
     ] = False
     override: options.SetOption = None
     algorithm: options.AlgorithmOption = None
@@ -127,13 +126,14 @@ def resume(
 def append(
     directory: options.DirectoryArgument,
     cases: Annotated[
-        int, Argument(metavar="N", help="Number of cases to add; for a study of `marsyard rare`, of replicates.", min=1)
+        int,
+        Argument(metavar="N", help="Number of cases to add, or of replicates for a study of `marsyard rare`.", min=1),
     ],
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
     allow_changed: options.ChangedOption = False,
 ) -> None:
-    """Add cases to a finished campaign, or replicates to a study, run them, and evaluate all cases."""
+    """Add cases to a finished campaign (or replicates to a study of rare violations), run them, and evaluate all."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
@@ -154,13 +154,13 @@ def replay(
     directory: options.DirectoryArgument,
     case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
     out: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder of the products; by default DIR/cases/CASE.")
+        Path | None, Option(metavar="DIR", help="Folder of images and results; by default DIR/cases/CASE.")
     ] = None,
     save_stages: Annotated[
         bool, Option("--save-stages", help="Also write the result of each processing stage to stages/.")
     ] = False,
 ) -> None:
-    """Rerun one case, write and plot its intermediate results, and compare its results with the stored ones."""
+    """Run one case again, write and plot its intermediate results, and compare its results with the stored ones."""
     from marsyard.campaigns.running.replay import replay as rerun_case
     from marsyard.campaigns.store.products import (
         case_directory,

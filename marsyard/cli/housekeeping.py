@@ -24,7 +24,7 @@ KIND_WITH_LIMIT = "terrain"
 @handle_user_errors
 def clean(
     kinds: Annotated[
-        list[str] | None, Argument(metavar="[KIND]...", help="terrain, kernels; by default all of them.")
+        list[str] | None, Argument(metavar="KIND", help="Kind of cache: terrain or kernels; by default both.")
     ] = None,
     yes: Annotated[bool, Option("--yes", help="Remove the files; by default they are only listed.")] = False,
     as_json: JsonOption = False,

@@ -31,7 +31,10 @@ CampaignArgument = Annotated[
     str, Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
 ]
 SiteArgument = Annotated[
-    str, Argument(metavar="SITE", help="A site from `marsyard terrain list`, or a DTM: .tif or .npz.")
+    str,
+    Argument(
+        metavar="SITE", help="A site from `marsyard terrain list`, or a digital terrain model (DTM): .tif or .npz."
+    ),
 ]
 MaxHolesOption = Annotated[
     float | None,
@@ -39,11 +42,15 @@ MaxHolesOption = Annotated[
         metavar="F",
         min=0.0,
         max=0.99,
-        help="Accept a DTM with up to this fraction of missing elevations, which are filled. [default: 0.2]",
+        help="Accept a DTM with up to this fraction of missing elevations, which are filled; by default 0.05.",
     ),
 ]
-CasesOption = Annotated[int | None, Option("-n", "--cases", metavar="N", help="Number of cases.")]
-SeedOption = Annotated[int | None, Option(metavar="S", help="Root seed of the random draws.")]
+CasesOption = Annotated[
+    int | None, Option("-n", "--cases", metavar="N", help="Number of cases; by default that of the campaign.")
+]
+SeedOption = Annotated[
+    int | None, Option(metavar="S", help="Root seed of the random draws; by default that of the campaign.")
+]
 #: Default record of confirmations.
 CONFIRMATIONS = Path("confirmations.jsonl")
 ConfirmationsOption = Annotated[

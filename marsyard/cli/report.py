@@ -28,21 +28,20 @@ LOOPBACK_ADDRESS = "127.0.0.1"
 def report(
     directory: DirectoryArgument,
     requirements: Annotated[
-        Path | None, Option(metavar="FILE", help="Evaluate against the requirements in FILE instead.")
+        Path | None, Option(metavar="FILE", help="Requirements file to use instead of those of the campaign.")
     ] = None,
     pdf: Annotated[bool, Option("--pdf", help="Also print the report to report.pdf (requires Chromium).")] = False,
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
     gallery: Annotated[
         bool,
         Option(
-            "--gallery",
-            help="First rerun the cases with the largest errors, some without answer and some random, to store images.",
+            "--gallery", help="First run some cases again to store their images: largest errors, no answer, and random."
         ),
     ] = False,
 ) -> None:
-    """Evaluate a campaign from its stored results, complete or not, and write its report.
+    """Evaluate the stored results of a campaign, and write its report; an interrupted campaign is also accepted.
 
-    Cases are rerun for --gallery only.
+    No case is run, except for --gallery.
     """
     from marsyard.campaigns.definition.requirements import read_requirements, select_applicable
     from marsyard.campaigns.errors import CampaignError
@@ -67,7 +66,8 @@ def report(
 
 @handle_user_errors
 def confirmations(
-    file: Annotated[Path, Argument(metavar="[FILE]", help="The record.")] = CONFIRMATIONS, as_json: JsonOption = False
+    file: Annotated[Path, Argument(metavar="FILE", help="Record of the confirmations.")] = CONFIRMATIONS,
+    as_json: JsonOption = False,
 ) -> None:
     """List confirmations: evaluations of frozen algorithms on unseen seeds (`run --confirm`), with their results."""
     from marsyard.campaigns.errors import CampaignError
@@ -163,8 +163,12 @@ def dashboard(
 
 @handle_user_errors
 def nightly(
-    plan: Annotated[Path | None, Argument(metavar="[PLAN.toml]", help="The plan; by default the built-in one.")] = None,
-    out: Annotated[Path, Option(metavar="DIR", help="Folder of history, runs, page and dashboard.")] = Path("nightly"),
+    plan: Annotated[
+        Path | None, Argument(metavar="PLAN.toml", help="Plan of campaigns; by default the built-in plan.")
+    ] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of history, runs, nightly.md and dashboard.")] = Path(
+        "nightly"
+    ),
     jobs: JobsOption = None,
 ) -> None:
     """Run the planned campaigns, compare each metric with previous nightly runs, write nightly.md and the dashboard.

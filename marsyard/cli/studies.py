@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from marsyard.campaigns.studies.rare import RareResult
     from marsyard.campaigns.studies.search import SearchResult
 
-MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Limit on all cases of the study.")]
+MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class StudyOptions:
 
     campaign: options.CampaignArgument
     requirement: Annotated[
-        str, Option(metavar="ID", help="Requirement of the campaign; the study analyses its metric and bound.")
+        str, Option(metavar="ID", help="Requirement of the campaign whose metric and bound the study analyses.")
     ]
     seed: options.SeedOption = None
     jobs: options.JobsOption = None
@@ -84,7 +84,7 @@ class RareOptions(StudyOptions):
 @options.handle_user_errors
 @options.with_options(RareOptions)
 def rare(arguments: RareOptions) -> None:
-    """Estimate the probability of a rare violation of a requirement by subset simulation, and compare with a limit.
+    """Estimate the probability of a rare violation of a requirement by subset simulation, and compare it with a limit.
 
     Exit status: 0 if the probability is below the limit, 1 if above, 3 if undecided.
     """

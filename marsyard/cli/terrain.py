@@ -224,7 +224,8 @@ class RenderOptions:
         Option(metavar="SCALE", help="Terrain resolution: descent or ground; by default that of the camera."),
     ] = None
     altitude: Annotated[
-        float | None, Option(metavar="M", help="Camera height above the ground; by default typical for the camera.")
+        float | None,
+        Option(metavar="M", help="Camera height above the ground; by default a typical height for the camera."),
     ] = None
     east: Annotated[
         float | None, Option(metavar="M", help="East coordinate of the camera; by default 0, or the DTM centre.")
@@ -236,7 +237,9 @@ class RenderOptions:
     elevation: Annotated[float | None, Option(metavar="DEG", help="Elevation of the optical axis; -90: down.")] = None
     sun_azimuth: Annotated[float, Option(metavar="DEG", help="Sun azimuth, clockwise from north.")] = 250.0
     sun_elevation: Annotated[float, Option(metavar="DEG", help="Sun elevation above the horizon.")] = 35.0
-    detector: Annotated[bool, Option("--detector/--radiance", help="Detector counts, or radiance factor.")] = True
+    detector: Annotated[
+        bool, Option("--detector/--radiance", help="Write detector counts, or the radiance factor (I/F).")
+    ] = True
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain and the noise.")] = 1
     bits_per_pixel: BitsOption = None
     overwrite: OverwriteOption = False
@@ -245,7 +248,7 @@ class RenderOptions:
 
 @with_options(RenderOptions)
 def render(arguments: RenderOptions) -> None:
-    """Render a site or DTM. Writes PREFIX.png (16 bits), .npz (ground truth), .cahvor (camera) and .json.
+    """Render an image of a site or DTM. Writes PREFIX.png (16 bits), .npz (ground truth), .cahvor (camera) and .json.
 
     A stereo camera adds -left and -right to PREFIX.
     """
