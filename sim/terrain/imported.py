@@ -52,7 +52,11 @@ class RealTerrain(Parameters):
 
 @dataclass(frozen=True)
 class Raster:
-    """A grid of values, row 0 in the south, NaN where missing; cell (0, 0) is centred at `west_m`, `south_m`."""
+    """A grid of values, row 0 in the south, NaN where missing.
+
+    - posting_m: distance between the grid points (posts)
+    - west_m, south_m: position of post (0, 0)
+    """
 
     values: Grid
     posting_m: float
