@@ -134,7 +134,7 @@ class Odometer:
     def step(
         self, estimate: PoseEstimate, drive: Drive, rng: np.random.Generator, visual: bool = False
     ) -> PoseEstimate:
-        """Update the estimate after a drive. Random numbers are drawn for visual odometry even if it is not used."""
+        """Update the estimate after a drive; `visual`: use visual odometry. Both modes draw the same random numbers."""
         p = self.parameters
         wheel_noise, heading_noise, tilt_noise, visual_noise = np.split(rng.standard_normal(8), [2, 3, 5])
         has_failed = bool(rng.random() < p.visual.failure_fraction)

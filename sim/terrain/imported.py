@@ -292,7 +292,7 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     return samples, raster.posting_m
 
 
-#: Detail of height and of the logarithm of albedo below a DTM's posting.
+#: Height (m) and logarithm of albedo of the synthetic detail that is finer than a DTM, in the area of the DTM.
 Detail = tuple[GridPatch, GridPatch]
 
 

@@ -148,6 +148,7 @@ def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wr
         tracks = errors[case].copy()
         tracks[rng.integers(2), rng.integers(tracks_per_pair)] += wrong_by * np.array([np.cos(angle), np.sin(angle)])
         truth, change = rng.uniform(-20.0, 20.0, 2), rng.normal(0.0, 1.0, 2)
+        # both IMU velocities have an error of (7, -4) m/s
         inertial = np.zeros((2, 3))
         inertial[:, :2] = truth + np.array([[7.0, -4.0]]) + np.array([[0.0, 0.0], change])
         answer = combine_tracks(list(truth + tracks[0]), list(truth + change + tracks[1]), inertial)

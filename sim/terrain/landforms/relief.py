@@ -91,7 +91,7 @@ class Dunes(Parameters):
 
 
 class Lava(Parameters):
-    """Thin lava flows as at Pisgah (Wood & Kienle 1990; field test paper, III.A): rough over a few metres, else smooth.
+    """Thin lava flows as at Pisgah (Wood & Kienle 1990; field test paper, III.A), rough at scales of a few metres.
 
     Lobes of 1-3 m thickness overlap. Patches of a'a lava have blocks and pinnacles of a few metres.
     """
@@ -134,11 +134,13 @@ class Lava(Parameters):
         """Add noise with the wavelength of the blocks, in patches where a smooth random field exceeds a threshold."""
         blocks = ground.coarser(self.aa_block_m / 2.0)
         patches = np.zeros((blocks.side, blocks.side), dtype=np.float32)
+        # three random fields with decreasing size of the patches and decreasing strength
         for scale, strength in ((1.0, 1.0), (0.35, 0.45), (0.12, 0.2)):
             length = scale * self.lobe_length_m
             field = draw_smooth_fields(ground.period_m, length, length, 0.0, rng)[..., 0]
             patches += np.float32(strength) * resample(field, blocks.side)
         threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_fraction))
+        # the coverage rises from 0 to 1 around the threshold, over 1/6 of the field's unit
         coverage = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
         relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * coverage
         relief *= rng.standard_normal(relief.shape, dtype=np.float32)
