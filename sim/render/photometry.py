@@ -64,7 +64,7 @@ class DustySky:
             )
 
     def coefficients(self, sun_z: float, sky_fraction: float) -> tuple[float, float, float, float]:
-        """Coefficients of `sky_brightness`: uniform radiance; factor, depth and asymmetry of single scattering."""
+        """Coefficients of `sky_brightness` (kernel): uniform radiance; factor, depth, asymmetry of scattered light."""
         depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
         scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
         without_peak = 1.0 - self.asymmetry**2
@@ -107,13 +107,16 @@ class Photometry:
         return 1.0 / _spherical_albedo(self.lunar_fraction, self.surge_amplitude, self.surge_width)
 
     def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
-        """Coefficients of the reflectance kernel (`marsyard.sim.render.kernels.structs.Light`)."""
+        """Coefficients of the reflectance kernel (`marsyard.sim.render.kernels.structs.Light`).
+
+        `caster_diameter_m` is the diameter of a round body at the camera that casts a shadow; 0 for none.
+        """
         ground_light = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_fraction)
         law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation())
         return np.array([*law, self.sky_fraction, ground_light, caster_diameter_m, sun.angular_radius_rad])
 
     def sky_coefficients(self, sun: Sun) -> Float64[np.ndarray, "4"]:
-        """Coefficients of the sky kernel."""
+        """Coefficients of the kernel `sky_brightness`."""
         if self.sky is None:
             return np.array([self.sky_radiance, 0.0, 0.0, 0.0])
         return np.array(self.sky.coefficients(float(sun.direction[2]), self.sky_fraction))
@@ -189,8 +192,8 @@ class CloudParameters(Parameters):
         """Irradiance scattered down by the clouds, divided by that of direct sunlight on a plane facing the sun.
 
         The transmittance of a cloud without absorption is ``2 / (2 + (1 - g) tau)`` (two-stream approximation; Bohren,
-        Am. J. Phys. 55, 1987). The part `direct_transmittance` is not scattered. The scattered light is assumed uniform
-        over the ground, because the height of the clouds is similar to their distances.
+        Am. J. Phys. 55, 1987). It includes the unscattered `direct_transmittance`. The scattered light is assumed to be
+        uniform over the ground, because the height of the clouds is similar to their distances.
         """
         transmittance = 2.0 / (2.0 + (1.0 - self.asymmetry) * self.optical_depth)
         scattered = max(transmittance - self.direct_transmittance(sun), 0.0)
@@ -215,7 +218,7 @@ class CloudLayer:
 
     @classmethod
     def draw(cls, parameters: CloudParameters, rng: np.random.Generator, *, ground_m: float = 0.0) -> CloudLayer:
-        """Generate a random layer above ground of this mean height.
+        """Generate a random layer at `base_m` above ground with the mean height `ground_m`.
 
         Clouds are the regions where a Gaussian random field with three octaves exceeds a threshold; the threshold is
         set by `cover`. The number of clouds per metre along a line is ``sqrt(m2) exp(-u**2 / 2) / 2 pi`` (Rice 1944)

@@ -18,8 +18,9 @@ from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
 from marsyard.sim.render.scene import Cone
 
-#: Sizes of the pinhole views, samples along a side. A camera uses the first that exceeds the part of its image in a
-#: view by at least `_SPARE_PX`, otherwise the last (about the camera's resolution for 1024 x 1024 pixels and 45 deg).
+#: Sizes of the pinhole views, samples along a side. A camera uses the smallest view that is at least `_SPARE_PX` larger
+#: than its image (or than the quarter of its image that the view covers), otherwise the largest view. For 1024 x 1024
+#: pixels and 45 deg the largest view has about the resolution of the camera.
 VIEW_SIDES_PX = (208, 288, 352, 544, 1088)
 VIEW_SIDE_PX = VIEW_SIDES_PX[-1]
 _SPARE_PX = 16
@@ -125,7 +126,7 @@ class PixelRays:
 def _divide_field_of_view(
     directions: Float64[np.ndarray, "rows columns 3"],
 ) -> tuple[list[tuple[slice, slice]], list[Float64[np.ndarray, "3 3"]]]:
-    """Divide an image into quarters until each part fits in a view; return the parts and the axes of their views."""
+    """Divide an image into quarters until each fits in a view; return rows and columns, and view axes, of each part."""
     parts: list[tuple[slice, slice]] = []
     axes: list[Float64[np.ndarray, "3 3"]] = []
     pending = [(slice(0, directions.shape[0]), slice(0, directions.shape[1]))]

@@ -41,8 +41,8 @@ from marsyard.sim.terrain import Surface
 if TYPE_CHECKING:
     import trimesh
 
-#: Number of terrain levels in a kernel call: kernels are compiled for a fixed number of arrays. A terrain with 2**15
-#: samples along a side has 12 levels.
+#: Number of terrain levels (resolutions) in a kernel call: kernels are compiled for a fixed number of arrays. A terrain
+#: with 2**15 samples along a side has 12 levels.
 LEVELS = 12
 #: Infinite height bound, which disables block skipping where it does not save time.
 NO_CEILING = np.full((1, 1), np.inf, dtype=np.float32)
@@ -138,6 +138,7 @@ class Renderer:
         columns, rows = rays.size
         highest_ray = np.arcsin(np.clip((pose.rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
         is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
+        # height bounds save time only for rays almost parallel to the ground
         ground = ground_struct(scene.surface, scene.extent_m, ceilings=is_grazing)
         hits, light, tree = _empty_hits(rows * columns, scene), scene.light(time_s), scene.objects.hierarchy
 
@@ -172,6 +173,7 @@ class Renderer:
         return self._views[side_px]
 
     def _draw_views(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
+        """Draw the pinhole views by OpenGL; `clearance_m` is the height of the camera above the ground."""
         if self._last_scene is not scene:
             self._last_scene = scene
             self._scene_count += 1
@@ -215,6 +217,7 @@ class Renderer:
 
 
 def _empty_hits(count: int, scene: Scene) -> Hits:
+    """Allocate the intersections of `count` rays; without objects there are no weights of triangle corners."""
     weights = np.empty((count if len(scene.objects) > 0 else 0, 2), np.float32)
     return Hits(np.empty(count), np.empty(count, np.int32), weights, np.empty(count, np.int8))
 
@@ -224,6 +227,7 @@ def _slice_arrays(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[A
 
 
 def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, light: Light) -> ShadedImage:
+    """Compute radiance, body and normal at the intersections, in threads."""
     count = len(rays.directions)
     image = ShadedImage(np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.float32))
     occluders, materials = scene.occluders, scene.materials

@@ -30,20 +30,20 @@ NO_CLOUDS = (no_cover(), np.zeros(5))
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
 #: Centre and radius of a bounding sphere of each body, metres.
 Spheres = Float64[np.ndarray, "bodies 4"]
-#: Largest number of cells along a side of a footprint.
+#: Maximum number of cells along a side of a shadow footprint (`shadow_footprint`).
 MAX_CELLS = 512
-#: Region for objects that may shade all ground.
+#: Shadow footprint of objects that may shade all ground.
 ALL_GROUND = Footprint(np.ones((1, 1), dtype=np.bool_), 0.0, 0.0, 0.0)
 #: Maximum number of samples along a side of the grid on which the ground's shadow is computed.
 SHADOW_SIDE = 4096
-#: Result for ground without shadow.
+#: Result of `ground_shadow` for ground without shadow.
 NO_SHADOW = GroundShadow(
     np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8), False, 1.0, 0, 1.0, 1.0, 0.0
 )
 #: Number of directions along the rim of a cone whose convex hull bounds the ground in the cone, and the fraction by
 #: which the hull is enlarged.
 _RIM_DIRECTIONS, _MARGIN = 64, 0.01
-#: Additional samples at each border of a part of the grid, for interpolation and rounding.
+#: Additional samples at each border of a grid that covers only the visible ground, for interpolation and rounding.
 _BORDER_SAMPLES = 4
 
 
@@ -216,7 +216,7 @@ def shadow_footprint(spheres: Spheres, sun: Float64[np.ndarray, "3"], min_height
 
 
 def casters_towards(objects: Objects, sun: Sun) -> Casters:
-    """List the triangles of objects in grids perpendicular to the direction of the sun."""
+    """List the triangles that can cast shadows, in grids perpendicular to the direction of the sun."""
     direction = np.asarray(sun.direction, dtype=np.float64)
     first_axis = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
     first_axis /= np.linalg.norm(first_axis)
@@ -279,6 +279,7 @@ def ground_shadow(
     along, across = (east, north) if along_x else (north, east)
     if along == 0.0:
         return NO_SHADOW
+    # from one row to the next towards the sun, a ray rises by `drop` metres and moves by `shift` columns
     drop, shift = spacing * up / abs(along), across / abs(along)
     rows = columns = np.arange(len(field))
     max_rows = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(field)))

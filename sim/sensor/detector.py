@@ -3,6 +3,8 @@
 Companding compresses counts to 8-bit codes with steps that grow with the square root of the count, as shot noise does:
 ``code = round(a (sqrt(count + b) - sqrt(b)))`` with ``a = 2 sqrt(b)``, so that the smallest step is one count. b is
 chosen such that full scale has code 255. A code is expanded to the centre of its range of counts.
+
+Physical pixels are those of the detector. A delivered row is the sum of `rows_summed` physical rows.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from marsyard.sim.sensor.optics import (
 CODES = 256  #: Number of 8-bit codes.
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]
 Counts = UInt16[np.ndarray, "rows columns"]
+#: Counts of an image after the summation of rows.
 Delivered = UInt16[np.ndarray, "delivered_rows columns"]
 
 
@@ -43,7 +46,8 @@ class DefectParameters(Parameters):
     listed: Annotated[bool, Field(description="bad pixels are listed and interpolated")] = False
 
 
-#: Amplitude of an interference burst (a third of the image's signal) and its length (two delivered rows).
+#: Bursts in scenarios that set only their number: RMS noise, counts (a third of the image's signal), and mean length,
+#: delivered pixels (two rows).
 BURST_DN, BURST_PX = 300.0, 2048.0
 
 
@@ -121,7 +125,7 @@ class DetectorParameters(Parameters):
 
     @property
     def dark_growth(self) -> float:
-        """Dark current at the detector's temperature / dark current at 0 deg C."""
+        """Dark current at the detector's temperature, divided by that at 0 deg C."""
         return float(2.0 ** (self.temperature_c / self.dark_doubling_c))
 
 
@@ -197,9 +201,9 @@ class Detector:
     def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:
         """Return the part of the detector that a subframe reads: upper left pixel and size (columns, rows).
 
-        The pixel responses are those of the full detector. The smear includes only the rows of the subframe: the
-        smear of the rows above, about ``row * transfer_row_s / exposure_s`` of their mean radiance, is missing. The
-        smear of the rows below, with `clear_row_s`, is also missing. The result is exact for a detector without smear,
+        The pixel responses are those of the full detector. The smear of rows outside the subframe is missing: for the
+        rows above, about ``row * transfer_row_s / exposure_s`` of their mean radiance; for the rows below, the same
+        with their number and `clear_row_s`. The result is exact for a detector without smear,
         such as the XC-55. If smear is relevant, expose the full image and crop it. Raises ValueError if the subframe is
         empty, extends beyond the detector or splits summed rows.
         """

@@ -2,7 +2,7 @@
 
 `InertialSolution` propagates attitude and velocity from the increments of an inertial unit. `Approach` propagates only
 the errors of a nominal flight: from the last attitude measurement by stars (the star reference) through spinning
-cruise, entry and parachute phase to the start of the descent. The steps resolve the spin:
+cruise, entry and parachute phase to the start of the descent. The time steps resolve the spin. The errors obey:
 
     d(attitude)/dt = R (bias + sensitivity error x body rate) + noise
     d(velocity)/dt = attitude x (R f) + R (bias + sensitivity error x f) + noise
@@ -160,7 +160,7 @@ class Approach:
         return replace(imu, gyro=replace(imu.gyro, scale=scale))
 
     def errors(self, imu: Imu, rng: np.random.Generator) -> NavigationErrors:
-        """Propagate the navigation errors to the start of the descent; the unit's time span must include the flight."""
+        """Propagate the errors to the start of the descent; the time span of `imu` must include the flight."""
         p = self.parameters
         count = int(np.ceil(p.duration_s * STEPS_PER_S))
         step = p.duration_s / count
@@ -214,6 +214,7 @@ class Approach:
         return np.asarray(self._spin_rate() * (np.minimum(times_s, self._deploy_s()) - self.start_s))
 
     def _pitch_axis(self) -> Vector:
+        """Return the horizontal unit vector, world axes, about which the body pitches."""
         # a rotation about this axis tilts nadir towards the heading a; axis = (0, 0, -1) x (sin a, cos a, 0)
         heading = np.radians(self.parameters.heading_deg)
         return np.array([np.cos(heading), -np.sin(heading), 0.0])

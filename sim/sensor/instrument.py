@@ -1,4 +1,4 @@
-"""Common parts of instruments: sampling times, time tags, readings and time-correlated errors."""
+"""Components that instruments share: sampling times, time tags, readings and time-correlated errors."""
 
 from __future__ import annotations
 

@@ -178,6 +178,7 @@ def mount_on_head(
     """Mount two cameras that look along -z on a head, as a forward-looking stereo pair with toe-in."""
 
     def mount(camera: CameraModel, side: float) -> CameraModel:
+        """Mount one camera; `side` is 1 for the left and -1 for the right camera."""
         toe_in = Rotation.from_rotvec([0.0, 0.0, -side * np.radians(toe_in_deg)])
         return camera.transform(rigid(toe_in * _HEAD_FROM_DOWN, np.array([0.0, 0.5 * side * baseline_m, 0.0])))
 

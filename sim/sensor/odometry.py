@@ -1,11 +1,12 @@
 """Pose estimation of a rover: wheel odometry with an inertial unit, and optionally visual odometry.
 
-Attitude (Ali et al. 2005, as on MER). Accelerometers measure the tilt at each stop, gyros the heading along a drive:
+Attitude (Ali et al. 2005, for MER). Accelerometers measure the tilt at each stop, gyros the heading along a drive:
 ``R_estimated = Rz(heading error) A R_true B N``. B is a misalignment of the accelerometers, constant in a run. The
 rotation A makes the estimate exact at the start, so that B has an effect only when the rover turns or tilts. N is the
-noise of a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
+noise at a stop. The heading error is the sum of a fraction of the turns, a drift along the path and a random walk.
 
-Position from wheel odometry. Each part of a drive adds the commanded path in estimated axes. Slip is not measured:
+Position from wheel odometry. Each segment of a drive (`Drive.parts`) adds the commanded path in estimated axes. Slip
+is not measured:
 ``dp = R_estimated ((1 + scale) path_commanded + noise)``.
 
 Position from visual odometry (paper, section 4.2: "roughly 2% of the rover travel distance"). Each drive adds the true
@@ -133,7 +134,7 @@ class Odometer:
     def step(
         self, estimate: PoseEstimate, drive: Drive, rng: np.random.Generator, visual: bool = False
     ) -> PoseEstimate:
-        """Update the estimate after a drive. Random numbers are drawn for visual odometry even if it is not used."""
+        """Update the estimate after a drive; `visual`: use visual odometry. Both modes draw the same random numbers."""
         p = self.parameters
         wheel_noise, heading_noise, tilt_noise, visual_noise = np.split(rng.standard_normal(8), [2, 3, 5])
         has_failed = bool(rng.random() < p.visual.failure_fraction)

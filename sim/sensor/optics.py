@@ -54,7 +54,7 @@ DENSITY_SLOPE_PER_100_NM = -0.085
 #: Assumed: quantum efficiency of a front-illuminated silicon CCD.
 _QE_NM = np.arange(400.0, 1101.0, 50.0)
 _QE = np.array([15.0, 22.0, 28.0, 33.0, 38.0, 42.0, 43.0, 40.0, 34.0, 27.0, 19.0, 11.0, 5.0, 2.0, 0.0]) / 100.0
-#: Default exposure: at the radiance factor 0.3 a pixel collects 60 % of the full well.
+#: Exposure of cameras without a given exposure time: at the radiance factor 0.3 a pixel collects 60 % of the full well.
 BRIGHT_RADIANCE_FACTOR, BRIGHT_FILL = 0.3, 0.6
 KERNEL_HALF_SIZE_PX = 6  #: Half size of the point spread kernel, pixels.
 Image = Float32[np.ndarray, "rows columns"]
@@ -95,7 +95,7 @@ class LightPath:
         return area * self.transmission * flux / (4.0 * self.f_number**2)
 
     def diffraction_px(self) -> float:
-        """Compute the mean wavelength of the detected photons times f-number, divided by the pixel pitch."""
+        """Compute the diffraction scale in pixels: mean wavelength of detected photons x f-number / pixel pitch."""
         wavelength_nm, electrons = self._filtered_electrons()
         return 1e-3 * float(np.average(wavelength_nm, weights=electrons)) * self.f_number / self.pixel_pitch_um
 

@@ -106,6 +106,7 @@ def _create_mer_preset(design: CameraDesign, light: LightPath, sun_au: float, **
     return Preset(design, light, DetectorParameters.model_validate(settings | changes))
 
 
+#: MER descent camera: focal length 14.67 mm, pixel pitch 12 um.
 _DESCENT = CameraDesign(14.67, 12.0, (1024, 1024), NAVCAM_RADIAL, down=True)
 _FLIGHT_EXPOSURE_S = 0.004
 _DESCENT_BAND, _ROVER_BAND = (400.0, 1100.0), (600.0, 800.0)  #: Passbands (Maki et al. 2003), nm.
@@ -125,14 +126,14 @@ def _create_mer_descent_field() -> Preset:
 
 
 def _create_mer_rover(design: CameraDesign, f_number: float) -> Preset:
-    """Create a rover camera; rows are not summed, the temperature is assumed."""
+    """Create an MER rover camera with a full well of 170000 e; rows are not summed, the temperature is assumed."""
     light = LightPath(f_number, design.pixel_pitch_um, _ROVER_BAND)
     exposure = bright_exposure_s(170000.0, light.responsivity_e_s(MARS_AU))
     return _create_mer_preset(design, light, MARS_AU, exposure_s=exposure, temperature_c=-40.0, rows_summed=1)
 
 
 def _create_interline_preset(design: CameraDesign, full_well_e: float, bits: int) -> Preset:
-    """Create an interline CCD without smear, on Earth at +20 deg C. Assumed: f/4, passband, noise."""
+    """Create an interline CCD without smear, on Earth at +20 deg C, 15 images/s. Assumed: f/4, passband, noise."""
     light = LightPath(4.0, design.pixel_pitch_um, (400.0, 700.0))
     responsivity = light.responsivity_e_s(1.0)
     detector = DetectorParameters(
@@ -320,6 +321,7 @@ DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_resolve_detector
 
 
 Vector = tuple[float, float, float]
+#: Keys of a custom camera that is read from a file.
 _FILE_KEYS = ("file", "number", "subframe_folded_in", "size")
 
 
@@ -373,7 +375,7 @@ class CustomCamera(Parameters):
 
     @classmethod
     def from_camera(cls, camera: CameraModel, **origin: Any) -> CustomCamera:
-        """Create the parameters from a camera with any pose; the camera is mounted to look down."""
+        """Create the parameters from a camera with any pose, mounted to look down; `origin`: fields of the file."""
         model = mount_looking_down(camera)
         length = float(np.linalg.norm(model.a))  # A in PDS labels is rounded and not exactly a unit vector
         vectors: dict[str, Any] = {

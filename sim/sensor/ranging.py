@@ -28,9 +28,9 @@ DOWN = np.array([0.0, 0.0, -1.0])
 MIN_POINTS = 64  #: Minimum number of points along a laser ray that are compared with the ground.
 #: Radar: step of the coarsest grid / height, ratio of successive steps, and number of grids.
 COARSEST_STEP, REFINEMENT, GRIDS = 1.0 / 64.0, 5, 3
-#: Ground around a node is nearer than the node by at most (this value + slope at the node) x step.
+#: Assumed: ground around a node is nearer than the node by at most (this value + slope at the node) x step.
 RELIEF_PER_STEP = 0.2
-MAX_SLOPE = 3.0  #: Maximum slope of the ground in the radar's search.
+MAX_SLOPE = 3.0  #: Assumed maximum slope of the ground (rise / run) in the radar's search.
 
 _Fraction = Annotated[float, Field(ge=0.0, le=0.2)]
 _Metres = Annotated[float, Field(ge=0.0, le=100.0)]

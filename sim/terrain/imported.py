@@ -52,7 +52,11 @@ class RealTerrain(Parameters):
 
 @dataclass(frozen=True)
 class Raster:
-    """A grid of values, row 0 in the south, NaN where missing; cell (0, 0) is centred at `west_m`, `south_m`."""
+    """A grid of values, row 0 in the south, NaN where missing.
+
+    - posting_m: distance between the grid points (posts)
+    - west_m, south_m: position of post (0, 0)
+    """
 
     values: Grid
     posting_m: float
@@ -288,7 +292,7 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
     return samples, raster.posting_m
 
 
-#: Detail of height and of the logarithm of albedo below a DTM's posting.
+#: Height (m) and logarithm of albedo of the synthetic detail that is finer than a DTM, in the area of the DTM.
 Detail = tuple[GridPatch, GridPatch]
 
 

@@ -10,7 +10,7 @@ from scipy.special import gamma, kv
 
 #: Frequency of the coarsest octave divided by the Nyquist frequency of the samples; size of the finest cells, metres.
 _FIRST_FREQUENCY, FINEST_M = 1.0, 0.001
-#: Median frequency of the noise power, cycles per lattice cell; mean square of the noise.
+#: Properties of the noise kernel: median frequency of its power, cycles per lattice cell, and its mean square.
 WAVES_PER_CELL, NOISE_VARIANCE = 0.61, 0.0464
 
 

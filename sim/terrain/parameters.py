@@ -1,4 +1,4 @@
-"""Parameters of a terrain."""
+"""Parameters of a synthetic terrain, and the order in which its landforms are added."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ CAMERA = Cahvor.from_cahv(
 )
 ROWS_SUMMED = 4
 FULL_SCALE = 4095
-INTERVAL_S = 3.75
+INTERVAL_S = 3.75  #: Time between images, s.
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,7 @@ def compute_binned_fall_off() -> np.ndarray:
 
 
 def make_calibration(transfer_row_s: float = 5e-6, clear_row_s: float = 2e-6) -> DetectorCalibration:
+    """Create the calibration of the MER descent camera with these times per row of transfer and clearing."""
     return DetectorCalibration(
         flat_field=compute_binned_fall_off(),
         exposure_s=0.004,
@@ -155,7 +156,7 @@ def tilt_body(tilt_deg: float, azimuth_deg: float, roll_deg: float) -> Rotation:
 def draw_flight(rng: np.random.Generator, max_tilt_deg: float = 25.0, max_wind: float = 30.0) -> Flight:
     """Draw random rolls, tilts within 5 deg of a random mean tilt, and a wind that changes between the intervals.
 
-    - max_wind: maximum horizontal velocity, m/s
+    - max_wind: maximum horizontal velocity, m/s; the lander drifts with the wind
     """
     wind = max_wind * np.sqrt(rng.uniform()) * np.array([*_draw_unit_vector(rng), 0.0])
     wind_change = np.array([*rng.normal(0.0, 1.0, 2), 0.0])

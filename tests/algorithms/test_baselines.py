@@ -26,11 +26,12 @@ from tests.algorithms.synthetic_descent import (
 )
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
+#: Run a test for the baselines, or for the baselines and DIMES.
 with_baselines = pytest.mark.parametrize("name", ESTIMATORS)
 with_all_estimators = pytest.mark.parametrize(
     "estimator", [*ESTIMATORS.values(), DimesEstimator()], ids=[*ESTIMATORS, "dimes"]
 )
-#: Attitudes at the three images.
+#: Attitudes at the three images: slightly tilted, with different rolls.
 ATTITUDES = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
 
 
@@ -58,6 +59,7 @@ def test_velocity_of_exact_measurements_is_accurate(name: str) -> None:
         for estimate, flight in zip(estimates, flights, strict=True)
         if estimate.velocity_m_s is not None
     ]
+    # an estimator may refuse one of the five descents
     assert len(errors) >= 4
     assert max(errors) < 0.5
 

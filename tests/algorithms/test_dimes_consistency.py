@@ -1,4 +1,4 @@
-"""Tests of the IMU consistency check over combinations of tracks, and of its threshold."""
+"""Tests of the IMU consistency check of DIMES over combinations of tracks, and of the validity checks of tracks."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, make_calibration, valid_velocity
 
 THRESHOLD = DimesOptions().imu_threshold_m_s
+#: Metrics of a track that passes all validity checks.
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)
 
 
 def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[ValidityCheck, ...] = ()) -> Track:
+    """Create a track of which only number of pair and template, velocity and failed checks are used."""
     blank = np.zeros((3, 3))
     return Track(
         pair, index, *(np.zeros(2),) * 3, blank, blank, np.ones(2), blank, METRICS, failures, np.asarray(velocity)
@@ -40,6 +42,7 @@ def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[Vali
 
 @cache
 def make_nadir_view() -> View:
+    """Create a black view from 2 km."""
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), make_calibration())
     return build_view(image, Rotation.identity(), 2000.0, (256, 256))
 
@@ -53,6 +56,7 @@ def make_pair(*tracks: Track) -> PairDetails:
 def combine_tracks(
     first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray
 ) -> VelocityEstimate:
+    """Combine valid tracks with these velocities in the first and the second pair, for these IMU velocities."""
     pairs = [
         make_pair(*(make_track(pair, index, velocity) for index, velocity in enumerate(velocities)))
         for pair, velocities in enumerate((first, second))
@@ -144,6 +148,7 @@ def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wr
         tracks = errors[case].copy()
         tracks[rng.integers(2), rng.integers(tracks_per_pair)] += wrong_by * np.array([np.cos(angle), np.sin(angle)])
         truth, change = rng.uniform(-20.0, 20.0, 2), rng.normal(0.0, 1.0, 2)
+        # both IMU velocities have an error of (7, -4) m/s
         inertial = np.zeros((2, 3))
         inertial[:, :2] = truth + np.array([[7.0, -4.0]]) + np.array([[0.0, 0.0], change])
         answer = combine_tracks(list(truth + tracks[0]), list(truth + change + tracks[1]), inertial)

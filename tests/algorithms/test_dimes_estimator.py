@@ -32,6 +32,7 @@ from tests.algorithms.synthetic_descent import (
     valid_velocity,
 )
 
+#: DIMES with all improvements to the published algorithm.
 ESTIMATOR: VelocityEstimator = DimesEstimator(DimesOptions(**IMPROVEMENTS))
 
 
@@ -70,6 +71,7 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
     )
     assert compute_rms(errors) < 0.05
     errors_of_tracks = compute_track_errors(flights, estimates)
+    # at least 90 % of the tracks, two templates in each of two pairs, are valid
     assert len(errors_of_tracks) >= 0.9 * 4 * len(flights)
     assert compute_rms(errors_of_tracks) < 0.05
     assert np.linalg.norm(errors_of_tracks, axis=1).max() < 0.15
@@ -195,6 +197,7 @@ ChangeCounts = Callable[[int, np.ndarray], np.ndarray]
 
 
 def _change_counts(inputs: DescentMeasurements, change: ChangeCounts) -> DescentMeasurements:
+    """Replace the counts of each image by `change(number of the image, counts)`."""
     images = (replace(image, counts=change(number, image.counts.copy())) for number, image in enumerate(inputs.images))
     return replace(inputs, images=tuple(images))
 
@@ -291,9 +294,9 @@ def test_velocity_is_correct_with_one_corrupted_template_per_pair() -> None:
 
 
 def test_opposition_surge_does_not_bias_velocity() -> None:
-    """An opposition surge moves with the lander.
+    """An opposition surge, a bright spot around the anti-solar point, moves over the ground with the lander.
 
-    It is a Gaussian with an amplitude of 30 % and a standard deviation of 3 deg around the anti-solar point.
+    It is a Gaussian with an amplitude of 30 % and a standard deviation of 3 deg.
     """
     sun = direction(np.radians(250.0), np.radians(75.0))
     attitudes = (tilt_body(5.0, 0.0, 40.0), tilt_body(8.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))

@@ -51,7 +51,8 @@ from tests.algorithms.synthetic_descent import (
 
 OPTIONS = DimesOptions()
 MAX_OFF_NADIR_RAD = OPTIONS.max_off_nadir_rad
-SUN_BELOW_HORIZON = direction(0.0, -1.0)  # no zero-phase spot on the ground
+#: Without sunlight there is no zero-phase spot (opposition surge) on the ground.
+SUN_BELOW_HORIZON = direction(0.0, -1.0)
 
 
 def make_view(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None) -> View:
@@ -65,10 +66,12 @@ def make_view(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts
 def make_views(
     first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)
 ) -> tuple[View, View]:
+    """Create two views with these attitudes; the default altitudes differ by 75 m/s in 3.75 s."""
     return make_view(first, altitudes[0]), make_view(second, altitudes[1], INTERVAL_S)
 
 
 def find_candidates(first: View, second: View, sun: np.ndarray = SUN_BELOW_HORIZON) -> Candidates:
+    """Find the template candidates of a pair."""
     return template_candidates(first, second, search_geometry(first, second, OPTIONS), sun, OPTIONS)
 
 
@@ -139,7 +142,8 @@ def test_candidates_lie_within_the_overlap_polygon() -> None:
     positions = find_candidates(first, second).pixels
     assert len(positions) > 20
     border_distances = [cv2.pointPolygonTest(polygon, (float(u), float(v)), True) for u, v in positions]
-    assert min(border_distances) > 0.5 * OPTIONS.template_px * 0.7  # half the window width in the first image
+    # half a template; in the first image it is smaller, by the ratio of the altitudes (0.86) and by the tilt
+    assert min(border_distances) > 0.5 * OPTIONS.template_px * 0.7
 
 
 def test_each_candidate_fits_template_and_window() -> None:

@@ -1,4 +1,4 @@
-"""Tests of the Monte Carlo derivation of the IMU check's threshold, and of its stored record."""
+"""Tests of the Monte Carlo derivation of the threshold of DIMES' IMU check, and of its stored result."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from benchmarks.threshold_derivation import (
 )
 from marsyard.algorithms.dimes.options import DimesOptions
 
+#: Stored result of the derivation: inputs, threshold and quantiles.
 STORED = json.loads(dimes_threshold.STORED.read_text())
 #: Inputs without measurement errors.
 EXACT = ThresholdInputs(
@@ -33,6 +34,7 @@ EXACT = ThresholdInputs(
 
 
 def draw_errors(inputs: ThresholdInputs, seed: int = 1) -> np.ndarray:
+    """Draw velocity errors of correct tracks, m/s, shape (descents, pair, template, 2)."""
     return draw_correct_track_errors(inputs, np.random.default_rng(seed))
 
 

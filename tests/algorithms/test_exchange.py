@@ -51,6 +51,7 @@ def write_program(folder: Path, body: str) -> str:
 
 
 def run_program(spec: str, measurements: DescentMeasurements, **limits: float) -> VelocityEstimate:
+    """Estimate the velocity with a program; limits: those of `ExecutableLimits`."""
     command = parse_command(spec)
     assert command is not None
     return ExecutableVelocityEstimator(command, ExecutableLimits(**{"time_s": 60.0, **limits})).estimate(measurements)
@@ -100,7 +101,7 @@ def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path
     names = sorted(path.name for path in tmp_path.iterdir())
     cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.pgm" for k in (1, 2, 3)]
     assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
-    # Each number in the files is a measurement or an index; the true velocity is absent.
+    # Each number in the files is a measurement, or an index or size; the true velocity is absent.
     case = json.loads((tmp_path / "case.json").read_text())
     numbers = np.array(list(_iterate_numbers(case)))
     inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
@@ -139,6 +140,7 @@ def test_other_format_version_is_rejected(measurements: DescentMeasurements, tmp
         read_case(tmp_path)
 
 
+#: Python expression of a valid answer in JSON.
 ANSWER = (
     'json.dumps({"exchange": 1, "outcome": "VALID", "velocity_m_s": [1.5, -2], "covariance_m2_s2": [[1, 0], [0, 4]]})'
 )
@@ -180,6 +182,7 @@ def test_program_answer_and_stderr_are_stored(measurements: DescentMeasurements,
 def test_program_errors_are_reported_as_faults(
     measurements: DescentMeasurements, tmp_path: Path, body: str, fault: Fault, message: str
 ) -> None:
+    # the program writes "!" to stderr before the error
     spec = f"exec:{write_program(tmp_path, 'print(chr(33), file=sys.stderr, flush=True)' + chr(10) + body)}"
     start_s = time.monotonic()
     times_out = fault is Fault.TIMED_OUT
@@ -195,6 +198,7 @@ def test_program_errors_are_reported_as_faults(
     assert time.monotonic() - start_s < 59.0  # the test does not wait for child processes
 
 
+#: A persistent program that answers its first two cases with the number of the case as velocity, and then aborts.
 SERVER = f"""
 print(json.dumps({{"exchange": 1, "ready": True}}), flush=True)
 for number, line in enumerate(sys.stdin):
@@ -230,6 +234,7 @@ for number, line in enumerate(sys.stdin):
 
 
 def format_double_answers(version: int, pause_s: float = 0.05) -> str:
+    """Fill in `DOUBLE_ANSWERS` for a version of the exchange format; version 1 has no request ids."""
     identity = '"id": request["id"], ' if version > 1 else ""
     text = DOUBLE_ANSWERS.replace("{version}", str(version)).replace("{identity}", identity)
     return text.replace("{pause_s}", str(pause_s))

@@ -70,12 +70,14 @@ def make_tracker(spec: str, time_s: float = 60.0) -> ExecutableTargetTracker:
 
 
 def write_server(folder: Path, text: str = SERVER) -> str:
+    """Write a Python program and return its command line."""
     path = folder / "tracker.py"
     path.write_text(text)
     return f"{sys.executable} {path}"
 
 
 def get_process_id(update: TargetUpdate) -> int:
+    """Return the process id that `SERVER` wrote to stderr during an update."""
     assert isinstance(update.details, ProgramDetails)
     return int(update.details.stderr)
 
@@ -142,6 +144,7 @@ def test_example_tracks_the_target() -> None:
         assert np.abs(update.position_rover - true_position)[1:].max() < 0.05
 
 
+#: Start of a program: imports, and the line that reports that it is ready.
 READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
 #: A program that prints fixed answers without evaluating the requests.
 ANSWERING_PROGRAM = (

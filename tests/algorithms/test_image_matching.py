@@ -9,6 +9,7 @@ from scipy import ndimage
 from marsyard.algorithms.image.correlation import coarse_to_fine_peak, halve, normalized_correlation
 from marsyard.algorithms.image.registration import Warp, register_template, similarity_patch
 
+#: Deformation models of the registration, each with more parameters than the one before.
 WARPS: tuple[Warp, ...] = ("shift", "stretch", "bend")
 
 
@@ -94,6 +95,7 @@ def render_blobs(seed: int, points: np.ndarray, width: float = 2.0) -> np.ndarra
 
 
 def pixel_grid(size: int) -> np.ndarray:
+    """Return the coordinates (u, v) of all pixels of a square image, shape (size, size, 2)."""
     return np.stack(np.meshgrid(np.arange(float(size)), np.arange(float(size))), axis=-1)
 
 

@@ -170,6 +170,7 @@ def test_biquadratic_offset_is_zero_without_maximum() -> None:
 
 
 def make_gaussian(row: float, column: float, widths: tuple[float, float] = (1.5, 1.5)) -> np.ndarray:
+    """Create a correlation surface with one Gaussian peak; widths: standard deviations along rows and columns."""
     y, x = np.mgrid[:41, :41]
     return np.asarray(np.exp(-((y - row) ** 2) / (2 * widths[0] ** 2) - (x - column) ** 2 / (2 * widths[1] ** 2)))
 

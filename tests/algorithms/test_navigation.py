@@ -1,4 +1,4 @@
-"""Tests of the path planner: navigation to a goal around hazards and over mapped ground."""
+"""Tests of the rover's path planner: navigation to a goal around hazards and over mapped ground."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand
 
 OPTIONS = NavigationOptions()
-SPACING_M = 0.05
+SPACING_M = 0.05  #: Spacing of the simulated stereo points.
 
 
 def _make_pose(east: float, north: float, yaw_deg: float = 0.0) -> RigidTransform:
+    """Create a pose on level ground; yaw is counter-clockwise from east."""
     return rigid(Rotation.from_euler("Z", yaw_deg, degrees=True), np.array([east, north, 0.0]))
 
 
@@ -30,6 +31,7 @@ def _sample_ground(rocks: tuple[tuple[float, float, float, float], ...] = (), sl
 
 
 def _map_ground(*rocks: tuple[float, float, float, float], slope_deg: float = 0.0) -> TerrainMap:
+    """Map the ground of `_sample_ground` within 9 m of the origin."""
     return TerrainMap.empty(np.zeros(2)).add_points(_sample_ground(rocks, slope_deg))
 
 
@@ -98,7 +100,7 @@ def test_hazard_is_passed_with_clearance(offset_m: float, yaw_deg: float) -> Non
     positions = _drive_to_goal(_map_ground((*rock, 0.25, 0.4)), _make_pose(0.0, 0.0, yaw_deg), goal, 0.5)
     assert positions[-1] == pytest.approx(goal, abs=0.02)
     min_distance_m = np.hypot(*(positions - rock).T).min()
-    # Cells of the rock extend beyond its outline by at most half the diagonal of a cell.
+    # the radius of the rock is 0.25 m
     assert min_distance_m > OPTIONS.half_width_m + 0.25
     assert np.hypot(*np.diff(positions, axis=0).T).sum() < 1.25 * 7.0
 

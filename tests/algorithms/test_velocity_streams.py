@@ -34,10 +34,12 @@ from marsyard.sim.sensor import InertialSolution
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NO_VELOCITY = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+#: Start of a program: imports, and the line that reports that it is ready.
 READY = "import json, os, sys, time\nprint(json.dumps({'exchange': 1, 'ready': True}), flush=True)\n"
 
 
 def make_estimate(*span_s: float) -> VelocityEstimate:
+    """Create a valid estimate for the time span (first, last), or without a span."""
     span = (span_s[0], span_s[1]) if span_s else None
     return VelocityEstimate(VelocityOutcome.VALID, np.array([1.0, 2.0]), span_s=span)
 
@@ -111,6 +113,7 @@ class RecordingInertialStream(RecordingStream):
 
 
 def record_events(measurements: DescentMeasurements) -> list[object]:
+    """Return the measurements in the order in which a stream with inertial data receives them."""
     stream = RecordingInertialStream()
     StreamedEstimator(stream).estimate(measurements)
     assert (stream.calls[0], stream.calls[-1]) == ("start", "finish")
@@ -137,9 +140,9 @@ def test_increments_and_altitudes_arrive_in_the_order_of_their_tags() -> None:
         *("image", "altitude", "image", "image", "altitude", "image", "image")
     ]
     assert [kinds[type(event)] for event in events[::2]] == ["increments"] * 7
-    # increments of all parts, up to the last image: 1 s before the first image, and 7.5 s between the images
-    parts = [event for event in events if isinstance(event, ImuIncrements)]
-    angles = np.concatenate([part.delta_angles_rad for part in parts])
+    # increments at 100 Hz up to the last image: 1 s before the first image, and 7.5 s between the images
+    blocks = [event for event in events if isinstance(event, ImuIncrements)]
+    angles = np.concatenate([block.delta_angles_rad for block in blocks])
     assert len(angles) == 850
     np.testing.assert_array_equal(angles, increments.delta_angles_rad[:850])
     # a stream without the optional methods receives the images only
@@ -153,10 +156,10 @@ def test_increments_before_an_image_end_at_the_next_boundary() -> None:
     measurements = inputs.inertial_descent(5)
     images = tuple(replace(image, time_s=image.time_s + 0.003) for image in measurements.images)
     events = record_events(replace(measurements, images=images, altitudes=measurements.altitudes[:1] * 5))
-    for part, frame in zip(events[2::2], events[3::2], strict=True):
-        assert isinstance(part, ImuIncrements)
+    for block, frame in zip(events[2::2], events[3::2], strict=True):
+        assert isinstance(block, ImuIncrements)
         assert isinstance(frame, DescentFrame)
-        assert part.times_s[-1] - 0.01 < frame.image.time_s <= part.times_s[-1]
+        assert block.times_s[-1] - 0.01 < frame.image.time_s <= block.times_s[-1]
     late = replace(images[-1], time_s=images[-1].time_s + 1.0)
     with pytest.raises(ValueError, match=r"time tag 108\.503000 s is outside of the increments; allowed: 99\.0"):
         record_events(replace(measurements, images=(*images[:-1], late)))
@@ -280,6 +283,7 @@ def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -
 
 
 def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
+    """Create the estimator of a streaming program with a time limit per answer."""
     command = parse_command(spec)
     assert command is not None
     assert command.stream
@@ -335,6 +339,7 @@ def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pyt
     end_idle_programs()
 
 
+#: A program that writes the names of its requests to stderr; `START` is added to its answer to start.
 RECORDING_PROGRAM = """
 import json, sys
 print(json.dumps({"exchange": 2, "ready": True}), flush=True)
@@ -368,6 +373,7 @@ def format_server(answers: list[str]) -> str:
     return f"{READY}for answer in {answers}:\n    sys.stdin.readline()\n    print(answer, flush=True)\n"
 
 
+#: Answer to an image, before the first velocity.
 NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
 
 

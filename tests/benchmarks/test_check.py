@@ -1,4 +1,4 @@
-"""Tests of the detection of slower hot paths (`benchmarks.check`) with random ratios: false alarms and detections."""
+"""Tests of the nightly check for slower code (`benchmarks.check`) with random time ratios: false alarms, detections."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.check import PAIRS, compare, log_ratios, select_slower
 
+#: Names of the timed functions (hot paths).
 HOT_PATHS = ("one", "two", "three", "four", "five", "six")
 
 
@@ -28,6 +29,7 @@ def test_unchanged_hot_paths_raise_few_alarms(sd: float) -> None:
 
 @pytest.mark.slow
 def test_accepted_growth_raises_few_alarms() -> None:
+    """A growth of 10 % is below the accepted 15 %; more than 6 alarms in 200 have a probability below 1 %."""
     rng = np.random.default_rng(2)
     alarms = sum(bool(select_slower(compare(draw_ratios(rng, 0.05, 1.1), draw_ratios(rng, 0.05)))) for _ in range(200))
     assert alarms <= 6
@@ -37,6 +39,7 @@ def test_accepted_growth_raises_few_alarms() -> None:
 def test_slower_hot_path_is_detected(sd: float, factor: float) -> None:
     rng = np.random.default_rng(3)
     detections = 0
+    # only the hot path "three" is slower
     for _ in range(100):
         ratios = draw_ratios(rng, sd) | {"three": draw_ratios(rng, sd, factor)["three"]}
         slower = select_slower(compare(ratios, draw_ratios(rng, sd)))

@@ -1,4 +1,4 @@
-"""Tests that validation checks fail for lost cases and a wrong threshold, and that their limits are not too wide."""
+"""Tests of the validation checks: they fail for lost cases and a wrong threshold, and their limits are not too wide."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ REASONS_FOR_WIDE_LIMITS = {
 
 
 def read_measures() -> list[Measure]:
+    """Read the stored measured values and limits of all checks."""
     checks = json.loads(RESULTS.read_text())["checks"]
     return [Measure(**row) for check in checks.values() for row in check["measures"]]
 
@@ -91,6 +92,7 @@ def test_limits_are_close_to_the_measured_values() -> None:
 
 def test_unmet_requirements_keep_their_original_limit() -> None:
     rows = {row.claim: row for row in read_measures()}
+    # the nightly check must detect 95 % of the regressions; this rate has no unit
     limit_by_unit = {"deg": landing_checks.ROTATION_LIMIT_DEG, "": 0.95}
     for claim_start in ("rotation error with the paper's features", "nights that detect a regression"):
         claim_rows = [row for claim, row in rows.items() if claim.startswith(claim_start)]
@@ -105,6 +107,7 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
         return 0.5 * draw_correct_track_errors(inputs, rng)
 
     monkeypatch.setattr(dimes_checks, "draw_correct_track_errors", halve_errors, raising=False)
+    # half of the threshold of 4.5 m/s, rounded up to 0.1 m/s
     options = dimes_checks.DimesOptions(imu_threshold_m_s=2.3)
     monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: options)
     claims = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))

@@ -19,11 +19,13 @@ class PageLog:
     messages: list[str] = field(default_factory=list)
 
 
+#: Function of a path, and optionally window width and colour scheme (`open_page`).
 OpenPage = Callable[..., tuple[Page, PageLog]]
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
+    """Start Chromium once for all tests."""
     path = next((executable for name in ("chromium", "chromium-browser") if (executable := shutil.which(name))), None)
     assert path is not None, "these tests need Debian's Chromium: apt-get install chromium"
     with sync_playwright() as playwright:

@@ -15,6 +15,7 @@ from playwright.sync_api import Page
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
 
+#: Fixture `open_page` of conftest: it opens a file and returns the page and its log.
 OpenPage = Callable[..., tuple[Page, Any]]
 #: Rule sets of axe-core for WCAG 2.2, levels A and AA.
 LEVELS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22a", "wcag22aa"]

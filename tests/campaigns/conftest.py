@@ -19,6 +19,7 @@ def campaign_file(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def watch() -> RecordingWatch:
+    """Return a progress watch that records stages, steps and notes of a run without printing."""
     return RecordingWatch()
 
 

@@ -31,8 +31,8 @@ TAG, DELIVERY, GPS_POSITION, GPS_VELOCITY, GPS_WANDER, GPS_NOISE, FIXED = 0, 1, 
 UP, YAW = 1, 4
 #: Types of innovations.
 POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
-#: Memory between runs: whether the last receiver solution was fixed (-1: no solution yet), filtered acceleration in
-#: world axes, and number of consecutive rejected solutions.
+#: First indices in the filter's memory between runs, and its size: whether the last receiver solution was fixed (-1: no
+#: solution yet), filtered acceleration in world axes, and number of consecutive rejected solutions.
 LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
 INNOVATION = 5  #: Number of columns of an innovation: time, type, axis, normalised innovation, whether it was used.
 
@@ -109,6 +109,7 @@ def write_rotation_matrix(q: Array, matrix: Array) -> None:
 
 @njit(cache=True)
 def _quaternion_from_vector(v: Array) -> tuple[float, float, float, float]:
+    """Convert a rotation vector to a quaternion (x, y, z, w)."""
     angle = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
     scale = 0.5 - angle * angle / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
     return scale * v[0], scale * v[1], scale * v[2], math.cos(0.5 * angle)
@@ -116,6 +117,7 @@ def _quaternion_from_vector(v: Array) -> tuple[float, float, float, float]:
 
 @njit(cache=True)
 def _multiply(a: tuple[float, float, float, float], b: tuple[float, float, float, float], out: Array) -> None:
+    """Write the normalised product of two quaternions (x, y, z, w)."""
     out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
     out[1] = a[3] * b[1] + a[1] * b[3] + a[2] * b[0] - a[0] * b[2]
     out[2] = a[3] * b[2] + a[2] * b[3] + a[0] * b[1] - a[1] * b[0]
@@ -151,7 +153,8 @@ def apply_transition(
 ) -> None:
     """Multiply error vectors (the columns of `errors`) by the transition matrix of a step, in place.
 
-    `matrix` rotates from body to world; `cross` is minus the cross-product matrix of the velocity change.
+    `matrix` rotates from body to world; `cross` is minus the cross-product matrix of the velocity change. `decay` and
+    `velocity_decay` are the factors of the receiver's position and velocity wander over the step.
     """
     velocity, rotation = np.empty(3), np.empty(3)
     for j in range(ERRORS):
@@ -283,7 +286,10 @@ def update_fix(row: Array, estimate: Estimate, change: Array, time: float, tunin
 def update_tilt(
     row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
 ) -> None:
-    """Update with the x and y components of the inclinometers' up direction; write two innovations."""
+    """Update with the x and y components of the inclinometers' up direction; write two innovations.
+
+    `disturbance_rad` is the standard deviation of the tilt error that accelerations cause.
+    """
     h, matrix = np.empty(ERRORS), np.empty((3, 3))
     for i in range(2):
         write_rotation_matrix(estimate.state[QUATERNION:], matrix)
@@ -298,7 +304,7 @@ def update_tilt(
 def update_heading(
     row: Array, estimate: Estimate, disturbance_rad: float, time: float, tuning: Tuning, log: Array
 ) -> None:
-    """Update with the yaw of the compass; write one innovation."""
+    """Update with the yaw of the compass; write one innovation. `disturbance_rad`: see `update_tilt`."""
     h, matrix = np.zeros(ERRORS), np.empty((3, 3))
     write_rotation_matrix(estimate.state[QUATERNION:], matrix)
     horizontal = matrix[0, 0] ** 2 + matrix[1, 0] ** 2

@@ -41,7 +41,7 @@ class Ground:
     def coarser(self, feature_m: float) -> Ground:
         """Return an empty grid of the same extent with a spacing of at most `feature_m`, but not finer than this grid.
 
-        A landform without detail finer than `feature_m` is computed faster on this grid. `add` then adds it.
+        A landform without detail finer than `feature_m` is computed faster on this grid, and then added by `add`.
         """
         side = self.side
         while side > SMALLEST_SIDE and self.period_m / (side // 2) <= feature_m:
@@ -49,9 +49,9 @@ class Ground:
         height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
         return Ground(height, log_albedo, self.period_m / side)
 
-    def add(self, part: Ground, *, include_albedo: bool = True) -> None:
-        """Add a part computed on a coarser grid. The refinement of a B-spline and therefore the sum are exact."""
-        for total, grid in ((self.height, part.height), (self.log_albedo, part.log_albedo))[: 1 + include_albedo]:
+    def add(self, layer: Ground, *, include_albedo: bool = True) -> None:
+        """Add height and albedo of a coarser grid (`coarser`); the refinement of a B-spline is exact."""
+        for total, grid in ((self.height, layer.height), (self.log_albedo, layer.log_albedo))[: 1 + include_albedo]:
             if grid.shape == total.shape:
                 total += grid
             else:
@@ -113,7 +113,7 @@ def substream(rng: Generator, name: str) -> Generator:
 class Spectrum:
     """Power-law spectrum on a periodic grid, for random fields.
 
-    - amplitude: modes of the half spectrum
+    - amplitude: amplitude of each Fourier mode of the half spectrum (as in `numpy.fft.rfft2`)
     - column_power: sum of the squared modes along y for each wavenumber along x, including conjugate modes
     """
 
@@ -162,7 +162,7 @@ class Spectrum:
     def draw_split_field(
         self, rng: Generator, scale: float, wavelength_m: float
     ) -> tuple[Float32[np.ndarray, "samples samples"], Float32[np.ndarray, "samples samples"]]:
-        """Draw the field of `draw_field` as the sum of a coarse and a fine part, separated at a wavelength."""
+        """Draw the field of `draw_field` as the sum of a coarse and a fine field, separated at a wavelength."""
         modes = self._draw_modes(rng)
         coarse = self._transform(
             modes * _compute_low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m), scale

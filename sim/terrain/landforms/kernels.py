@@ -99,6 +99,7 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
                 r = d / (radius * (1.0 + lobes))
                 if r >= max_r:
                     continue
+                # inside the bowl the blanket's r**-3 is limited
                 outside = max(r, 0.6)
                 fade = min((max_r - r) / (max_r - 1.0), 1.0)
                 notched_rim = rim * max(1.0 + RIM_HEIGHT_SENSITIVITY * lobes, 0.0)
@@ -305,7 +306,10 @@ def add_cracks(
 ) -> None:
     """Add polygonal cracks along the borders of Voronoi cells, with one point in each square of a periodic grid.
 
-    `points` has shape (count, count, 2): the position of each point within its square, from 0 to 1.
+    - points: position of each point within its square, from 0 to 1, shape (count, count, 2)
+    - cell: side of a square, metres
+    - width, depth: half width over which a crack fades, and depth at its middle, metres
+    - contrast: change of the logarithm of albedo at the middle of a crack
     """
     count = points.shape[0]
     # positions of the points, with a margin of one square for the periodic border

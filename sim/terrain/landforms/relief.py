@@ -83,15 +83,15 @@ class Dunes(Parameters):
         modulation = np.ascontiguousarray(modulation[::step, ::step])
         max_slope = float(np.tan(np.radians(self.repose_deg)))
         slip_face_m = self.height_m / max_slope
-        part = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
+        layer = ground.coarser(min(slip_face_m / SAMPLES_ON_SLIP_FACE, ground.period_m / modulation.shape[0]))
         kx, ky = (float(wavenumber) for wavenumber in wave_vector)
         bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast)
-        add_dunes(part.height, part.log_albedo, part.spacing_m, modulation, bedforms)
-        ground.add(part)
+        add_dunes(layer.height, layer.log_albedo, layer.spacing_m, modulation, bedforms)
+        ground.add(layer)
 
 
 class Lava(Parameters):
-    """Thin lava flows as at Pisgah (Wood & Kienle 1990; field test paper, III.A): rough over a few metres, else smooth.
+    """Thin lava flows as at Pisgah (Wood & Kienle 1990; field test paper, III.A), rough at scales of a few metres.
 
     Lobes of 1-3 m thickness overlap. Patches of a'a lava have blocks and pinnacles of a few metres.
     """
@@ -109,7 +109,7 @@ class Lava(Parameters):
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the flows, then the blocks."""
-        part = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
+        layer = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
         scale_m = self.lobe_length_m / 12.0
         warp = np.float32(CRENULATION) * draw_smooth_fields(ground.period_m, scale_m, scale_m, 0.0, rng)
         # log-normal lengths: the mean square is the square of the median times exp(2 SD**2)
@@ -125,20 +125,22 @@ class Lava(Parameters):
         log_albedo = self.lobe_contrast * rng.standard_normal(count)
         outline = (half_length, half_width, thickness, np.cos(heading), np.sin(heading), log_albedo)
         lobes = np.column_stack([position, *outline])
-        warp_x, warp_y = (resample(warp[..., axis], part.side) for axis in (0, 1))
-        stamp_lobes(part.height, part.log_albedo, part.spacing_m, lobes, warp_x, warp_y)
-        ground.add(part)
+        warp_x, warp_y = (resample(warp[..., axis], layer.side) for axis in (0, 1))
+        stamp_lobes(layer.height, layer.log_albedo, layer.spacing_m, lobes, warp_x, warp_y)
+        ground.add(layer)
         self._add_blocks(ground, rng)
 
     def _add_blocks(self, ground: Ground, rng: Generator) -> None:
         """Add noise with the wavelength of the blocks, in patches where a smooth random field exceeds a threshold."""
         blocks = ground.coarser(self.aa_block_m / 2.0)
         patches = np.zeros((blocks.side, blocks.side), dtype=np.float32)
+        # three random fields with decreasing size of the patches and decreasing strength
         for scale, strength in ((1.0, 1.0), (0.35, 0.45), (0.12, 0.2)):
             length = scale * self.lobe_length_m
             field = draw_smooth_fields(ground.period_m, length, length, 0.0, rng)[..., 0]
             patches += np.float32(strength) * resample(field, blocks.side)
         threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_fraction))
+        # the coverage rises from 0 to 1 around the threshold, over 1/6 of the field's unit
         coverage = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
         relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * coverage
         relief *= rng.standard_normal(relief.shape, dtype=np.float32)
@@ -156,17 +158,17 @@ class Swell(Parameters):
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Add the swell."""
-        part = ground.coarser(ground.period_m / 64.0)
-        phase = 2.0 * np.pi * np.arange(part.side) / part.side
-        field = np.zeros((part.side, part.side))
+        layer = ground.coarser(ground.period_m / 64.0)
+        phase = 2.0 * np.pi * np.arange(layer.side) / layer.side
+        field = np.zeros((layer.side, layer.side))
         for m, n in product(range(self.waves + 1), range(-self.waves, self.waves + 1)):
             if (m, n) > (0, 0):
                 strength = rng.uniform(0.7, 1.0) / (m * m + n * n) ** 1.25
                 shift = rng.uniform(0.0, 2.0 * np.pi)
                 field += strength * np.cos(m * phase[None, :] + n * phase[:, None] + shift)
         field *= self.relief_m / np.ptp(field)
-        part.height[...] = field
-        ground.add(part, include_albedo=False)
+        layer.height[...] = field
+        ground.add(layer, include_albedo=False)
 
 
 class Ramp(Parameters):
@@ -247,7 +249,7 @@ def draw_channels(
     Gauss-Markov process. Its correlation length is eight widths, its RMS about four times `wander` (radians): each step
     adds noise with the standard deviation `wander`. Both ends of a channel are narrow and shallow.
     """
-    parts = [np.empty((0, 4))]
+    channels = [np.empty((0, 4))]
     for origin, mean_heading, length_m, width_m, depth_m in zip(start, heading, length, width, depth, strict=True):
         step = 0.25 * width_m
         count = max(int(length_m / step), 2)
@@ -258,8 +260,8 @@ def draw_channels(
         fraction = (np.arange(count) + 0.5) / count
         taper = np.sqrt(np.minimum(1.0, 8.0 * fraction) * np.minimum(1.0, 5.0 * (1.0 - fraction)))
         position = origin + np.cumsum(steps, axis=0)
-        parts.append(np.column_stack([position, 0.5 * width_m * np.maximum(taper, 0.3), depth_m * taper]))
-    return np.concatenate(parts)
+        channels.append(np.column_stack([position, 0.5 * width_m * np.maximum(taper, 0.3), depth_m * taper]))
+    return np.concatenate(channels)
 
 
 class Gullies(Parameters):
@@ -275,8 +277,8 @@ class Gullies(Parameters):
 
     def apply(self, ground: Ground, rng: Generator) -> None:
         """Cut the gullies."""
-        # until the channels are complete, the albedo grid of `part` contains their depth
-        part = ground.coarser(self.width_m / 12.0)
+        # until the channels are complete, the albedo grid of `layer` contains their depth
+        layer = ground.coarser(self.width_m / 12.0)
         count = int(rng.poisson(self.per_km2 * (ground.period_m / 1000.0) ** 2))
         heading = np.radians(90.0 - self.downhill_deg) + 0.3 * rng.standard_normal(count)
         width = self.width_m * np.exp(0.3 * rng.standard_normal(count))
@@ -286,7 +288,7 @@ class Gullies(Parameters):
         depth = width * self._compute_depth(1.0)
         trunks = draw_channels(start, heading, length, width, depth, 0.15, rng)
         # the profile depth (1 - (r / w)**1.5) has its maximum slope at the rim: 1.5 depth / w
-        cut_channels(part.log_albedo, part.spacing_m, trunks, 1.5)
+        cut_channels(layer.log_albedo, layer.spacing_m, trunks, 1.5)
         if self.tributaries and trunks.size:
             mouths = rng.integers(0, trunks.shape[0], count * self.tributaries)
             heading = np.radians(90.0 - self.downhill_deg) + np.pi + rng.choice([-0.7, 0.7], mouths.size)
@@ -294,11 +296,11 @@ class Gullies(Parameters):
             length = 6.0 * width + 0.1 * self.length_m
             depth = width * self._compute_depth(1.0)
             branches = draw_channels(trunks[mouths, :2], heading, length, width, depth, 0.15, rng)
-            cut_channels(part.log_albedo, part.spacing_m, branches, 1.5)
-        part.height[...] = -part.log_albedo
-        part.log_albedo[...] *= np.float32(self.contrast / (0.5 * self._compute_depth(self.width_m)))
-        np.clip(part.log_albedo, -abs(self.contrast), abs(self.contrast), out=part.log_albedo)
-        ground.add(part)
+            cut_channels(layer.log_albedo, layer.spacing_m, branches, 1.5)
+        layer.height[...] = -layer.log_albedo
+        layer.log_albedo[...] *= np.float32(self.contrast / (0.5 * self._compute_depth(self.width_m)))
+        np.clip(layer.log_albedo, -abs(self.contrast), abs(self.contrast), out=layer.log_albedo)
+        ground.add(layer)
 
     def _compute_depth(self, width: float) -> float:
         """Compute the depth of a gully from its width and the slope of its walls, m."""
@@ -323,15 +325,15 @@ class Playa(Parameters):
 
     def compute_fissures(self, ground: Ground, rng: Generator) -> Ground:
         """Compute the fissures on a separate grid."""
-        part = ground.coarser(self.fissure_m)
+        layer = ground.coarser(self.fissure_m)
         for scale in (1.0, 0.4):
             cells = max(round(ground.period_m / (scale * self.polygon_m)), 3)
             points = rng.uniform(0.1, 0.9, (cells, cells, 2))
-            width = max(scale * self.fissure_m, part.spacing_m)
+            width = max(scale * self.fissure_m, layer.spacing_m)
             depth, contrast = scale * self.fissure_depth_m, scale * self.contrast
             cell_m = ground.period_m / cells
-            add_cracks(part.height, part.log_albedo, part.spacing_m, points, cell_m, width, depth, contrast)
-        return part
+            add_cracks(layer.height, layer.log_albedo, layer.spacing_m, points, cell_m, width, depth, contrast)
+        return layer
 
 
 class Fans(Parameters):
@@ -389,8 +391,8 @@ class Fans(Parameters):
 
     def _add_washes(self, ground: Ground, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
         """Cut the washes of all fans."""
-        # until the channels are complete, the albedo grid of `part` contains their depth
-        part = ground.coarser(self.wash_width_m / 3.0)
+        # until the channels are complete, the albedo grid of `layer` contains their depth
+        layer = ground.coarser(self.wash_width_m / 3.0)
         count = self.washes_per_fan
         for apex in apexes:
             # on both sides of the divide, within 30 deg of the steepest descent
@@ -401,8 +403,8 @@ class Fans(Parameters):
             start = apex[:2] + start_radius[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
             length = apex[2] * rng.uniform(0.9, 1.05, count) - start_radius
             discs = draw_channels(start, heading, np.maximum(length, width), width, depth, 0.06, rng)
-            cut_channels(part.log_albedo, part.spacing_m, discs, 2.0)
-        part.height[...] = -part.log_albedo
-        part.log_albedo[...] *= np.float32(self.wash_contrast / max(self.wash_depth_m, 1e-6))
-        np.clip(part.log_albedo, -0.5, 0.5, out=part.log_albedo)
-        ground.add(part)
+            cut_channels(layer.log_albedo, layer.spacing_m, discs, 2.0)
+        layer.height[...] = -layer.log_albedo
+        layer.log_albedo[...] *= np.float32(self.wash_contrast / max(self.wash_depth_m, 1e-6))
+        np.clip(layer.log_albedo, -0.5, 0.5, out=layer.log_albedo)
+        ground.add(layer)

@@ -29,7 +29,7 @@ _FIT_STEPS, _FIT_SIDE = 40, 128
 
 
 class SurfaceUnit(Parameters):
-    """One kind of ground. Factors are relative to the terrain's own values; a factor of 1 leaves them unchanged."""
+    """One type of ground. Factors are relative to the terrain's own values; a factor of 1 leaves them unchanged."""
 
     name: Annotated[str, Field(min_length=1, description="name of the unit")]
     fraction: Annotated[Fraction, Field(description="expected fraction of the terrain's area")]
@@ -93,7 +93,7 @@ class SurfaceUnits(Parameters):
         ground.add(Ground(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
         if len(craters):
-            # depth below the rim; a fresh crater has a depth of 0.4 radii
+            # columns of `stamp_craters`; depth below the rim, which is 0.4 radii for a fresh crater
             radius, depth, filled_fraction = craters[:, 2], craters[:, 3] + craters[:, 4], craters[:, 6]
             freshness = np.clip(depth / radius / 0.4, 0.0, 1.0)
             # assumed factors of roughness on the floor and on the ejecta

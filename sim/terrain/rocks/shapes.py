@@ -142,6 +142,7 @@ def _max_pixels_per_deviation() -> Float64[np.ndarray, "shapes levels"]:
 
 @cache
 def _icosphere(detail: int) -> tuple[Float64[np.ndarray, "n 3"], Int32[np.ndarray, "faces 3"]]:
+    """Return unit vectors to the vertices of a subdivided icosahedron, and its triangles."""
     import trimesh  # imported late, because the import is slow
 
     sphere = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS[detail])
@@ -217,6 +218,7 @@ class _RockShape:
 
     @classmethod
     def draw(cls, number: int) -> _RockShape:
+        """Draw the shape with this number from the root seed."""
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(_SEED, spawn_key=(number,))))
         form = list(FORMS.values())[number // SHAPES_OF_FORM]
         roundness = number % SHAPES_OF_FORM / (SHAPES_OF_FORM - 1)
@@ -264,7 +266,7 @@ class _RockShape:
             length = np.linalg.norm(points, axis=1)
             return np.asarray(length - self.radius(points / length[:, None]))
 
-        # the product `* axes / axes` does not move the points; it is part of the rounding of the stored normals
+        # `* axes / axes` does not move the points, but determines the last bit of the normals
         surface_points = directions * self.radius(directions)[:, None] * self.axes / self.axes
         step = 1e-4
         differences = [
@@ -320,6 +322,7 @@ def _dot_products(d: Points, vectors: Float64[np.ndarray, "m 3"]) -> Float64[np.
 
 @cache
 def _all_shapes() -> tuple[_RockShape, ...]:
+    """Draw all shapes in the order of their numbers."""
     return tuple(_RockShape.draw(number) for number in range(SHAPES))
 
 

@@ -17,6 +17,7 @@ from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration, DetectorImage, LandingMeasurements, PoseMeasurement
 
+#: Height of the ground, metres, at world positions x and y, metres.
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 TEXEL_M = 0.01  #: Size of a texture cell, metres.
@@ -60,6 +61,7 @@ def brightness(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def make_plane(slope_x: float = 0.0, slope_y: float = 0.0) -> Height:
+    """Create the height function of a plane through the origin."""
     return lambda x, y: slope_x * x + slope_y * y
 
 
@@ -114,7 +116,11 @@ def intersect_relief(height: Height, origin: np.ndarray, rays: np.ndarray) -> np
 
 @dataclass(frozen=True)
 class Pass:
-    """Two true poses of the body over a relief."""
+    """A pass of the lander over relief: true poses of the body at two images.
+
+    - height: height function of the ground
+    - columns: width of the images, pixels
+    """
 
     height: Height
     poses: tuple[RigidTransform, RigidTransform]
@@ -145,6 +151,7 @@ class Pass:
 
 
 def _camera_rotation(model: Cahvor) -> Rotation:
+    """Return the rotation from camera axes (x along columns, z along A) to world axes."""
     return Rotation.from_matrix(np.column_stack([model.right, np.cross(model.a, model.right), model.a]))
 
 
@@ -156,7 +163,7 @@ def make_pose(x: float, y: float, z: float, yaw: float = 0.0, pitch: float = 0.0
 def render_image(
     scene: Pass, index: int, noise: np.random.Generator | None = None, albedo: Callable[..., np.ndarray] = brightness
 ) -> DetectorImage:
-    """Render a 12-bit image: 1500 counts for brightness 1, with optional noise of 8 counts (1 sigma)."""
+    """Render image 0 or 1, 12 bits: 1500 counts for brightness 1, with optional noise of 8 counts (1 sigma)."""
     points = scene.ground(index, make_camera(scene.columns).pixel_grid())
     counts = 1500.0 * albedo(points[..., 0], points[..., 1])
     if noise is not None:

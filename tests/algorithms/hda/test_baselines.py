@@ -25,6 +25,7 @@ OPTIONS = HdaOptions(block_px=32, grid_px=8, align=True, refine_planes=True)
 
 
 def make_scene(second: tuple[float, ...] = (0.25, -0.65, 10.1, 23.0, 1.0, -1.5)) -> Pass:
+    """Create a pass at 10 m over a slope with two bumps; `second` contains the arguments of `make_pose`."""
     relief = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=make_plane(0.05, 0.02))
     return Pass(relief, (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(*second)))
 
@@ -58,7 +59,7 @@ def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> No
     tracks = track_features(landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, OPTIONS)
     motion = motion_from_tracks(landing_scene, tracks, OPTIONS)
     scene = make_scene()
-    # The baseline gets its true length.
+    # Scale the baseline, whose length is not determined by images, to its true length.
     motion = motion.scale(
         float(np.linalg.norm(scene.second_from_first.translation))
         / float(np.linalg.norm(motion.second_from_first.translation))

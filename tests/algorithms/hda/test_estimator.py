@@ -47,6 +47,7 @@ all_estimators = pytest.mark.parametrize("name", ESTIMATORS)
 
 
 def make_pass(base: tuple[float, float] = (0.03, 0.02), rocks: tuple[tuple[float, ...], ...] = BOULDERS) -> Pass:
+    """Create a pass at 10 m over boulders on a plane with the slopes `base` along x and y; the baseline is 0.76 m."""
     relief = make_bumps(*rocks, base=make_plane(*base))  # type: ignore[arg-type]
     return Pass(relief, (make_pose(0.0, 0.0, 10.0, 5.0, 1.0, -2.0), make_pose(0.1, -0.75, 10.1, 7.0, 2.0, -1.0)))
 
@@ -89,7 +90,7 @@ def get_site(estimate: SiteEstimate) -> np.ndarray:
 
 
 def compute_map_errors(scene: Pass, estimate: SiteEstimate) -> np.ndarray:
-    """Compute elevation errors at known cells, metres, with the exact pose of the first camera."""
+    """Compute errors of the map at cells with an elevation, metres, with the exact position of the first camera."""
     result = get_ground(estimate)
     cells = np.argwhere(~np.isnan(result.elevation.elevation_m))
     z = result.elevation.elevation_m[tuple(cells.T)]
@@ -243,13 +244,13 @@ def test_unrelated_second_image_has_no_tracks(name: str, seed: int | None, measu
 
 
 def test_zero_baseline_is_reported(measurements: LandingMeasurements) -> None:
-    static = replace(
+    static_measurements = replace(
         replace_image(measurements, 1, measurements.images[0].counts),
         poses=(measurements.poses[0], measurements.poses[0]),
     )
-    result = HdaEstimator(OPTIONS).estimate(static)
+    result = HdaEstimator(OPTIONS).estimate(static_measurements)
     assert result.outcome is SiteOutcome.NO_BASELINE
-    assert is_apriori_site(result, static)
+    assert is_apriori_site(result, static_measurements)
 
 
 def test_pure_rotation_is_reported() -> None:

@@ -29,6 +29,7 @@ OPTIONS = HdaOptions(
 
 
 def make_ground(rows: int = 80, columns: int = 100, slope_x: float = 0.0, slope_y: float = 0.0) -> ElevationMap:
+    """Create the elevation map of a plane."""
     empty = ElevationMap(np.zeros((rows, columns)), np.array([-2.0, 5.0]), CELL_M)
     x, y = np.moveaxis(empty.positions(np.moveaxis(np.indices((rows, columns)).astype(np.float64), 0, -1)), -1, 0)
     return replace(empty, elevation_m=slope_x * x + slope_y * y)
@@ -52,7 +53,7 @@ def test_plane_has_exact_slope_and_no_roughness(slopes: tuple[float, float], ref
 @pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.15, -0.1)])
 @pytest.mark.parametrize("height", [0.3, -0.3])
 def test_roughness_equals_boulder_height_on_a_slope(slopes: tuple[float, float], height: float) -> None:
-    # A radius of 2.5 cells covers 21 of the 100 cells of a footprint: no effect on the median.
+    # A radius of 2.5 cells covers 21 of the 100 cells of a footprint: no effect on a least-median plane.
     flat = make_ground(slope_x=slopes[0], slope_y=slopes[1])
     for row, column in ((40, 50), (45, 55), (12, 33)):
         maps = hazard_maps(add_bump(flat, row, column, 2.5, height), OPTIONS)
@@ -96,6 +97,7 @@ def test_robust_fit_has_least_median_of_tested_triples() -> None:
         if abs(np.linalg.det(design)) < 0.5:
             continue
         plane = np.linalg.solve(design, z[indices])
+        # The median of n values with three unknowns is the (n // 2 + 2)-th smallest (Rousseeuw & Leroy 1987).
         median = np.sort(np.abs(z - plane[0] - plane[1] * x - plane[2] * y))[25 // 2 + 1]
         if median < best:
             best, expected = median, plane
@@ -266,6 +268,7 @@ def test_out_of_range_options_are_reported() -> None:
 # ----- footprints -----
 
 
+#: Resolution of an exact map: matching windows without extent, and no noise.
 SHARP = Resolution(window_m=0.0, noise_m=0.0)
 
 

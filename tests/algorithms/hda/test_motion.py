@@ -13,29 +13,35 @@ from marsyard.algorithms.hda.motion import estimate_motion, plane_depths
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
 
-FOCAL_PX = 811.0
+FOCAL_PX = 811.0  #: XC-55: 6 mm / 7.4 um.
 OPTIONS = HdaOptions()
 NO_MOTION_START = rigid(Rotation.identity(), np.zeros(3))
 
 
 def make_tracks(rng: np.random.Generator, relief: float, tracks: int = 59) -> tuple[np.ndarray, np.ndarray]:
-    """Draw normalised image coordinates in the XC-55's field of view, and depths of about 10 m on a 6 deg slope."""
+    """Draw normalised image coordinates in the XC-55's field of view, and depths of about 10 m on a 6 deg slope.
+
+    `relief` is the standard deviation of a depth from the slope, as a fraction of the depth.
+    """
     points = rng.uniform([-0.39, -0.29], [0.39, 0.29], (tracks, 2))
     return points, 10.0 * (1.0 + 0.1 * points[:, 0]) * (1.0 + relief * rng.standard_normal(tracks))
 
 
 def draw_motion(rng: np.random.Generator, rotation_sd_rad: float = 0.05) -> RigidTransform:
+    """Draw a motion from the first to the second camera: mostly lateral, 0.5 m to 1.5 m, with a small rotation."""
     azimuth = rng.uniform(0.0, 2.0 * np.pi)
     translation = np.array([np.cos(azimuth), np.sin(azimuth), 0.3 * rng.standard_normal()])
     return rigid(Rotation.from_rotvec(rng.normal(0.0, rotation_sd_rad, 3)), rng.uniform(0.5, 1.5) * translation)
 
 
 def project_points(points: np.ndarray, depths: np.ndarray, true_motion: RigidTransform) -> np.ndarray:
+    """Compute the normalised coordinates in the second image, shape (n, 2)."""
     second = true_motion.apply(np.column_stack([points, np.ones(len(points))]) * depths[:, None])
     return second[:, :2] / second[:, 2:]
 
 
 def solve_motion(points: np.ndarray, second: np.ndarray, start: RigidTransform = NO_MOTION_START) -> Motion:
+    """Estimate the motion from tracks; the initial depths are 10 m."""
     return estimate_motion(points, second, FOCAL_PX, np.full(len(points), 10.0), (start,), OPTIONS)
 
 

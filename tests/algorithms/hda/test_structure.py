@@ -26,6 +26,7 @@ from marsyard.sim.frames import rigid
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make_pose, measure_pass
 
 OPTIONS = HdaOptions(block_px=32, grid_px=8, align=True, refine_planes=True)
+#: Slope with two bumps; the ground is 9 m to 11 m below the camera. Searches allow depths of 7 m to 13 m.
 RELIEF = make_bumps((1.2, 0.8, 0.4, 0.3), (-1.5, -1.0, 0.3, 0.2), base=make_plane(0.05, 0.02))
 
 
@@ -40,6 +41,7 @@ def landing_scene(scene: Pass) -> LandingScene:
 
 
 def true_depths(scene: Pass, pixels: np.ndarray) -> np.ndarray:
+    """Compute the depths of the ground at pixels of the first image, along its optical axis, metres."""
     first_camera = scene.camera(0)
     return np.asarray((scene.ground(0, pixels) - first_camera.c) @ first_camera.a)
 

@@ -133,6 +133,7 @@ def test_integer_shifts_within_the_window_are_recovered(shift: tuple[int, int]) 
 
 
 def make_pass(second: tuple[float, ...] = (0.2, -0.6, 10.05, 21.5, 0.5, -0.8)) -> Pass:
+    """Create a pass at 10 m over a slope with a bump; `second` contains the arguments of `make_pose`."""
     return Pass(
         make_bumps((1.2, 0.8, 0.4, 0.3), base=make_plane(0.05, 0.02)),
         (make_pose(0.0, 0.0, 10.0, 20.0), make_pose(*second)),
@@ -175,6 +176,7 @@ def test_largest_changes_of_the_paper_are_tracked(second: tuple[float, ...]) -> 
     first_counts, second_counts = (render_image(scene, i).counts for i in (0, 1))
     features = select_features(first_counts, OPTIONS)
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    # at least 12 px inside the second image of 320 x 240 pixels
     is_visible = np.all((true_pixels >= 12.0) & (true_pixels <= np.array([307.0, 227.0])), axis=1)
     tracks = track_features(first_counts, second_counts, features, true_pixels + 3.0, OPTIONS)
     is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)

@@ -1,7 +1,8 @@
-"""Synthetic map, terrain and descent images for the tests of image matching: a ray-traced height field.
+"""Synthetic map, terrain and descent images for the tests of map-relative localisation: a ray-traced height field.
 
-The terrain's appearance has a finer grid than the map, whose pixels are means over squares of it. Images are traced
-from pixels to the ground with super-sampling, by more iterations than in the algorithm and on the finer grid.
+The appearance (brightness) of the terrain has a finer grid than the map; a map pixel is the mean over a square of fine
+pixels. Images are traced from pixels to the ground with super-sampling, on the finer grid and with more iterations than
+in the algorithm.
 """
 
 from __future__ import annotations
@@ -35,7 +36,11 @@ class Scene:
 def random_field(
     size: int, slope: float, rng: np.random.Generator, low_cycles: float, max_frequency: float = 0.4
 ) -> np.ndarray:
-    """Random field with amplitudes proportional to frequency**-slope, standard deviation 1."""
+    """Draw a random field with amplitudes proportional to frequency**-slope and standard deviation 1.
+
+    - size: pixels along each side
+    - low_cycles, max_frequency: lowest frequency, cycles per side, and highest frequency, cycles per pixel
+    """
     n = fft.next_fast_len(size, real=True)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(n), fft.rfftfreq(n), indexing="ij")).astype(np.float32)
     amplitude = np.zeros_like(frequency)
@@ -47,6 +52,7 @@ def random_field(
 
 
 def map_from_fine(fine_appearance: np.ndarray, fine: int, elevation: np.ndarray) -> MapProduct:
+    """Average the appearance over `fine` x `fine` pixels; return an exact map with its centre at (0, 0)."""
     size = fine_appearance.shape[0] // fine
     appearance = cv2.resize(fine_appearance, (size, size), interpolation=cv2.INTER_AREA)
     origin = -0.5 * (size - 1) * MAP_PIXEL_M
@@ -55,7 +61,7 @@ def map_from_fine(fine_appearance: np.ndarray, fine: int, elevation: np.ndarray)
 
 @cache
 def make_scene(seed: int = 1, size: int = 1536, relief_m: float = 80.0, contrast: float = 0.12, fine: int = 2) -> Scene:
-    """Terrain with texture of all scales down to 7.5 m, and relief of `relief_m` (standard deviation)."""
+    """Create terrain with texture of all scales down to 7.5 m, and relief of `relief_m` (standard deviation)."""
     rng = np.random.default_rng(seed)
     texture = random_field(fine * size, 1.2, rng, 8.0)
     elevation = relief_m * random_field(size, 2.5, rng, 2.0, max_frequency=0.04)
@@ -64,7 +70,7 @@ def make_scene(seed: int = 1, size: int = 1536, relief_m: float = 80.0, contrast
 
 
 def make_camera(pixels: int) -> Cahvore:
-    """Fisheye of 94 deg (1.6 mrad a pixel at 1024 pixels), with distortion and 0.1 m from the body's origin."""
+    """Create a fisheye camera of 94 deg (1.6 mrad per pixel at 1024 pixels), 0.1 m off the body origin."""
     focal = pixels / 1024.0 / 1.6e-3
     pinhole = Cahv.from_axes(
         (focal, 1.002 * focal),
@@ -78,7 +84,7 @@ def make_camera(pixels: int) -> Cahvore:
 
 
 def _refine(size: tuple[int, int], samples: int) -> np.ndarray:
-    """Centres of `samples` x `samples` squares in each pixel."""
+    """Compute the centres (u, v) of `samples` x `samples` squares in each pixel."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     columns, rows = size
     u, v = np.arange(columns)[:, None] + offsets, np.arange(rows)[:, None] + offsets
@@ -88,7 +94,7 @@ def _refine(size: tuple[int, int], samples: int) -> np.ndarray:
 def trace_image(
     scene: Scene, camera: CameraModel, position: np.ndarray, attitude: Rotation, samples: int = 2
 ) -> np.ndarray:
-    """Radiance seen by a camera (body frame) at a pose: the mean over `samples` x `samples` rays of each pixel."""
+    """Compute the image of a camera (body frame) at a pose: mean radiance over `samples` x `samples` rays per pixel."""
     world = camera.transform(rigid(attitude, position))
     columns, rows = camera.size
     # rays are smooth functions of the pixel: interpolated from every fourth pixel by a cubic spline to below 1e-6
@@ -96,8 +102,8 @@ def trace_image(
     u, v = np.arange(-step, columns + 2 * step, step, dtype=float), np.arange(-step, rows + 2 * step, step, dtype=float)
     nodes = np.stack(np.meshgrid(u, v), axis=-1)
     origins, directions = world.rays(nodes)
-    fine = _refine(camera.size, samples)
-    node_rows, node_columns = (fine[:, 0, 1] + step) / step, (fine[0, :, 0] + step) / step
+    subpixels = _refine(camera.size, samples)
+    node_rows, node_columns = (subpixels[:, 0, 1] + step) / step, (subpixels[0, :, 0] + step) / step
     slopes = np.stack([_interpolate(directions[..., k] / directions[..., 2], node_rows, node_columns) for k in (0, 1)])
     origin = origins.reshape(-1, 3).mean(axis=0)  # the pupil moves by millimetres
     product = scene.map_product
@@ -114,11 +120,13 @@ def trace_image(
 
 
 def _interpolate(values: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Interpolate a grid at all combinations of rows and columns by a cubic spline."""
     spline = RectBivariateSpline(np.arange(values.shape[0]), np.arange(values.shape[1]), values)
     return np.asarray(spline(rows, columns))
 
 
 def _sample(raster: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Interpolate a raster bilinearly at columns x and rows y."""
     return cv2.remap(
         raster, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
@@ -133,7 +141,7 @@ def make_image(
     attitude_error_rad: np.ndarray | None = None,
     time_s: float = 0.0,
 ) -> PosedImage:
-    """Image of the scene; its estimated pose is the true one plus the errors (estimate = true + error)."""
+    """Create an image of the scene with an estimated pose: the true pose with errors of position and attitude added."""
     radiance = trace_image(scene, camera, position, attitude)
     estimate = position if position_error is None else position + position_error
     turn = Rotation.identity() if attitude_error_rad is None else Rotation.from_rotvec(attitude_error_rad)
@@ -141,7 +149,7 @@ def make_image(
 
 
 def solve_position(image: PosedImage, points: np.ndarray, measured_px: np.ndarray, steps: int = 4) -> np.ndarray:
-    """Position by least squares from landmarks with exact attitude (Gauss-Newton)."""
+    """Estimate the position from landmarks by least squares (Gauss-Newton); the attitude must be exact."""
     for _ in range(steps):
         camera = image.world_camera
         pixels, _ = camera.project(points)

@@ -1,4 +1,4 @@
-"""Validation of position estimates: malformed answers are BAD_ANSWER with the reason, valid ones are copied."""
+"""Tests of the validation of position estimates: malformed answers raise BAD_ANSWER, valid ones are copied."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 
-SPAN_S = (-0.2, 40.0)
-PARTS = ("position_m", "velocity_m_s", "world_from_body", "covariance")
+SPAN_S = (-0.2, 40.0)  #: First and last time of the inertial increments.
+#: Fields of the state, which a valid answer contains and a refusal does not.
+STATE_FIELDS = ("position_m", "velocity_m_s", "world_from_body", "covariance")
 
 
 def _make_valid() -> PositionEstimate:
@@ -34,6 +35,7 @@ class _Malformed(PositionEstimate):
 
 
 def _expect_bad(answer: object, message: str) -> None:
+    """Assert that the answer raises BAD_ANSWER with this message on one line."""
     with pytest.raises(AlgorithmError, match=message) as caught:
         check_estimate(answer, SPAN_S)
     assert caught.value.fault is Fault.BAD_ANSWER
@@ -55,17 +57,17 @@ def test_time_outside_of_the_increments_is_refused(time_s: object) -> None:
     _expect_bad(_Malformed(time_s=time_s), r"time_s is .*; allowed: -0.2 to 40.0")
 
 
-@pytest.mark.parametrize("name", PARTS)
-def test_valid_answer_needs_all_parts(name: str) -> None:
+@pytest.mark.parametrize("name", STATE_FIELDS)
+def test_valid_answer_needs_all_state_fields(name: str) -> None:
     _expect_bad(_Malformed(**{name: None}), rf"outcome is VALID, but {name} is missing; allowed: all parts")
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", STATE_FIELDS)
 @pytest.mark.parametrize("outcome", [outcome for outcome in PositionOutcome if outcome is not PositionOutcome.VALID])
-def test_refusal_has_no_part(name: str, outcome: PositionOutcome) -> None:
-    nothing: dict[str, Any] = dict.fromkeys(PARTS)
-    parts = {**nothing, name: getattr(_make_valid(), name)}
-    _expect_bad(_Malformed(outcome=outcome, **parts), rf"outcome is {outcome.name}, but {name} is given; allowed")
+def test_refusal_with_a_state_field_is_rejected(name: str, outcome: PositionOutcome) -> None:
+    no_state: dict[str, Any] = dict.fromkeys(STATE_FIELDS)
+    fields = {**no_state, name: getattr(_make_valid(), name)}
+    _expect_bad(_Malformed(outcome=outcome, **fields), rf"outcome is {outcome.name}, but {name} is given; allowed")
 
 
 @pytest.mark.parametrize(

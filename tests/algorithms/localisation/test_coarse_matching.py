@@ -1,4 +1,7 @@
-"""Coarse stage: offset of the position from large patches, and refusals, on ray-traced images of synthetic terrain."""
+"""Tests of the coarse stage of localisation on ray-traced images of synthetic terrain: position offset and refusals.
+
+Three images with five patches each are matched with the map. All estimated positions are wrong by a common offset.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +27,17 @@ from tests.algorithms.localisation.synthetic_map import (
 )
 
 OPTIONS = LvsOptions()
+#: Heights of the three images above the ground.
 HEIGHTS_M = (3500.0, 3410.0, 3320.0)
 #: Covariance of position, velocity and attitude. 3.5 standard deviations of the position are more than the search
 #: radius of 3.2 km; that of the attitude is 0.1 deg.
 COVARIANCE = np.diag(np.repeat([1067.0, 1.0, np.radians(0.1)], 3) ** 2)
+#: True minus estimated position (east, north), metres: a large and a small error.
 OFFSET_M, NEAR_M = np.array([2400.0, -1800.0]), np.array([1000.0, -800.0])
 
 
 def make_images(scene: Scene) -> tuple[PosedImage, ...]:
-    """Three images one second apart, with exact poses."""
+    """Render three images one second apart, with exact poses."""
     camera, images = make_camera(512), []
     for k, height in enumerate(HEIGHTS_M):
         position = np.array([130.0 + 30.0 * k, -210.0 + 20.0 * k, 0.0])
@@ -47,19 +52,22 @@ def random_images() -> tuple[PosedImage, ...]:
     return make_images(make_scene())
 
 
-def find(
+def run_coarse_stage(
     images: tuple[PosedImage, ...], map_product: MapProduct, offset: np.ndarray, height_error_m: float = 0.0
 ) -> CoarseFix | CoarseRefusal:
-    """Run the coarse stage with the position wrong by the offset, and the altitude (150 m) by less."""
+    """Run the coarse stage with estimated positions that are wrong by `offset`, and by 150 m in height.
+
+    The measured altitudes are wrong by `height_error_m`.
+    """
     error = np.array([-offset[0], -offset[1], 150.0])
     wrong = [replace(image, position_m=image.position_m + error) for image in images]
     return find_coarse_position(wrong, [h + height_error_m for h in HEIGHTS_M], map_product, COVARIANCE, OPTIONS)
 
 
 def test_exact_images_determine_an_offset_of_three_kilometres() -> None:
-    fix = find(random_images(), make_scene().map_product, OFFSET_M)
+    fix = run_coarse_stage(random_images(), make_scene().map_product, OFFSET_M)
     assert isinstance(fix, CoarseFix)
-    # noise-free: a tenth of a coarse pixel; required: 100 m
+    # without noise: a tenth of a coarse pixel of 12 m; required: 100 m
     np.testing.assert_allclose(fix.offset_m, OFFSET_M, atol=1.2)
     assert fix.matches.consistent.sum() >= 14
     assert fix.second_support == 0.0
@@ -71,11 +79,11 @@ def test_errors_of_pose_altitude_radiometry_and_noise_stay_within_100_m() -> Non
     images = []
     for image in random_images():
         haze = np.linspace(0.3, 0.6, image.radiance.shape[1], dtype=np.float32)
-        seen = haze + 0.4 * image.radiance**1.5
-        noisy = (seen + seen.mean() / 40.0 * rng.standard_normal(seen.shape)).astype(np.float32)
+        hazy = haze + 0.4 * image.radiance**1.5
+        noisy = (hazy + hazy.mean() / 40.0 * rng.standard_normal(hazy.shape)).astype(np.float32)
         attitude = Rotation.from_rotvec([2e-3, -3e-3, 5e-3]) * image.world_from_body
         images.append(replace(image, radiance=noisy, world_from_body=attitude))
-    fix = find(tuple(images), make_scene().map_product, OFFSET_M, height_error_m=30.0)
+    fix = run_coarse_stage(tuple(images), make_scene().map_product, OFFSET_M, height_error_m=30.0)
     assert isinstance(fix, CoarseFix)
     error = fix.offset_m - OFFSET_M
     # attitude errors of 3.6 mrad shift the ground by 12.6 m
@@ -83,20 +91,20 @@ def test_errors_of_pose_altitude_radiometry_and_noise_stay_within_100_m() -> Non
     assert error @ np.linalg.solve(fix.covariance, error) < 13.8  # 99.9 % of chi-square with two degrees of freedom
 
 
-def tilt(images: tuple[PosedImage, ...], angle_deg: float) -> tuple[PosedImage, ...]:
+def tilt_attitudes(images: tuple[PosedImage, ...], angle_deg: float) -> tuple[PosedImage, ...]:
     """Return the images with estimated attitudes that are wrong by a tilt about the north axis."""
-    turn = Rotation.from_euler("y", angle_deg, degrees=True)
-    return tuple(replace(image, world_from_body=turn * image.world_from_body) for image in images)
+    rotation = Rotation.from_euler("y", angle_deg, degrees=True)
+    return tuple(replace(image, world_from_body=rotation * image.world_from_body) for image in images)
 
 
 def test_a_wrong_attitude_is_refused() -> None:
     """10 deg of tilt: at least seven patches agree within 60 m on an offset that is wrong by 600 m."""
-    result = find(tilt(random_images(), 10.0), make_scene().map_product, NEAR_M)
+    result = run_coarse_stage(tilt_attitudes(random_images(), 10.0), make_scene().map_product, NEAR_M)
     assert result is CoarseRefusal.INCONSISTENT
 
 
 def test_an_attitude_within_the_stated_error_is_accepted() -> None:
-    fix = find(tilt(random_images(), 0.1), make_scene().map_product, NEAR_M)
+    fix = run_coarse_stage(tilt_attitudes(random_images(), 0.1), make_scene().map_product, NEAR_M)
     assert isinstance(fix, CoarseFix)
     assert fix.consistency is not None
     assert fix.consistency.is_consistent
@@ -105,11 +113,14 @@ def test_an_attitude_within_the_stated_error_is_accepted() -> None:
 
 @pytest.mark.parametrize("seed", [11, 12])
 def test_an_unrelated_map_is_refused(seed: int) -> None:
-    assert find(random_images(), make_scene(seed=seed, fine=1).map_product, OFFSET_M) is CoarseRefusal.NO_CONSENSUS
+    assert (
+        run_coarse_stage(random_images(), make_scene(seed=seed, fine=1).map_product, OFFSET_M)
+        is CoarseRefusal.NO_CONSENSUS
+    )
 
 
 def make_dunes(period_m: float) -> Scene:
-    """Flat ground with crossed dunes."""
+    """Create flat ground with two crossed periodic patterns."""
     size = 1536
     phase = 2.0 * np.pi * np.arange(size) * (MAP_PIXEL_M / period_m)
     appearance = (1.0 + 0.1 * (np.sin(phase)[:, np.newaxis] + np.sin(0.97 * phase + 1.0))).astype(np.float32)
@@ -119,15 +130,17 @@ def make_dunes(period_m: float) -> Scene:
 @pytest.mark.parametrize("period_m", [110.0, 400.0])
 def test_periodic_dunes_are_refused(period_m: float) -> None:
     dunes = make_dunes(period_m)
-    result = find(make_images(dunes), dunes.map_product, OFFSET_M)
+    result = run_coarse_stage(make_images(dunes), dunes.map_product, OFFSET_M)
     assert isinstance(result, CoarseRefusal)
 
 
 def test_uniform_ground_is_refused() -> None:
     flat = np.ones_like(random_images()[0].radiance)
     images = tuple(replace(image, radiance=flat) for image in random_images())
-    assert find(images, make_scene().map_product, OFFSET_M) is CoarseRefusal.TOO_FEW_PATCHES
+    assert run_coarse_stage(images, make_scene().map_product, OFFSET_M) is CoarseRefusal.TOO_FEW_PATCHES
 
 
 def test_an_offset_beyond_the_search_radius_is_refused() -> None:
-    assert isinstance(find(random_images(), make_scene().map_product, np.array([2800.0, 2200.0])), CoarseRefusal)
+    assert isinstance(
+        run_coarse_stage(random_images(), make_scene().map_product, np.array([2800.0, 2200.0])), CoarseRefusal
+    )

@@ -1,4 +1,7 @@
-"""Test of patch offsets against the covariance of the state: statistics, wrong attitude, outliers, shared ground."""
+"""Tests of the consistency check of coarse matching: patch offsets against the covariance of the state.
+
+The cases are offsets with the stated errors, a wrong attitude, outliers, and images of the same ground.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,9 @@ from marsyard.algorithms.localisation.consistency import (
 HEIGHT_M, SIDE_M = 3000.0, 1000.0
 #: Standard deviations of position (m), velocity (m/s) and attitude (rad), per axis.
 STATE_SD = np.repeat([800.0, 1.0, 2e-3], 3)
-#: Times of the three images before the last, s.
+#: Time from each of the three images to the last one, s.
 AGES_S = np.array([6.6, 3.3, 0.0])
-FALSE_REFUSAL = 1e-4
+FALSE_REFUSAL = 1e-4  #: Probability that correct patches are refused.
 TEST = OffsetTest(outlier_probability=1e-3, false_refusal=FALSE_REFUSAL, chance_agreement=0.126)
 #: Ground points relative to the nadir: up to 35 deg off nadir; the areas do not overlap.
 POINTS_M = np.array([[0.0, 0.0], [1500.0, 200.0], [-1300.0, 700.0], [200.0, -1600.0], [-300.0, 1700.0]])
@@ -68,7 +71,8 @@ def test_offsets_with_the_stated_errors_are_chi_square() -> None:
     rng = np.random.default_rng(1)
     weights = np.linalg.inv(COVARIANCE)
     squares = np.array([o @ weights @ o for o in (draw_offsets(rng).ravel() for _ in range(400))])
-    # mean 30, standard deviation sqrt(60 / 400) of the mean: 4 sigma; plus the second order, 1 % of the variance
+    # 15 patches x 2 axes: the mean is 30, with a standard deviation of sqrt(60 / 400) for 400 draws; the tolerance is
+    # 4 sigma plus 1 % for the effect of linearisation
     assert squares.mean() == pytest.approx(30.0, abs=4.0 * np.sqrt(60.0 / 400.0) + 0.3)
     # 5 % above the 95 % quantile: 4 standard deviations of a binomial number
     assert np.mean(squares > chi2.ppf(0.95, 30)) == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 400.0))
@@ -78,7 +82,7 @@ def test_stated_errors_are_accepted() -> None:
     rng = np.random.default_rng(2)
     results = [check_offsets(draw_offsets(rng), COVARIANCE, 0, TEST) for _ in range(200)]
     assert all(result.is_consistent for result in results)
-    # 3,000 patches, of which 3 are expected to be removed
+    # 200 x 15 patches, of which 3 are expected to be removed: outlier_probability is 1e-3
     assert sum(np.count_nonzero(~result.members) for result in results) <= 12
 
 

@@ -1,6 +1,6 @@
-"""Map-relative estimator and baselines: sequence of the stages, refusals and restart, on a vertical descent.
+"""Tests of the map-relative estimator and baselines on a descent: sequence of stages, refusals and restart.
 
-The matching stages are replaced by functions with known results, or run on a small synthetic map.
+The matching stages are replaced by functions with given results (`Stages`), or run on a small synthetic map.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _descend(
     yield estimator.finish()
 
 
-# --- stages with known results -----------------------------------------------------------------------------------
+# --- stages with given results -----------------------------------------------------------------------------------
 
 
 def _rotation(vector: np.ndarray) -> Rotation:
@@ -98,10 +98,10 @@ def _rotation(vector: np.ndarray) -> Rotation:
 
 
 class Stages:
-    """Replacements of both matching stages: they return the next result of a list, and record their images.
+    """Replacements of both matching stages: they return the next result of a list, and record their inputs.
 
     - coarse: offsets (east, north) of the coarse fixes, or refusals
-    - fine: whether the landmarks are found, or the attitude error (rotation vector) that they show
+    - fine: whether landmarks are found; or the attitude error (rotation vector) with which they are projected
     """
 
     def __init__(self, coarse: list[np.ndarray | CoarseRefusal], fine: list[bool | np.ndarray]) -> None:
@@ -158,7 +158,7 @@ def make_stages(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stages]:
 
 
 def _images(count: int) -> list[DetectorImage]:
-    """Images without content, one per second."""
+    """Create uniform images, one per second, for the replaced stages."""
     return [_make_image(1.0 + number, np.ones((64, 64))) for number in range(count)]
 
 
@@ -200,7 +200,7 @@ def test_no_position_before_three_images(make_stages: Callable[..., Stages]) -> 
     np.testing.assert_array_equal(details.coarse_offset_m, ERROR_M[:2])
 
 
-def test_no_coarse_stage_without_an_altitude(make_stages: Callable[..., Stages]) -> None:
+def test_coarse_stage_is_not_run_without_an_altitude(make_stages: Callable[..., Stages]) -> None:
     make_stages([], [])
     estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(4), with_altitudes=False))
     assert set(_outcomes(estimates)) == {NO_COARSE_FIX}
@@ -224,7 +224,7 @@ def test_position_is_uncertain_between_coarse_fix_and_first_match(make_stages: C
         _check_error(estimate)
 
 
-def test_wrong_fix_is_given_up_and_the_coarse_stage_restarts(make_stages: Callable[..., Stages]) -> None:
+def test_wrong_fix_is_discarded_and_the_coarse_stage_restarts(make_stages: Callable[..., Stages]) -> None:
     wrong = ERROR_M[:2] + np.array([-160.0, 90.0])
     stages = make_stages([wrong, ERROR_M[:2]], [False, False, False, True])
     estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(8)))
@@ -239,14 +239,14 @@ def test_wrong_fix_is_given_up_and_the_coarse_stage_restarts(make_stages: Callab
 
 
 def test_contradicting_landmarks_are_failures(make_stages: Callable[..., Stages]) -> None:
-    """Exact landmarks after a coarse fix that is wrong by 16 standard deviations: never a position from them."""
+    """Exact landmarks after a coarse fix that is wrong by 16 standard deviations: no position is reported."""
     make_stages([ERROR_M[:2] + np.array([-160.0, 0.0])], [True] * 3)
     estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5)))
     assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
 
 
 def test_no_position_after_contradicting_landmarks_until_the_next_update(make_stages: Callable[..., Stages]) -> None:
-    """The covariance is below the limit throughout, and the last update is recent: only the contradiction counts."""
+    """The covariance is below the limit throughout, and the last update is recent: only the contradiction matters."""
     turned = np.radians([5.0, 0.0, 0.0])
     make_stages([ERROR_M[:2]], [True, True, turned, False, True])
     estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(7)))
@@ -269,7 +269,7 @@ def test_landmarks_of_a_wrong_attitude_never_update_the_state(make_stages: Calla
 
 
 def test_position_without_a_recent_update_is_uncertain(make_stages: Callable[..., Stages]) -> None:
-    """The last update is that of the image at 3 s: reported for 5 s, for any number of images without a match."""
+    """The last update is at 3 s: the position is reported until 8 s, with any number of images without a match."""
     make_stages([ERROR_M[:2]], [True, *[False] * 6])
     options = LvsOptions(max_failures=100, max_position_sd_m=1000.0)
     estimates = list(_descend(MapRelativeEstimator(options), FLAT_MAP, _images(9)))
@@ -421,7 +421,7 @@ def test_stages_find_the_position_on_a_synthetic_map() -> None:
     assert max(_error_m(estimate) for estimate in estimates[2:]) < 3.0
 
 
-def test_stages_find_nothing_on_an_unrelated_map() -> None:
+def test_stages_find_no_position_on_an_unrelated_map() -> None:
     estimates = list(_descend(MapRelativeEstimator(), _scene(2).map_product, _traced_images()))
     assert set(_outcomes(estimates)) == {NO_COARSE_FIX}
 
@@ -440,7 +440,7 @@ def test_features_find_the_position_on_a_synthetic_map() -> None:
     assert details.inliers >= LvsOptions().min_matches
 
 
-def test_features_find_nothing_on_an_unrelated_map() -> None:
+def test_features_find_no_position_on_an_unrelated_map() -> None:
     estimates = list(_descend(FeatureEstimator(), _scene(2).map_product, _traced_images()[:2]))
     assert _outcomes(estimates) == [NO_COARSE_FIX] * 3
 

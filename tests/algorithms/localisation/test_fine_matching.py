@@ -1,4 +1,4 @@
-"""Fine stage: landmarks' pixels from ray-traced images of synthetic terrain against the exact projection."""
+"""Tests of the fine stage of localisation: pixels of landmarks in ray-traced images against the exact projection."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.algorithms.localisation.synthetic_map import make_camera, make_image,
 
 OPTIONS = LvsOptions()
 ATTITUDE = Rotation.from_euler("zyx", [30.0, 6.0, -4.0], degrees=True)
-DIRECTION = np.array([0.75, -0.65, 0.15])
+DIRECTION = np.array([0.75, -0.65, 0.15])  #: Direction of the position errors, about a unit vector.
 
 
 @cache
@@ -30,12 +30,14 @@ def landmarks() -> Landmarks:
 
 @cache
 def exact_image(height_m: float, pixels: int = 512) -> PosedImage:
+    """Render an image from a height above the ground; its estimated pose is exact."""
     position = np.array([130.0, -210.0, 0.0])
     position[2] = elevation_at(make_scene().map_product, position[:2]) + height_m
     return make_image(make_scene(), make_camera(pixels), position, ATTITUDE)
 
 
-def match(image: PosedImage, sd_m: float) -> LandmarkMatches:
+def run_fine_stage(image: PosedImage, sd_m: float) -> LandmarkMatches:
+    """Match landmarks in an image whose position has the standard deviation `sd_m` along east and north."""
     sd = np.array([sd_m, sd_m, max(0.2 * sd_m, 5.0)])
     return match_landmarks(image, landmarks(), make_scene().map_product, sd, OPTIONS)
 
@@ -52,7 +54,7 @@ def pixel_errors(truth: PosedImage, matches: LandmarkMatches) -> np.ndarray:
 def test_exact_images_match_without_bias(height_m: float, pixels: int, error_m: float) -> None:
     truth = exact_image(height_m, pixels)
     wrong = replace(truth, position_m=truth.position_m + error_m * DIRECTION)
-    matches = match(wrong, error_m / 1.5)
+    matches = run_fine_stage(wrong, error_m / 1.5)
     assert matches.attempted == OPTIONS.max_landmarks
     assert len(matches) > 0.9 * matches.attempted
     errors = pixel_errors(truth, matches)
@@ -65,15 +67,15 @@ def test_exact_images_match_without_bias(height_m: float, pixels: int, error_m: 
     np.testing.assert_allclose(matches.predicted_px, wrong.world_camera.project(matches.points_m)[0])
 
 
-def test_contrast_noise_and_attitude_error() -> None:
+def test_landmarks_are_accurate_despite_haze_noise_and_attitude_error() -> None:
     rng = np.random.default_rng(2)
     truth = exact_image(2000.0)
     haze = np.linspace(0.3, 0.6, truth.radiance.shape[1], dtype=np.float32)
-    seen = haze + 0.4 * truth.radiance**1.5
-    noisy = (seen + seen.mean() / 80.0 * rng.standard_normal(seen.shape)).astype(np.float32)
+    hazy = haze + 0.4 * truth.radiance**1.5
+    noisy = (hazy + hazy.mean() / 80.0 * rng.standard_normal(hazy.shape)).astype(np.float32)
     attitude = Rotation.from_rotvec([2e-3, -3e-3, 4e-3]) * ATTITUDE
     wrong = replace(truth, radiance=noisy, position_m=truth.position_m + 60.0 * DIRECTION, world_from_body=attitude)
-    matches = match(wrong, 40.0)
+    matches = run_fine_stage(wrong, 40.0)
     assert len(matches) > 0.8 * matches.attempted
     errors = pixel_errors(truth, matches)
     assert np.median(np.hypot(*errors.T)) < 0.15
@@ -90,7 +92,7 @@ def test_hidden_ground_and_wrong_ground_are_rejected() -> None:
     v, u = np.mgrid[:512, :512]
     radiance[(u - 150.0) ** 2 + (v - 280.0) ** 2 < 60.0**2] = 0.2
     wrong = replace(truth, radiance=radiance, position_m=truth.position_m + 5.0 * DIRECTION)
-    matches = match(wrong, 4.0)
+    matches = run_fine_stage(wrong, 4.0)
     assert matches.accepted > len(matches) > 0.45 * matches.attempted
     errors = pixel_errors(truth, matches)
     assert np.hypot(*errors.T).max() < 1.5
@@ -101,7 +103,7 @@ def test_an_image_of_other_ground_has_no_matches() -> None:
     truth = exact_image(2000.0)
     for radiance in (np.flipud(truth.radiance).copy(), np.ones_like(truth.radiance)):
         for sd_m in (3.0, 130.0):
-            matches = match(replace(truth, radiance=radiance), sd_m)
+            matches = run_fine_stage(replace(truth, radiance=radiance), sd_m)
             assert len(matches) == 0
             assert matches.measured_px.shape == (0, 2)
 
@@ -133,7 +135,7 @@ def test_pose_jacobian_equals_finite_differences() -> None:
         np.testing.assert_allclose(jacobian[:, :, k], difference / (2.0 * step), rtol=1e-5, atol=1e-6)
 
 
-def test_pose_fit_with_half_of_the_matches_wrong() -> None:
+def test_pose_fit_rejects_wrong_half_of_the_matches() -> None:
     rng = np.random.default_rng(4)
     image = exact_image(1000.0)
     points = np.column_stack([rng.uniform(-700.0, 900.0, (120, 2)), rng.uniform(-50.0, 50.0, 120)])
@@ -142,6 +144,7 @@ def test_pose_fit_with_half_of_the_matches_wrong() -> None:
     displacements = jacobian @ correction + 0.05 * rng.standard_normal((120, 2))
     wrong = np.arange(120) % 2 == 0
     displacements[wrong] = rng.uniform(-12.0, 12.0, (60, 2))
+    # standard deviations of position (m) and attitude (rad), noise and maximum residual (pixels)
     fit = fit_pose(jacobian, displacements, np.array([20.0, 20.0, 10.0, 2e-3, 2e-3, 2e-3]), 0.3, 1.2)
     assert fit.consistent[~wrong].all()
     assert fit.consistent[wrong].sum() <= 4  # by chance: pi 1.2^2 / 24^2 of 60 is 0.5

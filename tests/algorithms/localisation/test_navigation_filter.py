@@ -1,4 +1,4 @@
-"""Navigation filter for localisation on a map, on an analytic descent with exact inertial increments."""
+"""Tests of the navigation filter for localisation on a map: an analytic descent with exact inertial increments."""
 
 from __future__ import annotations
 
@@ -71,13 +71,13 @@ def exact(truth: Descent) -> ImuIncrements:
     return ImuIncrements(boundaries, 1.0 / RATE_HZ, angles, velocities)
 
 
-def part(increments: ImuIncrements, first: int, last: int) -> ImuIncrements:
+def slice_increments(increments: ImuIncrements, first: int, last: int) -> ImuIncrements:
     angles, velocities = increments.delta_angles_rad[first:last], increments.delta_velocities_m_s[first:last]
     return ImuIncrements(increments.times_s[first : last + 1], increments.period_s, angles, velocities)
 
 
 def initial_state(truth: Descent, covariance: np.ndarray, errors: np.ndarray | None = None) -> InitialState:
-    """True state at time 0, minus errors: true = exp(e) estimated."""
+    """Return the true state at time 0 minus errors of position, velocity and attitude (rotation vector), shape (9,)."""
     start, errors = truth.state(0.0), np.zeros(9) if errors is None else errors
     attitude = Rotation.from_rotvec(-errors[6:]) * start.attitude
     return InitialState(
@@ -92,8 +92,8 @@ def state_errors(truth: Descent, state: NavigationState) -> np.ndarray:
     return np.concatenate([true.position_m - state.position_m, true.velocity_m_s - state.velocity_m_s, attitude])
 
 
-def see_landmarks(truth: Descent, time_s: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw ground points (heights up to 100 m) in the image; return points and exact pixels."""
+def draw_points(truth: Descent, time_s: float, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw landmarks in the image (heights of 0 to 100 m); return points, shape (count, 3), and exact pixels."""
     state = truth.state(time_s)
     pose = RigidTransform.from_components(state.position_m, state.attitude)
     camera = CAMERA.transform(pose)
@@ -106,10 +106,10 @@ def see_landmarks(truth: Descent, time_s: float, count: int, rng: np.random.Gene
 
 
 def test_perfect_increments_reproduce_the_motion(truth: Descent, exact: ImuIncrements) -> None:
-    # calls of irregular length, and an end between two boundaries
+    # the increments are passed in blocks of irregular length; 59.9987 s is between two boundaries
     navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
     for first, last in ((0, 1), (1, 700), (700, 701), (701, 24000)):
-        navigation.propagate(part(exact, first, last))
+        navigation.propagate(slice_increments(exact, first, last))
     for time_s in (60.0, 59.9987, 57.0):
         errors = state_errors(truth, navigation.state_at(time_s))
         # position: velocities are linear in an interval: step^2 / 12 * change of acceleration (8 m/s2); velocity:
@@ -119,20 +119,20 @@ def test_perfect_increments_reproduce_the_motion(truth: Descent, exact: ImuIncre
         assert np.abs(errors[6:]).max() < 4e-8
 
 
-def test_extrapolation_after_the_last_increment(truth: Descent, exact: ImuIncrements) -> None:
+def test_state_is_extrapolated_by_a_few_milliseconds(truth: Descent, exact: ImuIncrements) -> None:
     navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
-    navigation.propagate(part(exact, 0, 4000))
+    navigation.propagate(slice_increments(exact, 0, 4000))
     errors = state_errors(truth, navigation.state_at(10.002))
-    # constant rate for 2 ms at an angular acceleration below 0.1 rad/s2
+    # a constant rate is assumed over 2 ms plus the last interval of 2.5 ms; angular acceleration below 0.1 rad/s2
     assert np.abs(errors[6:]).max() < 0.5 * 0.1 * 0.0045**2
     assert np.abs(errors[:3]).max() < 1e-4
     with pytest.raises(ValueError, match="outside of the stored history"):
         navigation.state_at(10.1)
     with pytest.raises(ValueError, match="consecutive"):
-        navigation.propagate(part(exact, 4100, 4200))
+        navigation.propagate(slice_increments(exact, 4100, 4200))
 
 
-def difference(plus: NavigationState, minus: NavigationState) -> np.ndarray:
+def state_difference(plus: NavigationState, minus: NavigationState) -> np.ndarray:
     return np.concatenate(
         [
             plus.position_m - minus.position_m,
@@ -173,7 +173,7 @@ def test_transition_matches_numerical_differences(truth: Descent, exact: ImuIncr
         error = sizes[column] * np.eye(15)[column]
         plus, minus = propagate(error), propagate(-error)
         for number, analytic, tolerance in ((0, transitions[0], 0.05), (39, total, 2e-3)):
-            numeric = difference(plus[number], minus[number]) / (2.0 * sizes[column])
+            numeric = state_difference(plus[number], minus[number]) / (2.0 * sizes[column])
             for first in range(0, 15, 3):
                 rows = slice(first, first + 3)
                 expected = analytic[rows, column]
@@ -186,9 +186,9 @@ def test_transition_matches_numerical_differences(truth: Descent, exact: ImuIncr
                 assert np.abs(numeric[rows] - expected).max() < allowed, (number, column, first)
 
 
-def test_covariance_is_that_of_the_transition(truth: Descent, exact: ImuIncrements) -> None:
+def test_propagated_covariance_equals_that_of_the_transition(truth: Descent, exact: ImuIncrements) -> None:
     """The propagated covariance of a single error is the square of its propagated difference."""
-    silent = ImuErrorModel(
+    noise_free = ImuErrorModel(
         **dict.fromkeys(ImuErrorModel.__dataclass_fields__, 0.0) | {"gyro_wander_s": 1.0, "accelerometer_wander_s": 1.0}
     )
     start = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
@@ -197,12 +197,12 @@ def test_covariance_is_that_of_the_transition(truth: Descent, exact: ImuIncremen
     for column, size in ((4, 1.0), (7, 1e-4), (9, 1e-4), (13, 1e-2)):
         error = size * np.eye(15)[column]
         single = replace(start, covariance=np.outer(error, error))
-        result = inertial.propagate_states(single, history, times, GRAVITY, silent)[-1]
+        result = inertial.propagate_states(single, history, times, GRAVITY, noise_free)[-1]
         ends = (
-            inertial.propagate_states(start.correct(sign * error, np.eye(15)), history, times, GRAVITY, silent)[-1]
+            inertial.propagate_states(start.correct(sign * error, np.eye(15)), history, times, GRAVITY, noise_free)[-1]
             for sign in (1.0, -1.0)
         )
-        numeric = 0.5 * difference(*ends)
+        numeric = 0.5 * state_difference(*ends)
         for first in range(0, 15, 3):
             rows = slice(first, first + 3)
             expected = np.outer(numeric[rows], numeric[rows])
@@ -212,7 +212,7 @@ def test_covariance_is_that_of_the_transition(truth: Descent, exact: ImuIncremen
 
 def test_landmark_jacobian_matches_numerical_differences(truth: Descent) -> None:
     state, rng = truth.state(10.0), np.random.default_rng(1)
-    points, pixels = see_landmarks(truth, 10.0, 40, rng)
+    points, pixels = draw_points(truth, 10.0, 40, rng)
     measurement = updates.LandmarkMeasurement(CAMERA, points, pixels, np.ones(40), np.zeros(3), np.zeros(3))
     result = updates.linearise_landmarks(measurement, state.position_m, state.attitude)
     assert result.visible.all()
@@ -277,7 +277,7 @@ def test_updates_of_position_and_altitude_are_those_of_a_kalman_filter(truth: De
         np.testing.assert_allclose(turned, errors[6:9], atol=1e-12)
 
 
-def test_reset_jacobian() -> None:
+def test_left_jacobian_is_the_derivative_of_a_composed_rotation() -> None:
     rotation, rest = np.array([0.02, -0.03, 0.01]), np.array([1e-6, 2e-6, -3e-6])
     total = Rotation.from_rotvec(rotation + rest) * Rotation.from_rotvec(rotation).inv()
     # third order of the series: |d|^3 / 24, relative
@@ -294,7 +294,7 @@ def test_delayed_updates_equal_updates_in_the_order_of_time(
     """
     rng = np.random.default_rng(3)
     image_s, altitude_s = 1.2343, 1.7
-    points, pixels = see_landmarks(truth, image_s, 60, rng)
+    points, pixels = draw_points(truth, image_s, 60, rng)
     pixels += 0.5 * rng.standard_normal(pixels.shape)
     pixels[::4] += 100.0
     start = initial_state(truth, SMALL_COVARIANCE, np.array([40.0, -30, 20, 0.3, 0.2, -0.4, 0.003, 0.004, -0.002]))
@@ -303,16 +303,16 @@ def test_delayed_updates_equal_updates_in_the_order_of_time(
         navigation = NavigationFilter.from_initial(start)
         # 493 increments end at 1.2325 s, 494 at 1.235 s
         first = 800 if delayed else (493 if pending else 494)
-        navigation.propagate(part(exact, 0, first))
+        navigation.propagate(slice_increments(exact, 0, first))
         if delayed:
             navigation.update_altitude(altitude_s, 4240.0, (7.0, np.array([0.1, 0.0])), 10.0)
         result = navigation.update_landmarks(image_s, CAMERA, points, pixels, 0.5, 1.0, 3.0)
         assert result.outcome is UpdateOutcome.APPLIED
         assert np.array_equal(np.flatnonzero(~result.inliers), np.arange(0, 60, 4))
         if not delayed:
-            navigation.propagate(part(exact, first, 700))
+            navigation.propagate(slice_increments(exact, first, 700))
             navigation.update_altitude(altitude_s, 4240.0, (7.0, np.array([0.1, 0.0])), 10.0)
-            navigation.propagate(part(exact, 700, 800))
+            navigation.propagate(slice_increments(exact, 700, 800))
         states.append(navigation.state_at(2.0))
     one, two = states
     deviations = np.sqrt(np.diag(one.covariance))
@@ -322,9 +322,9 @@ def test_delayed_updates_equal_updates_in_the_order_of_time(
     assert np.abs((one.covariance - two.covariance) / np.outer(deviations, deviations)).max() < 1e-9
 
 
-def test_updates_outside_the_history_and_invalid_measurements(truth: Descent, exact: ImuIncrements) -> None:
+def test_updates_outside_the_history_and_invalid_ones_are_ignored(truth: Descent, exact: ImuIncrements) -> None:
     navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
-    navigation.propagate(part(exact, 0, 4000))
+    navigation.propagate(slice_increments(exact, 0, 4000))
     before = navigation.state_at(10.0)
     flat = (0.0, np.zeros(2))
     assert navigation.update_altitude(1.0, 3900.0, flat).outcome is UpdateOutcome.OUTSIDE_HISTORY
@@ -333,7 +333,7 @@ def test_updates_outside_the_history_and_invalid_measurements(truth: Descent, ex
     assert navigation.update_altitude(10.0, 100.0, flat).outcome is UpdateOutcome.REJECTED
     none = np.zeros((0, 2))
     assert navigation.update_landmarks(10.0, CAMERA, np.zeros((0, 3)), none).outcome is UpdateOutcome.TOO_FEW
-    points, pixels = see_landmarks(truth, 10.0, 20, np.random.default_rng(4))
+    points, pixels = draw_points(truth, 10.0, 20, np.random.default_rng(4))
     invalid = navigation.update_landmarks(10.0, CAMERA, points, np.full_like(pixels, np.nan))
     assert invalid.outcome is UpdateOutcome.TOO_FEW
     after = navigation.state_at(10.0)
@@ -361,7 +361,7 @@ def simulate(
     )
     for second, (points, exact_pixels) in enumerate(landmarks):
         first = round(second * RATE_HZ)
-        navigation.propagate(part(measured, first, first + round(RATE_HZ)))
+        navigation.propagate(slice_increments(measured, first, first + round(RATE_HZ)))
         image_s = second + 0.5
         pixels = exact_pixels + 0.3 * rng.standard_normal(exact_pixels.shape)
         mapped = points + 3.0 * rng.standard_normal(points.shape) + 4.0 * rng.standard_normal(3)
@@ -378,7 +378,7 @@ def simulate(
 def test_estimates_are_consistent(truth: Descent, exact: ImuIncrements) -> None:
     """NEES of 60 runs: the sum is chi-square with 3 x 60 (9 x 60) degrees of freedom."""
     runs = 60
-    landmarks = [see_landmarks(truth, second + 0.5, 40, np.random.default_rng([second, 4])) for second in range(3)]
+    landmarks = [draw_points(truth, second + 0.5, 40, np.random.default_rng([second, 4])) for second in range(3)]
     results = [simulate(truth, exact, landmarks, seed) for seed in range(runs)]
     for block in (slice(0, 3), slice(3, 6), slice(6, 9), slice(0, 9)):
         size = block.stop - block.start
@@ -396,8 +396,8 @@ def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) 
     covariance = np.diag(np.repeat([100.0, 1.0, 0.005], 3) ** 2)
     errors = np.sqrt(np.diag(covariance)) * rng.standard_normal(9)
     navigation = NavigationFilter.from_initial(initial_state(truth, covariance, errors))
-    navigation.propagate(part(exact, 0, 800))
-    points, pixels = see_landmarks(truth, 2.0, 150, rng)
+    navigation.propagate(slice_increments(exact, 0, 800))
+    points, pixels = draw_points(truth, 2.0, 150, rng)
     pixels += 0.3 * rng.standard_normal(pixels.shape)
     wrong = rng.permutation(150) < 45
     pixels[wrong] += rng.uniform(-40.0, 40.0, (45, 2))
@@ -415,8 +415,8 @@ def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) 
 def test_systematically_wrong_landmarks_are_inconsistent(truth: Descent, exact: ImuIncrements) -> None:
     """A repetitive pattern: all landmarks agree on a position that is wrong by 400 m, 8 standard deviations."""
     navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
-    navigation.propagate(part(exact, 0, 800))
-    points, pixels = see_landmarks(truth, 2.0, 80, np.random.default_rng(7))
+    navigation.propagate(slice_increments(exact, 0, 800))
+    points, pixels = draw_points(truth, 2.0, 80, np.random.default_rng(7))
     result = navigation.update_landmarks(2.0, CAMERA, points + np.array([400.0, 0.0, 0.0]), pixels, 0.3)
     assert result.outcome in (UpdateOutcome.TOO_FEW, UpdateOutcome.INCONSISTENT)
     assert np.abs(state_errors(truth, navigation.state_at(2.0))[:3]).max() < 0.1
@@ -435,8 +435,8 @@ def test_rigid_landmarks_of_a_wrong_attitude_are_inconsistent(
     height = truth.state(2.0).position_m[2]
     errors = np.concatenate([np.cross(tilt, [0.0, 0.0, height]), np.zeros(3), tilt])
     navigation = NavigationFilter.from_initial(initial_state(truth, covariance, errors))
-    navigation.propagate(part(exact, 0, 800))
-    points, pixels = see_landmarks(truth, 2.0, 100, np.random.default_rng(7))
+    navigation.propagate(slice_increments(exact, 0, 800))
+    points, pixels = draw_points(truth, 2.0, 100, np.random.default_rng(7))
     before = navigation.state_at(2.0)
     result = navigation.update_landmarks(2.0, CAMERA, points, pixels, 0.3, 6.0, 10.0, is_rigid=True)
     if tilt_deg == 0.0:
@@ -445,7 +445,7 @@ def test_rigid_landmarks_of_a_wrong_attitude_are_inconsistent(
         return
     assert result.outcome is UpdateOutcome.INCONSISTENT
     assert not result.inliers.any()
-    # ten times the limit of 33
+    # far above the chi-square limit of 33
     assert result.shift_square > 300.0
     np.testing.assert_array_equal(navigation.state_at(2.0).position_m, before.position_m)
 
@@ -455,8 +455,8 @@ def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: Im
     deviations = []
     for common in (0.0, np.array([6.0, 6.0, 10.0])):
         navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
-        navigation.propagate(part(exact, 0, 800))
-        points, pixels = see_landmarks(truth, 2.0, 150, np.random.default_rng(8))
+        navigation.propagate(slice_increments(exact, 0, 800))
+        points, pixels = draw_points(truth, 2.0, 150, np.random.default_rng(8))
         result = navigation.update_landmarks(2.0, CAMERA, points, pixels, 0.3, 1.0, common)
         assert result.outcome is UpdateOutcome.APPLIED
         deviations.append(np.sqrt(np.diag(navigation.state_at(2.0).covariance)[:3]))
@@ -466,12 +466,12 @@ def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: Im
     assert np.all(deviations[1] > 0.999 * minimum)
 
 
-def test_print_speed(truth: Descent, exact: ImuIncrements, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_times_are_printed(truth: Descent, exact: ImuIncrements, capsys: pytest.CaptureFixture[str]) -> None:
     navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE), FilterOptions())
     start = time.perf_counter()
     navigation.propagate(exact)
     propagation = time.perf_counter() - start
-    points, pixels = see_landmarks(truth, 59.0, 150, np.random.default_rng(9))
+    points, pixels = draw_points(truth, 59.0, 150, np.random.default_rng(9))
     pixels[:45] += 30.0
     start = time.perf_counter()
     navigation.update_landmarks(59.0, CAMERA, points, pixels, 0.3, 3.0, 3.0)

@@ -51,6 +51,7 @@ INITIAL = InitialState(
 
 
 def make_increments(first: int, last: int) -> ImuIncrements:
+    """Draw the increments between two boundaries of `TIMES_S`."""
     angles, velocities = RNG.normal(0.0, 1e-3, (2, last - first, 3))
     return ImuIncrements(TIMES_S[first : last + 1], 0.01, angles, velocities)
 
@@ -93,6 +94,7 @@ def write_program(folder: Path, text: str) -> str:
 
 
 def run(spec: str, **limits: float) -> StreamAnswers:
+    """Run the algorithm of a specification on `EVENTS`; limits: those of `ExecutableLimits`."""
     estimator = LOCALISATION.make(spec, LvsOptions(), ExecutableLimits(**{"time_s": 60.0, **limits}))
     return feed(estimator, INITIAL, MAP, EVENTS)
 
@@ -178,6 +180,7 @@ for line in sys.stdin:
 
 
 def write_plain(folder: Path, body: str, header: str = "") -> str:
+    """Write `PLAIN` with `body` as the line that each request runs, after the lines of `header`."""
     return write_program(folder, header + PLAIN.replace("# BODY", body))
 
 
@@ -194,13 +197,14 @@ def test_each_descent_has_its_own_process_and_order_of_messages(tmp_path: Path) 
 
 
 def test_an_estimator_starts_again_in_the_same_process(tmp_path: Path) -> None:
-    command = parse_command(f"serve:{write_plain(tmp_path, 'answer.get(chr(97))')}")
+    command = parse_command(f"serve:{write_plain(tmp_path, 'pass')}")
     assert command is not None
     estimator = ExecutablePositionEstimator(command, ExecutableLimits(time_s=60.0))
     first, second = (feed(estimator, INITIAL, MAP, EVENTS) for _ in range(2))
     assert first.outcome is second.outcome is PositionOutcome.NO_COARSE_FIX
 
 
+#: A line for `PLAIN` that makes the answers to image and finish valid.
 VALID = 'answer = {**STATE, "outcome": "VALID", "time_s": 0.5} if "outcome" in answer and answer["outcome"] else answer'
 
 

@@ -20,7 +20,7 @@ from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, MastImage, RoverMeasurements, RoverTarget
 
-#: The MER mast: the axes intersect 1.4 m above the rover frame; elbow and head are offset from the axes.
+#: A mast similar to that of MER: the axes are at 1.4 m above the rover frame; elbow and head are offset from the axes.
 MAST = MastGeometry(
     base_m=np.array([0.35, 0.05, 1.1]), elbow_m=np.array([0.02, 0.01, 0.3]), head_m=np.array([0.06, 0.0, 0.08])
 )
@@ -131,7 +131,7 @@ class Scene:
     def render_image(
         self, camera: CameraModel, box: PixelBox, noise: np.random.Generator | None = None, noise_dn: float = 8.0
     ) -> MastImage:
-        """Render a part of the frame; each texture wave is averaged over the extent of the central pixel.
+        """Render a subframe; each texture wave is averaged over the extent of the central pixel.
 
         The average over a parallelogram attenuates a wave by a product of two sinc functions. `noise_dn` is the SD of
         the noise.
@@ -215,9 +215,10 @@ class Drive:
         )[0]
 
 
-#: Options with a smaller search window than the paper's, for smaller computed image parts.
+#: Options with a smaller search window than the paper's, so that smaller subframes are rendered.
 SMALL_WINDOW = VttOptions(search_px=101, warp="bend")
 
+#: Function of a seed and the target's position that returns a body with the target on its surface.
 MakeBody = Callable[[int, np.ndarray], Plane | Sphere]
 
 
@@ -237,6 +238,7 @@ def make_boulder(seed: int, target: np.ndarray) -> Sphere:
 
 
 def make_scene(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
+    """Create a scene of one body with a random texture."""
     return Scene((body,), draw_waves(seed, count=100), target)
 
 
@@ -255,9 +257,9 @@ def get_pixel(update: TargetUpdate) -> np.ndarray:
 def drive_to_target(
     drive: Drive, target: np.ndarray, fraction: float, goal_m: float = 2.0, slip: float = 0.0
 ) -> list[tuple[RigidTransform, TargetUpdate]]:
-    """Drive towards the target until it is near or lost; each step is a fraction of the distance.
+    """Drive along x towards the target until it is `goal_m` away or lost; each step is a fraction of the distance.
 
-    Returns the true pose and the update of each stop.
+    `slip` is the fraction of each step that the rover does not move. Returns the true pose and the update of each stop.
     """
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     stops, x, estimated_x = [], 0.0, 0.0

@@ -33,7 +33,8 @@ def test_ten_pixel_drift_matches_the_paper() -> None:
 
 
 def test_table_1_requires_the_specified_pixel_pitch() -> None:
-    # The text derives a pitch of 4.69 um from the sensor size (4.8 mm / 1024), which results in 9.8 and 39.1 cm.
+    # The text of the paper derives a pitch of 4.69 um from the sensor size (4.8 mm / 1024); with this pitch the errors
+    # would be 9.8 and 39.1 cm.
     designs = [
         StereoDesign(design.name, design.focal_length_m, 4.8e-3 / 1024, design.baseline_m)
         for design in (PANCAM, NAVCAM)
@@ -43,6 +44,7 @@ def test_table_1_requires_the_specified_pixel_pitch() -> None:
 
 def test_errors_scale_with_range_and_focal_length() -> None:
     assert stereo_range_error_m(6.0, 1000.0, 0.2) == pytest.approx(9.0 * stereo_range_error_m(2.0, 1000.0, 0.2))
+    # range^2 x disparity error / (focal length x baseline): 4 m2 x 0.5 px / (1000 px x 0.2 m)
     assert stereo_range_error_m(2.0, 1000.0, 0.2, 0.5) == pytest.approx(0.01)
     # A pixel at 2 m: 0.58 mm and 1.55 mm.
     assert drift_error_m(2.0, PANCAM.focal_px, 1.0) == pytest.approx(0.58e-3, abs=5e-6)

@@ -27,6 +27,7 @@ from tests.algorithms.vtt.synthetic_drive import MAST, navcam, pancam, pose
 
 
 def draw_pose(rng: np.random.Generator) -> RigidTransform:
+    """Draw a pose with a random attitude and position."""
     return rigid(Rotation.random(rng=rng), rng.normal(0.0, 5.0, 3))
 
 
@@ -37,11 +38,11 @@ def draw_targets(seed: int, count: int) -> np.ndarray:
     return np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), rng.uniform(-0.3, 0.5, count)], axis=1)
 
 
-# ----- the target -----
+# ----- target coordinates -----
 
 
 def test_rover_and_site_coordinates_agree() -> None:
-    # 3 m north, 4 m east and 1 m below the origin.
+    # Site coordinates are north, east, down: 3 m north, 4 m east and 1 m below the origin.
     site = designated_position_world(SiteTarget(np.array([3.0, 4.0, 1.0])), pose(9.0, 9.0, 1.0))
     np.testing.assert_allclose(site, [4.0, 3.0, -1.0], atol=1e-12)
     # For a rover at (4, 1) that faces north, the target is 2 m ahead and 1 m below.
@@ -65,7 +66,7 @@ def test_bearings_are_clockwise_from_north(direction: tuple[int, int, int], degr
     assert np.degrees(bearing_rad(np.array(direction, dtype=np.float64))) == pytest.approx(degrees)
 
 
-# ----- the mast -----
+# ----- mast pointing -----
 
 
 def test_positive_azimuth_is_right_and_positive_elevation_is_up() -> None:
@@ -121,7 +122,7 @@ def test_pointing_a_pair_splits_the_disparity() -> None:
 
 
 def test_near_targets_need_pair_centred_pointing() -> None:
-    # 516 px of disparity at 2 m: more than half of 1024.
+    # 516 px of disparity at 2 m: if the left image is centred, the target is outside the right one of 1024 px.
     target = np.array([1.2, -0.1, 0.1])
     assert aim_at_position(target, pancam(), VttOptions()) is None
     aim = aim_at_position(target, pancam(), VttOptions(aim_pair=True))

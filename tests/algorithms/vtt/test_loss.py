@@ -15,6 +15,7 @@ from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
 OPTIONS = VttOptions()
+#: Evidence of a correct match.
 GOOD = {"match_score": 0.9, "stereo_score": 0.9, "distance_correction_m": 0.0, "position_correction_m": 0.0}
 TOLERANCES = Tolerances(distance_m=0.2, position_m=0.4)
 
@@ -50,8 +51,9 @@ def test_all_violated_criteria_are_reported() -> None:
 
 
 def test_tolerances_match_the_formula() -> None:
-    # Range error of the MER navcam for 1 px of disparity: R^2 / 244.5, which is 0.409 m at 10 m and 0.331 m at 9 m. The
-    # step of 1 m adds 0.2 m, and the direction error 0.27 m.
+    # Range error of the MER navcam for 1 px of disparity: R^2 / (1222.5 px x 0.2 m), which is 0.409 m at 10 m and
+    # 0.331 m at 9 m. The step of 1 m adds 20 %, 0.2 m; the direction error is 0.03 rad x 9 m = 0.27 m. The minimum of
+    # the tolerance is 0.05 m.
     result = tolerances(Distances(10.0, 10.0, 9.0, 1.0, 1.0), navcam().left, navcam().right, OPTIONS)
     assert result.distance_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2), abs=1e-3)
     assert result.position_m == pytest.approx(0.05 + np.sqrt(0.409**2 + 0.3313**2 + 0.2**2 + 0.27**2), abs=1e-3)
@@ -66,6 +68,7 @@ def test_tolerances_decrease_with_target_distance() -> None:
     assert np.all(np.diff([step.distance_m for step in step_tolerances]) < 0.0)
     assert step_tolerances[-1].distance_m < 0.11
     # The initial designation uncertainty and the rover drift remain: the tolerance is never below either of them.
+    # 0.409 m is the range error of the designation at 10 m.
     assert min(step.position_m for step in step_tolerances) > 0.409
 
 
@@ -116,8 +119,8 @@ def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     assert at_goal.outcome is HandOffOutcome.HANDED_OVER
     assert at_goal.target is not None
     np.testing.assert_array_equal(at_goal.target.position_rover, target_m)
-    # Eq. 5 of the tracking paper at 1.75 m, from the mast axis at (0.35, 1.4) m: 1.25 cm of stereo error, 0.36 cm of
-    # drift.
+    # Eq. 5 of the tracking paper at 1.735 m from the mast's elevation axis, which is 0.35 m ahead of the rover's origin
+    # and 1.4 m above it: 1.23 cm of stereo error, and 0.35 cm for a drift of 2.5 px.
     assert at_goal.target.error_m == pytest.approx(np.hypot(1.735**2 / 244.5, 2.5 * 1.735 / 1222.5), rel=0.01)
     lost_target = hand_off(TargetUpdate(LOST, (TargetLoss.LOW_MATCH_SCORE,), target_m), goal, navcam())
     assert (lost_target.outcome, lost_target.target) == (HandOffOutcome.NOT_TRACKED, None)

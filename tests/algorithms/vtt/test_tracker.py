@@ -1,4 +1,4 @@
-"""Tests of the closed-loop tracker on exact images of planes and spheres through distorting cameras."""
+"""Tests of the target tracker in the loop of drive, images and update, on exact images of planes and spheres."""
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 
+#: Fixture of conftest that writes a campaign file from its parameters, dispersions and other tables.
 CampaignFile = Callable[..., Path]
 #: Module of the fake scenarios.
 FAKE = "tests.campaigns.fake_scenario"
@@ -247,6 +248,7 @@ _random_words = st.sampled_from(_WORDS.split())
 
 
 def _to_toml(value: object) -> str:
+    """Format a value as TOML; all characters of texts are escaped."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(entry)}" for key, entry in value.items()) + "}"
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Tests of requirements: unknown columns in metrics and populations are reported before terrain is built."""
+"""Tests of the columns in requirements: unknown ones in metric or population are reported before terrain is built."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario
 
+#: A user's score function: its results are additional columns of a case.
 SCORE_MODULE = """
 def braking(case):
     return {"lateral_j": 1.0, "soft": True}
@@ -49,6 +50,7 @@ def test_misspelt_columns_are_reported_before_terrain_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, metric: str, population: str, bound: str, key: str, hint: str
 ) -> None:
     prepared_inputs: list[int] = []
+    # preparing a case builds its terrain
     monkeypatch.setattr(DescentScenario, "prepare", lambda _, __, number: prepared_inputs.append(number))
     path = _write_campaign(tmp_path, metric, population, bound)
     with pytest.raises(ConfigurationError) as error:

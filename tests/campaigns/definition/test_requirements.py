@@ -78,6 +78,7 @@ def test_unknown_id_and_changed_bound_are_reported(tmp_path: Path, entry: str, m
     assert message in str(error.value)
 
 
+#: A requirement of a user's file, for campaigns whose names begin with dimes-.
 ENTRY = (
     '[[requirements]]\nid = "A"\nmetric = "answered"\nprobability = 0.9\nconfidence = 0.9\ncampaigns = ["dimes-*"]\n'
 )
