@@ -110,9 +110,9 @@ def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_ima
 
 def test_meshes_of_users_are_not_rocks() -> None:
     """An image without rocks has no mean radiance of rocks, even if it shows a lander."""
-    frame = SimpleNamespace(body=np.array([[GROUND, 0]]), radiance=np.ones((1, 2)))
+    frame = cast(Frame, SimpleNamespace(body=np.array([[GROUND, 0]]), radiance=np.ones((1, 2))))
     scene = SimpleNamespace(objects=SimpleNamespace(names=np.array([FIRST_MESH_NUMBER])))
-    assert add_unresolved_rocks(cast(Frame, frame), cast(Scene, scene), cast(RockField, [None]), 1e-3, 0.0) is frame
+    assert add_unresolved_rocks(frame, cast(Scene, scene), cast(RockField, [None]), 1e-3, 0.0) is frame
 
 
 def test_ground_without_rocks_is_unchanged() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,7 +14,7 @@ from marsyard.algorithms.localisation import inertial_state as inertial
 from marsyard.algorithms.localisation import state_updates as updates
 from marsyard.algorithms.localisation.inertial_state import ImuErrorModel, IncrementHistory, NavigationState
 from marsyard.algorithms.localisation.interface import InitialState
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import NavigationFilter
 from marsyard.algorithms.localisation.state_updates import UpdateOutcome
 from marsyard.sim.camera import Cahvore, mount_looking_down
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates
@@ -464,17 +463,3 @@ def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: Im
     # posterior of prior and common error alone: 1 / (1 / 50^2 + 1 / 6^2), and 10 m in the height
     minimum = 1.0 / np.sqrt(1.0 / 50.0**2 + 1.0 / np.array([6.0, 6.0, 10.0]) ** 2)
     assert np.all(deviations[1] > 0.999 * minimum)
-
-
-def test_run_times_are_printed(truth: Descent, exact: ImuIncrements, capsys: pytest.CaptureFixture[str]) -> None:
-    navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE), FilterOptions())
-    start = time.perf_counter()
-    navigation.propagate(exact)
-    propagation = time.perf_counter() - start
-    points, pixels = draw_points(truth, 59.0, 150, np.random.default_rng(9))
-    pixels[:45] += 30.0
-    start = time.perf_counter()
-    navigation.update_landmarks(59.0, CAMERA, points, pixels, 0.3, 3.0, 3.0)
-    update = time.perf_counter() - start
-    with capsys.disabled():
-        print(f"\n60 s at 400 Hz: {propagation:.3f} s; 150 landmarks 1 s ago, 45 outliers: {1e3 * update:.1f} ms")

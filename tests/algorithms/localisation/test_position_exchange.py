@@ -179,9 +179,9 @@ for line in sys.stdin:
 """
 
 
-def write_plain(folder: Path, body: str, header: str = "") -> str:
-    """Write `PLAIN` with `body` as the line that each request runs, after the lines of `header`."""
-    return write_program(folder, header + PLAIN.replace("# BODY", body))
+def write_plain(folder: Path, body: str) -> str:
+    """Write `PLAIN` with `body` as the line that each request runs."""
+    return write_program(folder, PLAIN.replace("# BODY", body))
 
 
 def test_each_descent_has_its_own_process_and_order_of_messages(tmp_path: Path) -> None:
