@@ -17,7 +17,7 @@ demo: setup ## Run a small rendered descent campaign and write its report
 	@tools/demo.sh
 
 test: setup ## Run all checks and tests
-	@tools/lint.sh
+	@tools/compile_and_lint.sh
 	@tools/test.sh $(PYTEST_ARGS)
 
 lint: setup ## Run the static checks: ruff, mypy, import-linter, codespell

@@ -136,12 +136,6 @@ check_rendering() {
     [ -n "$works" ] || fail "no GL backend renders an image: $either"
 }
 
-# Otherwise the first run of each system compiles them.
-compile_kernels() {
-    say "compiling numeric kernels (about a minute)"
-    "$venv/bin/marsyard" compile >/dev/null </dev/null || say "kernels were not compiled: 'marsyard compile' shows the cause; the first runs compile them"
-}
-
 # One set-up at a time in one folder.
 if command -v flock >/dev/null; then
     exec 9<"$PWD"
@@ -163,7 +157,6 @@ install_compiler
 install_browser
 install_packages
 check_rendering
-compile_kernels
 rm -f "$unfinished"
 printf '%s %s' "$(foundation)" "$(contents)" >"$stamp"
 say "done"
