@@ -74,7 +74,7 @@ class LandmarkResult:
     - inliers: landmarks that agree with each other and with the state; all False if the points are invalid
     - residuals_px: measured minus expected pixels with the estimated state and common error; NaN if not visible
     - shift_square: squared length of the whitened correction, about chi-square with 6 degrees of freedom if
-      consistent; that of the motion of all landmarks if this motion is refused
+      consistent; after the outcome INCONSISTENT of the test of the rigid motion, the statistic of this test
     """
 
     outcome: UpdateOutcome
@@ -112,7 +112,8 @@ class LandmarkMeasurement:
     - pixel_sd: standard deviation per axis and landmark, pixels
     - point_sd_m: independent error of the points (east, north, up)
     - common_sd_m: error of the points that is equal for all landmarks of the image (east, north, up)
-    - is_rigid: whether one correction of position and attitude explains all pixels, so that no landmark is an outlier
+    - is_rigid: whether the matching has found that one correction of position and attitude explains all pixels; then
+      this correction is tested before landmarks are rejected one by one
     - alignment_sd_rad: error of the camera's alignment and calibration per axis, for the test of the rigid motion
     """
 
@@ -200,9 +201,9 @@ def update_landmarks(
 ) -> tuple[NavigationState, LandmarkResult]:
     """Update by the landmarks of an image, with rejection of outliers.
 
-    If the landmarks are known to move as a rigid body, their motion is tested first against the covariance
-    (`_test_rigid_motion`). A wrong attitude contradicts some landmarks more than others. After the rejection of these
-    landmarks as outliers, the remaining ones could agree with the wrong state.
+    If one correction explains all landmarks (`is_rigid`), it is tested first against the covariance
+    (`_test_rigid_motion`). Without this test, the steps below could reject the landmarks that contradict a wrong
+    attitude most, and apply an update by the remaining ones.
 
     1. Landmarks whose innovation is improbable before the update are rejected.
     2. Robust estimation by graduated non-convexity with truncated least squares (Yang et al. 2020, "Graduated
@@ -251,10 +252,10 @@ def _test_rigid_motion(
 ) -> tuple[float, Float[np.ndarray, "n 2"]]:
     """Compute the normalised square of the motion that all landmarks show, and the residuals of the expected motion.
 
-    The motion x is that of the body frame, without prior knowledge of position and attitude, and has the covariance C.
-    The minima of the least-squares problem with and without the prior covariance P differ by x' (P + C)^-1 x. This is
-    chi-square with 6 degrees of freedom for any residuals of the landmarks. P contains the error of the
-    camera's alignment, which one image does not distinguish from an attitude error.
+    The motion x of the body frame is estimated without prior knowledge of position and attitude; C is its covariance.
+    The minima of the least-squares problem with and without the prior covariance P differ by x' (P + C)^-1 x. If the
+    state is consistent, this difference is chi-square with 6 degrees of freedom, however well the landmarks fit. P
+    contains the error of the camera's alignment, which one image does not distinguish from an attitude error.
     """
     costs, weights = [], visible.astype(np.float64)
     alignment = np.zeros(ERRORS)
@@ -322,8 +323,8 @@ class _LandmarkProblem:
             target = flat_weighted.T @ (residuals.reshape(-1) + flat @ whitened)
             previous, whitened = whitened, np.linalg.solve(information, target)
             linearisation, residuals = self.linearise(whitened)
-            # In standard deviations before the update. Gauss-Newton steps shrink by about 1e-3 each, so that the
-            # remaining error is 1e-7 of them.
+            # Whitened errors have the unit of one standard deviation before the update. A Gauss-Newton step is about
+            # 1e-3 of the previous one, so the error after a step below 1e-4 is about 1e-7 standard deviations.
             if np.abs(whitened - previous).max() < 1e-4:
                 break
         squares = _normalise(residuals, linearisation.noise)

@@ -1,4 +1,7 @@
-"""Conformance checks of user-defined parts: motions, instruments, scores (`marsyard.scenarios.parts`)."""
+"""Conformance checks of user-defined parts: motions (kind `DYNAMICS`), instruments and scores.
+
+Parts are described in `marsyard.scenarios.parts`.
+"""
 
 from __future__ import annotations
 
@@ -21,6 +24,7 @@ from marsyard.algorithms.interface import (
 )
 from marsyard.scenarios.conformance import inputs, trackers
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
+from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.landing.images import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.parts import scores
@@ -38,21 +42,26 @@ _NORMAL = np.array([-_SLOPE, 0.0, 1.0]) / np.hypot(_SLOPE, 1.0)
 
 
 def determine_kind(spec: str) -> str | None:
-    """Determine the kind of a part by its entry point, the members of its class, or the annotations of its function.
+    """Determine the kind of a part by its entry point, the members of its class, or the annotation of its function.
 
-    Returns None if they are ambiguous.
+    Returns None if these do not determine it: for example, any function could be a score, so one without annotation
+    is not recognised as such.
     """
     name = next((kind.name for kind in KINDS.values() if spec in list_installed(kind.group)), None)
     if name is not None or ":" not in spec:
         return name
     try:
-        part = DYNAMICS.load(spec)
-    except ValueError:
+        part = import_object(spec)
+    except (ImportError, ValueError):
         return None
     if isinstance(part, type):
         return next((kind.name for kind in (DYNAMICS, INSTRUMENT) if hasattr(part, kind.members[0])), None)
-    accepted_cases = scores.accepted_cases(part) if callable(part) else scores.SCORED
-    return SCORE.name if accepted_cases and accepted_cases != scores.SCORED else None
+    if not callable(part):
+        return None
+    accepted_types = scores.accepted_cases(part)
+    # the types of a function without annotation are all types
+    is_annotated = accepted_types != scores.SCORED
+    return SCORE.name if accepted_types and is_annotated else None
 
 
 @dataclass(frozen=True)
@@ -69,11 +78,11 @@ class PartSuite(Suite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         advice = "see docs/custom-parts.md for inputs and outputs"
-        requirement = "returns the output of its kind: right shapes, finite and in order"
+        requirement = "returns the output of its kind: arrays of the right shapes, finite values, increasing times"
         yield Check(
             "answer", requirement, advice, lambda: ", ".join(_describe(self._answer(case)) for case in self.cases())
         )
-        requirement = "reports the same columns in every case: identifiers, with numbers or booleans"
+        requirement = "reports the same columns in every case: names are identifiers, values are numbers or booleans"
         yield Check(
             "columns", requirement, "report every column in every case; NaN for a missing number", self._check_columns
         )
@@ -103,6 +112,7 @@ class PartSuite(Suite):
             if self.kind is DYNAMICS:
                 answer = check_poses(self.spec, answer, case)
                 attitudes = Rotation.from_quat(answer.quaternions_xyzw)
+                # raises ValueError if no motion can be interpolated between the poses
                 RecordedMotion(answer.times_s, answer.positions_m, attitudes, case.gravity_m_s2)
             else:
                 answer = check_readings(self.spec, answer, self.make().quantity, case.times_s.size)
