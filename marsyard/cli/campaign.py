@@ -157,10 +157,14 @@ def replay(
         Path | None, Option(metavar="DIR", help="Folder of images and results; by default DIR/cases/CASE.")
     ] = None,
     save_stages: Annotated[
-        bool, Option("--save-stages", help="Also write the result of each processing stage to stages/.")
+        bool,
+        Option(
+            "--save-stages",
+            help="Also write each intermediate result as a file of its own to stages/ (.npy, .png or .json).",
+        ),
     ] = False,
 ) -> None:
-    """Run one case again, write and plot its intermediate results, and compare its results with the stored ones."""
+    """Run one case again, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as rerun_case
     from marsyard.campaigns.store.products import (
         case_directory,

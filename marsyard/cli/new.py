@@ -32,17 +32,27 @@ class NewOptions:
     name: Annotated[str, Argument(metavar="NAME", help="Name of the campaign; the file is NAME.toml.")]
     system: Annotated[
         str | None,
-        Option(help="Type of the system under test, such as velocity, tracking or landing; `list` prints all."),
+        Option(help="Type of the system under test, such as velocity, tracking or landing; an unknown one lists all."),
     ] = None
     site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
-    camera: Annotated[str | None, Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md).")] = None
+    camera: Annotated[
+        str | None,
+        Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md); by default the paper's camera."),
+    ] = None
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
-    flight: Annotated[str | None, Option(metavar="FILE", help="Trajectory file instead of simulated dynamics.")] = None
+    flight: Annotated[
+        str | None,
+        Option(
+            metavar="FILE", help="Recorded trajectory (docs/custom-worlds.md); by default the dynamics are simulated."
+        ),
+    ] = None
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
     bound: Annotated[
         float | None,
         Option(
-            metavar="X", help="Requirement limit: maximum error in its unit, or minimum fraction of successful cases."
+            metavar="X",
+            help="Limit of the requirement: maximum error of velocity (m/s) or of the target's position (m), or "
+            "minimum fraction of selected landing sites that are safe.",
         ),
     ] = None
     cases: Annotated[int, Option("--cases", "-n", metavar="N", min=1, help="Number of cases.")] = 24
@@ -175,12 +185,12 @@ def ingest(
     system: Annotated[
         str | None,
         Option(
-            help="System that estimates from the images (see `marsyard new`); by default `measured`: velocity, "
-            "compared with the measured poses."
+            help="System that reads the folder; the default, `measured`, tests the kind of algorithm that ingest.toml "
+            "states as `task`: velocity, landing or matching."
         ),
     ] = None,
 ) -> None:
-    """Create a campaign from recorded images with measured attitude and altitude."""
+    """Create a campaign from recorded images with measured poses (attitude and altitude, or position)."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count

@@ -217,11 +217,17 @@ class RenderOptions:
     """Arguments and options of `marsyard render`."""
 
     site: SiteArgument
-    camera: Annotated[str, Option(metavar="NAME", help="Camera such as mer-navcam; `list` prints all.")]
+    camera: Annotated[
+        str, Option(metavar="NAME", help="Camera, such as mer-navcam or mer-descent-flown; an unknown name lists all.")
+    ]
     out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
     scale: Annotated[
         str | None,
-        Option(metavar="SCALE", help="Terrain resolution: descent or ground; by default that of the camera."),
+        Option(
+            metavar="SCALE",
+            help="Terrain of the site: descent (kilometres, coarse) or ground (100 m, fine); by default that of the "
+            "camera.",
+        ),
     ] = None
     altitude: Annotated[
         float | None,
@@ -234,7 +240,10 @@ class RenderOptions:
         float | None, Option(metavar="M", help="North coordinate of the camera; by default 0, or the DTM centre.")
     ] = None
     azimuth: Annotated[float, Option(metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
-    elevation: Annotated[float | None, Option(metavar="DEG", help="Elevation of the optical axis; -90: down.")] = None
+    elevation: Annotated[
+        float | None,
+        Option(metavar="DEG", help="Elevation of the optical axis, -90 is down; by default typical for the camera."),
+    ] = None
     sun_azimuth: Annotated[float, Option(metavar="DEG", help="Sun azimuth, clockwise from north.")] = 250.0
     sun_elevation: Annotated[float, Option(metavar="DEG", help="Sun elevation above the horizon.")] = 35.0
     detector: Annotated[
@@ -248,7 +257,9 @@ class RenderOptions:
 
 @with_options(RenderOptions)
 def render(arguments: RenderOptions) -> None:
-    """Render an image of a site or DTM. Writes PREFIX.png (16 bits), .npz (ground truth), .cahvor (camera) and .json.
+    """Render an image of a site or DTM.
+
+    Writes PREFIX.png (16 bits), PREFIX.npz (ground truth), PREFIX.cahvor (camera) and PREFIX.json (settings).
 
     A stereo camera adds -left and -right to PREFIX.
     """
