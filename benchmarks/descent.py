@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from benchmarks.images import descent_pose, descent_scene
-from benchmarks.minimum_costs import measure_minimum_costs
 from benchmarks.stages import measure_stages
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
@@ -36,10 +35,7 @@ def measure_frame(repeats: int) -> list[Measurement]:
 
 
 def measure_case(repeats: int) -> list[Measurement]:
-    """Measure complete `dimes-gusev` cases over one prepared terrain, their stages and their minimum costs.
-
-    The minimum costs are those of the operations that any implementation needs (`benchmarks.minimum_costs`).
-    """
+    """Measure complete `dimes-gusev` cases over one prepared terrain, and their stages."""
     campaign = load_campaign("dimes-gusev")
     case_numbers = itertools.count()
 
@@ -53,7 +49,6 @@ def measure_case(repeats: int) -> list[Measurement]:
             "dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0
         ),
         *measure_stages(run_next, repeats),
-        *measure_minimum_costs(run_next, repeats),
     ]
 
 
