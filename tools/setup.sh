@@ -117,11 +117,13 @@ make_venv() {
 
 install_packages() {
     say "installing the packages pinned in constraints.txt (about a minute)"
-    local install=("$venv/bin/python" -m pip install -qq --no-input --disable-pip-version-check --progress-bar off -c constraints.txt)
+    local install=("$venv/bin/python" -m pip install -qq --no-input --disable-pip-version-check --progress-bar off --no-compile -c constraints.txt)
     : >"$unfinished"
     # setuptools first, with its pinned version: an isolated build would download another version
     "${install[@]}" pip setuptools
     "${install[@]}" --no-build-isolation -e '.[dask,dev,docs,geo,spice]'
+    # on all cores; pip would use one
+    "$venv/bin/python" -m compileall -q -j 0 "$venv/lib" >/dev/null || true
 }
 
 check_rendering() {
