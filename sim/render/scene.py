@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -45,6 +46,14 @@ NO_SHADOW = GroundShadow(
 _RIM_DIRECTIONS, _MARGIN = 64, 0.01
 #: Additional samples at each border of a grid that covers only the visible ground, for interpolation and rounding.
 _BORDER_SAMPLES = 4
+
+
+def _read_only(value: Any) -> Any:
+    """Return a read-only view of an array, for which numba has compiled the kernels; other values unchanged."""
+    if isinstance(value, np.ndarray):
+        value = value.view()
+        value.setflags(write=False)
+    return value
 
 
 @dataclass(frozen=True)
@@ -157,7 +166,8 @@ class Scene:
         """Relief, textures, normals and albedo, as input of the kernels."""
         objects = self.objects
         textures = self.ground_texture.arrays(), self.object_texture.arrays()
-        return Materials(self.relief, *textures, objects.normals, objects.body_of_triangle, objects.albedo)
+        relief = MicroRelief(*map(_read_only, self.relief))
+        return Materials(relief, *textures, objects.normals, objects.body_of_triangle, objects.albedo)
 
     def light(self, time_s: float) -> Light:
         """Return the illumination at a time, as input of the kernels."""

@@ -38,6 +38,11 @@ class Surface:
     spacing_m: float
     factors: Float32[np.ndarray, "side side 3"] = field(default_factory=lambda: UNIFORM)
 
+    def __post_init__(self) -> None:
+        # numba compiles kernels anew for writable arrays
+        for level in self.levels:
+            level.setflags(write=False)
+
     @classmethod
     def from_samples(
         cls,
@@ -53,8 +58,6 @@ class Surface:
         levels = [np.ascontiguousarray(samples)]
         while levels[-1].shape[0] > SMALLEST_LEVEL:
             levels.append(reduce_level(levels[-1]))
-        for level in levels:
-            level.setflags(write=False)
         return cls(tuple(levels), spacing_m, factors)
 
     @property
