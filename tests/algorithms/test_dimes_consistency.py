@@ -135,6 +135,7 @@ def draw_track_errors(rng: np.random.Generator, cases: int) -> np.ndarray:
     return errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
 @pytest.mark.parametrize("wrong_by", [10.0, 20.0, 55.0])
 def test_one_wrong_track_rarely_causes_a_wrong_velocity(tracks_per_pair: int, wrong_by: float) -> None:

@@ -113,6 +113,7 @@ def test_program_matches_python_tracker(tmp_path: Path) -> None:
     end_idle_programs()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("import_path")
 def test_only_a_persistent_process_serves_many_runs(tmp_path: Path) -> None:
     command = write_server(tmp_path)

@@ -11,6 +11,9 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
+#: The build takes a minute.
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[2] / "docs"
 #: Minimum number of pages of the site; fewer pages mean that the build skipped some.
 MIN_PAGES = 40

@@ -53,13 +53,8 @@ INSTALL_FOLDER = "installed"
 EXIT_CODES = re.compile(r"# exits with (\d)(?: or (\d))?")
 
 
-@pytest.mark.parametrize(
-    "tutorial",
-    [
-        pytest.param(path, id=path.stem, marks=() if path.stem == "first-campaign" else pytest.mark.slow)
-        for path in TUTORIALS
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=[path.stem for path in TUTORIALS])
 def test_tutorial_commands_succeed(tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = tutorial.read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)

@@ -133,6 +133,7 @@ def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
     process.wait()
 
 
+@pytest.mark.slow
 def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Command) -> None:
     path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
     _kill_after_first_rows(path, tmp_path / "run", 40)

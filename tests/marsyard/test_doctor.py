@@ -41,6 +41,7 @@ def set_check(monkeypatch: pytest.MonkeyPatch) -> Callable[[Check], None]:
     return lambda check: monkeypatch.setattr(doctor, "run_checks", lambda: iter([check]))
 
 
+@pytest.mark.slow
 def test_all_checks_pass_on_this_machine() -> None:
     status, text = run_doctor()
     assert status == 0, text

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
@@ -23,6 +24,7 @@ def run_command(*arguments: str) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.slow
 def test_ingested_images_are_run_and_reported(tmp_path: Path) -> None:
     folder, cases, run = (
         write_landing_folder(tmp_path / "in", inputs.landing(), "matching"),

@@ -97,6 +97,7 @@ def test_stored_rows_are_evaluated_again(make_run: MakeRun, marsyard: Command, t
     assert (status, "no requirement lists the campaign" in err) == (2, True)
 
 
+@pytest.mark.slow
 def test_pdf_is_written(make_run: MakeRun, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     directory = make_run("run")
     assert shutil.which("chromium"), "the test needs Debian's Chromium"
@@ -192,6 +193,7 @@ def test_adaptive_campaign_reports_its_end(tmp_path: Path) -> None:
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
 
 
+@pytest.mark.slow
 def test_gallery_reruns_each_notable_case_once(tmp_path: Path, marsyard: Command) -> None:
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path, directory = write_campaign(tmp_path, dispersions=dispersions), tmp_path / "run"

@@ -118,6 +118,7 @@ RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
 def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
     text, page, report = _write_and_read(make_run(RUNS[kind](make_rows)))

@@ -209,6 +209,7 @@ def test_tracker_defects_are_reported(
     assert problem in run_suite(spec, check)[check].problem
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lines", "problem"),
     [

@@ -176,6 +176,7 @@ def test_alternating_headings_reduce_the_effect_of_drift() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run_index", [0, 2, 4])
 def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nearly all targets are detected on lava, dunes and the lake bed.

@@ -73,6 +73,7 @@ def test_navigation_camera_sees_the_hills_of_gusev_above_the_horizon(gusev_image
     assert not np.any(column[np.argmax(column == HILL_NAME) :] == SKY)
 
 
+@pytest.mark.slow
 def test_rover_is_visible_at_the_sides_of_its_hazard_camera() -> None:
     request = ImageRequest.from_defaults("meridiani", "mer-hazcam")
     image = render_images(request, detector=False, both=False)[0]

@@ -140,6 +140,7 @@ def assert_flight_inputs_differ(
         assert_differs("altitude", altitude.altitude_m, altitude_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(3))
 def test_field_test_inputs_differ_from_truth(case: int) -> None:
     """Time tags are not compared: as in the paper (III.D), their intervals equal the virtual interval."""

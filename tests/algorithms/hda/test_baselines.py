@@ -54,6 +54,7 @@ def test_rectified_points_have_equal_rows_and_inverse_depth_disparity(landing_sc
     np.testing.assert_allclose(u1 - u2, pair.focal_px * pair.baseline_m / first[:, 2], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> None:
     features = select_features(landing_scene.views[0].counts, OPTIONS)
     tracks = track_features(landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, OPTIONS)

@@ -104,6 +104,7 @@ def is_clear_of_boulders(scene: Pass, x: float, y: float) -> bool:
     return all(np.hypot(x - cx, y - cy) > 0.5 + 2.0 * radius for cx, cy, _, radius in BOULDERS)
 
 
+@pytest.mark.slow
 @all_estimators
 def test_site_is_on_the_ground_and_clear_of_boulders(name: str, scene: Pass, measurements: LandingMeasurements) -> None:
     result = ESTIMATORS[name](OPTIONS).estimate(measurements)

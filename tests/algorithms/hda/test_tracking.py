@@ -157,6 +157,7 @@ def test_tracks_over_relief_match_exact_scene() -> None:
     assert np.sqrt(np.mean((aligned.second - true_pixels)[is_correct] ** 2)) < 0.015
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "second",
     [

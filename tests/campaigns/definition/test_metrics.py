@@ -73,8 +73,3 @@ def test_score_columns_and_algorithm_columns_are_accepted(tmp_path: Path, monkey
         load_campaign(str(path))
     comparison = _write_campaign(tmp_path, "homography.velocity_error_m_s", "answered")
     load_campaign(str(comparison), algorithms=["dimes", "homography"])
-
-
-@pytest.mark.parametrize("name", list(catalogue()))
-def test_catalogue_campaigns_use_known_columns(name: str) -> None:
-    load_campaign(name)

@@ -105,6 +105,7 @@ def fork_sleeping_child() -> int:
     return child
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["thread", "pool", "fork", "session", "orphan"])
 def test_processes_started_by_a_case_end_with_the_case(kind: str, tmp_path: Path) -> None:
     start_s = time.monotonic()
@@ -129,6 +130,7 @@ def wait_for_child_in_new_session(folder: str, item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_time_limit_ends_child_in_separate_session(tmp_path: Path) -> None:
     start_s = time.monotonic()
     results = run_items(partial(wait_for_child_in_new_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
@@ -150,6 +152,7 @@ def signal_supervisor(signal_number: int, folder: str, item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGKILL, signal.SIGSTOP])
 def test_signal_to_supervisor_ends_only_the_case(signal_number: int, tmp_path: Path) -> None:
     start_s = time.monotonic()
@@ -302,6 +305,7 @@ def close_files(item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_case_that_closes_worker_files_is_the_only_crashed_case() -> None:
     results = run_items(close_files, range(4))
     assert str(results[1].error) == "the case closed or replaced the worker's file descriptors"
@@ -322,6 +326,7 @@ def share_memory(item: int) -> int:
     return int(block[item])
 
 
+@pytest.mark.slow
 def test_memory_shared_by_forked_children_is_counted_once() -> None:
     # five processes with 100 MB each would exceed 0.3 GB if shared pages counted five times
     results = run_items(share_memory, [0], WorkLimits(memory_bytes=0.3e9))

@@ -170,6 +170,7 @@ def leak_memory(item: int, arrays: list[object] = []) -> int:  # noqa: B006  (th
     return item
 
 
+@pytest.mark.slow
 def test_memory_leak_of_earlier_tasks_does_not_end_a_task() -> None:
     # twelve tasks leak 32 MB each
     limits = WorkLimits(memory_bytes=0.2e9)

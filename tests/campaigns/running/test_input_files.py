@@ -55,6 +55,7 @@ def finished_campaign(campaign_file: CampaignFile, tmp_path: Path, watch: Record
     return run(campaign_file(f'table = "{table}"'), tmp_path / "done", watch, "cases=2", jobs=1)
 
 
+@pytest.mark.slow
 def test_changed_input_file_is_detected(finished_campaign: Path, table: Path, watch: RecordingWatch) -> None:
     assert list(record.read(finished_campaign)["identity"]["inputs"]) == [str(table)]
     resume_campaign(finished_campaign, ExecutorConfig(1), watch)

@@ -160,6 +160,7 @@ with stop_on_signals():
     assert (process.returncode, errors) == (130, b"killed\n")
 
 
+@pytest.mark.slow
 def test_changes_of_the_worker_process_are_reported(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:

@@ -83,6 +83,7 @@ def write_answers(path: Path, answers: dict[int, VelocityEstimate]) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_external_answers_are_scored_as_in_a_normal_run(export: ExportFolders, tmp_path: Path) -> None:
     watch = RecordingWatch()
     answers = write_answers(tmp_path / "external.csv", estimate_exported_cases(export))

@@ -80,6 +80,7 @@ def test_unsupported_products_do_not_stop_the_campaign(
     assert "products.unsupported is a object; allowed" in watch.notes[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "cases"),
     [

@@ -99,6 +99,7 @@ def test_interaction_of_two_sources_is_divided_between_them(campaign_path: Path,
     assert result.budget.closure == pytest.approx(1.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_cases_without_an_error_in_a_configuration_are_excluded(campaign_path: Path, tmp_path: Path) -> None:
     result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "refused_fraction=0.25")
     assert result.budget is not None
@@ -146,6 +147,7 @@ def test_killed_budget_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     assert "Largest contributions to the mean square: gyroscope" in resume_result.stdout
 
 
+@pytest.mark.slow
 def test_case_without_a_source_replays(campaign_path: Path, tmp_path: Path) -> None:
     run_budget(campaign_path, tmp_path / "run", BudgetSettings("ERROR", 20))
     rows = read_case_rows(tmp_path / "run")
@@ -215,6 +217,7 @@ def test_sources_of_all_scenarios_have_valid_values() -> None:
     assert set(campaigns) == {name for name in scenario_names() if error_sources(name)}
 
 
+@pytest.mark.slow
 def test_study_ends_if_all_first_cases_crash(
     campaign_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

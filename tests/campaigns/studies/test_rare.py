@@ -47,6 +47,7 @@ def rows_without_times(directory: Path) -> list[dict[str, object]]:
     return [{name: value for name, value in row.items() if name not in TIMES} for row in read_case_rows(directory)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.6])
 def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, noise: float) -> None:
     result = run_study(campaign_path, tmp_path / "run", SETTINGS, f"noise={noise}")
@@ -66,6 +67,7 @@ def test_importance_sampling_interval_contains_the_probability(campaign_path: Pa
     assert result.interval.upper / result.interval.lower < 2.0
 
 
+@pytest.mark.slow
 def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: Path) -> None:
     by_bound = run_study(campaign_path, tmp_path / "bound")
     by_margin = run_study(campaign_path, tmp_path / "margin", replace(SETTINGS, requirement="MARGIN"))
@@ -87,6 +89,7 @@ def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path
     assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]
 
 
+@pytest.mark.slow
 def test_additional_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Path) -> None:
     first = run_study(campaign_path, tmp_path / "run")
     rows = rows_without_times(tmp_path / "run")
@@ -99,6 +102,7 @@ def test_additional_replicates_narrow_the_interval(campaign_path: Path, tmp_path
     assert second.interval.upper / second.interval.lower < first.interval.upper / first.interval.lower
 
 
+@pytest.mark.slow
 def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
     run_study(campaign_path, tmp_path / "run", SETTINGS, "noise=0.5")
     # a late case of a Markov chain, in general with the random streams of an earlier case
@@ -171,6 +175,7 @@ def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
         load_campaign(str(campaign_path), ["design.kind=adaptive"])
 
 
+@pytest.mark.slow
 def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Path) -> None:
     options = ["--requirement", "LOAD", "--max-probability", "1e-2", "--samples", "100", "--jobs", "1"]
     command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--out", str(tmp_path / "run")]

@@ -32,6 +32,7 @@ def _draw_cases(
     return rng.random(terrain.size) < rates[terrain], terrain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.05, 0.3, 1.0])
 @pytest.mark.parametrize(("rate", "terrains"), [(0.99, 60), (0.95, 60), (0.8, 60), (0.9, 20)])
 def test_bounds_for_clustered_cases_cover_the_true_rate(rate: float, terrains: int, correlation: float) -> None:

@@ -103,6 +103,7 @@ def _simulate_verdicts(
         pass_level, fail_level = pass_test.significance_level(cases), fail_test.significance_level(cases)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first_cases", [24, 230])
 def test_appending_the_cases_needed_keeps_the_confidence(first_cases: int) -> None:
     """Campaigns have at most 5000 cases. With uncorrected bounds at each evaluation, 38.6 % of them would pass."""
@@ -118,6 +119,7 @@ def test_appending_the_cases_needed_keeps_the_confidence(first_cases: int) -> No
         assert np.mean([verdict in campaign_verdicts for campaign_verdicts in verdicts]) <= 0.1 + 2 * 0.008
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first_cases", [1, 24, 230, 388])
 @pytest.mark.parametrize(("rate", "confidence"), [(0.01, 0.9), (0.1, 0.95), (0.95, 0.9)])
 def test_frequent_looks_keep_the_risk(first_cases: int, rate: float, confidence: float) -> None:

@@ -63,6 +63,7 @@ def test_flat_ground_velocity_error_is_within_15_cm_s() -> None:
     assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.15
 
 
+@pytest.mark.slow
 def test_relief_errors_match_geometric_prediction() -> None:
     """Requirement: errors agree with the formula to 0.2 m/s rms over 200 m of relief.
 

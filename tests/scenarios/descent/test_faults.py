@@ -148,6 +148,7 @@ def _render_descent(faults: Mapping[str, Any], **tables: Any) -> list[np.ndarray
     return [counts for counts, _ in take_exposures(parameters, world, states, optics, detector, streams)]
 
 
+@pytest.mark.slow
 def test_image_faults_change_the_expected_pixels() -> None:
     """Each fault changes a fraction of the pixels in all images, or all pixels in one image."""
     clear_images = _render_descent({})

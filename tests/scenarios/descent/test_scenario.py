@@ -31,6 +31,7 @@ def test_case_is_deterministic(nominal_case: CaseResult) -> None:
     assert second_case.row["image_hash"] != nominal_case.row["image_hash"]
 
 
+@pytest.mark.slow
 def test_each_catalogue_dispersion_is_reported() -> None:
     """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
     draws = load_campaign("dimes-gusev").draws(3)

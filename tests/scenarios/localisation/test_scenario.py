@@ -218,6 +218,7 @@ def test_attitude_error_tilts_the_initial_attitude() -> None:
     assert isinstance(tilted.world_from_body, Rotation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error_deg", [2.0, 5.0, 6.0, 7.0, 10.0])
 def test_wrong_attitude_gives_no_position(error_deg: float) -> None:
     """The error is 20 to 100 times the standard deviation in the covariance: 50 to 280 m on the ground.

@@ -74,6 +74,7 @@ def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
     assert np.count_nonzero(np.isfinite(oracle) & ~np.isfinite(stereo)) > 0
 
 
+@pytest.mark.slow
 def test_rover_drives_around_an_obstacle_in_its_images() -> None:
     leg = {"motion": "approach", "goal_m": 2.0, "autonav": True}
     # with most seeds, the holes of the map stop the rover in front of the obstacle (NO_PATH)

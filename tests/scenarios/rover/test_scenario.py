@@ -164,6 +164,7 @@ def test_unknown_trackers_and_cameras_are_rejected() -> None:
         make_parameters(camera={"preset": "xc-55"})
 
 
+@pytest.mark.slow
 def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
     settings: dict[str, Any] = {

@@ -372,6 +372,7 @@ def test_thrusters_fire_at_their_height_before_the_end() -> None:
     assert descent.state(descent.time_of_altitude(1400.0)).position_m[2] == pytest.approx(1500.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_horizontal_velocities_match_the_paper() -> None:
     """Velocities including the swing are up to 30 m/s at the images (field test paper, III.C)."""
     speeds = []

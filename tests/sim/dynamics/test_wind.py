@@ -48,6 +48,7 @@ def _compute_structure_function(spectrum: str, lag_m: float, length_m: float) ->
     return squared_difference / variance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_m", [50.0, 300.0])
 def test_gusts_have_dryden_spectra(lag_m: float) -> None:
     n_draws = 3000

@@ -53,6 +53,7 @@ def _render_in_process(backend: str, folder: Path) -> dict[str, np.ndarray]:
     return dict(np.load(path))
 
 
+@pytest.mark.slow
 def test_osmesa_and_egl_render_equal_images(tmp_path: Path) -> None:
     osmesa, egl = _render_in_process("osmesa", tmp_path), _render_in_process("egl", tmp_path)
     # At crests a rounding difference in depth can select the near or the far side.
@@ -127,6 +128,7 @@ def test_second_backend_in_one_process_is_rejected() -> None:
     assert "already uses OpenGL through osmesa" in run.stdout
 
 
+@pytest.mark.slow
 def test_python_without_assertions_is_rejected() -> None:
     program = (
         "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"

@@ -91,6 +91,7 @@ def test_nearest_triangle_equals_exhaustive_search(rocky_view: View) -> None:
     np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("side", "max_error_ratio"), [(2, 0.5), (3, 0.4)])
 def test_outlines_match_256_rays_per_pixel(
     renderer: Renderer, rocky_view: View, reference: np.ndarray, side: int, max_error_ratio: float

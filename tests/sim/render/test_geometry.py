@@ -72,6 +72,7 @@ def _compute_expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
     return np.asarray((weight[..., None] * pixels).sum(axis=(0, 1)) / weight.sum())
 
 
+@pytest.mark.slow
 def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     """Requirement: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
     surface, spots = _make_spotted_plane(height_m=7.0)

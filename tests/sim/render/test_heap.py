@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 #: Size of the block, bytes.
 SIZE = 20_000_000
 #: Allocates and frees a large block. Prints the bytes still in use before and after the memory is returned.
@@ -32,6 +34,7 @@ def _measure_memory(mode: str) -> tuple[int, int]:
     return bytes_after_free, bytes_after_return
 
 
+@pytest.mark.slow
 def test_process_retains_freed_memory_until_it_is_returned() -> None:
     bytes_after_free, bytes_after_return = _measure_memory("keep")
     assert bytes_after_free > 0.9 * SIZE

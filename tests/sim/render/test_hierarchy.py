@@ -45,9 +45,9 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     listed_triangles = set(
         buffer[: list_in_beam(objects.hierarchy, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist()
     )
-    perpendicular = np.cross(axis, _draw_rays(rng, 400))
+    perpendicular = np.cross(axis, _draw_rays(rng, 100))
     perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
-    angles = half_angle * rng.uniform(0.0, 1.0, (400, 1))
+    angles = half_angle * rng.uniform(0.0, 1.0, (100, 1))
     hit_triangles: set[int] = set()
     for ray in np.cos(angles) * axis + np.sin(angles) * perpendicular:
         hit_triangles |= _list_hits(objects, ray, max_distance_m)

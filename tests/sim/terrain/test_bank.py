@@ -156,6 +156,7 @@ def test_terrain_stays_readable_after_its_file_is_removed(cache: Path) -> None:
     assert surface.levels[0].tobytes() == content
 
 
+@pytest.mark.slow
 def test_concurrent_builds_in_a_small_cache_are_complete(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each process gets complete terrains while others evict files; no partial file remains."""
     monkeypatch.setenv("MARSYARD_CACHE_GB", "0.0002")

@@ -63,6 +63,7 @@ def test_added_landform_does_not_change_others(name: str) -> None:
     np.testing.assert_allclose(difference, contribution, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_the_number_of_threads() -> None:
     program = (
         "import hashlib, numpy as np\n"

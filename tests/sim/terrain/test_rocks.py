@@ -253,6 +253,7 @@ def test_too_many_rocks_and_unknown_shapes_are_rejected(ground: Surface) -> None
         make_field(ground, placed=(unknown,))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 9, 15, 16, 27, 32, 47, 50, 63, 70])
 @pytest.mark.parametrize("detail", [COARSEST, COARSE, MEDIUM, FINE])
 def test_coarse_rock_deviates_from_the_finest_by_a_quarter_pixel(number: int, detail: int) -> None:
@@ -281,6 +282,7 @@ def test_rock_detail_follows_camera_resolution(field: RockField) -> None:
             assert thresholds[detail] < diameter_px <= thresholds[detail + 1]
 
 
+@pytest.mark.slow
 def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
     cache_clears = [

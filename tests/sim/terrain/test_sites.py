@@ -44,6 +44,7 @@ def test_albedo_and_slopes_match_the_paper(name: str, site_statistics: dict[str,
     assert min_value <= statistics.mean_slope_90_m_deg <= max_value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pisgah", "gusev", "meridiani"])
 def test_small_bank_terrains_match_the_paper(name: str) -> None:
     """2048 samples with 2 m spacing need 44 MB on disk instead of 178 MB, for banks of hundreds of terrains."""
