@@ -37,7 +37,7 @@ class NewOptions:
     site: Annotated[str | None, Option(help="A site from `marsyard terrain list`.")] = None
     camera: Annotated[
         str | None,
-        Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md); by default the paper's camera."),
+        Option(metavar="FILE", help="Custom camera file (docs/custom-worlds.md); by default a camera of the system."),
     ] = None
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
     flight: Annotated[
@@ -51,7 +51,7 @@ class NewOptions:
         float | None,
         Option(
             metavar="X",
-            help="Limit of the requirement: maximum error of velocity (m/s) or of the target's position (m), or "
+            help="Limit of the requirement: maximum error of the velocity (m/s) or of the tracked position (m), or "
             "minimum fraction of selected landing sites that are safe.",
         ),
     ] = None
@@ -185,12 +185,12 @@ def ingest(
     system: Annotated[
         str | None,
         Option(
-            help="System that reads the folder; the default, `measured`, tests the kind of algorithm that ingest.toml "
-            "states as `task`: velocity, landing or matching."
+            help="System of an installed package whose importer reads the folder; by default the built-in importer, "
+            "for the task that ingest.toml states: velocity, landing or matching."
         ),
     ] = None,
 ) -> None:
-    """Create a campaign from recorded images with measured poses (attitude and altitude, or position)."""
+    """Create a campaign from recorded images with measured attitudes, and measured altitudes or positions."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count

@@ -28,9 +28,7 @@ class StudyOptions:
     """Arguments and options of all studies."""
 
     campaign: options.CampaignArgument
-    requirement: Annotated[
-        str, Option(metavar="ID", help="Requirement of the campaign whose metric and bound the study analyses.")
-    ]
+    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign that is analysed.")]
     seed: options.SeedOption = None
     jobs: options.JobsOption = None
     cluster: options.ClusterOption = None
@@ -154,7 +152,8 @@ class BudgetOptions(StudyOptions):
         int,
         Option(
             metavar="N",
-            help="Base samples for Sobol indices, a power of 2: N (d + 3) more cases for d dispersions. 0: none.",
+            help="Base samples for Sobol indices of the d dispersions and of the random streams, a power of 2: N (d + 3) "
+            "more cases. 0: none.",
         ),
     ] = 0
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9
@@ -163,7 +162,10 @@ class BudgetOptions(StudyOptions):
 @options.handle_user_errors
 @options.with_options(BudgetOptions)
 def budget(arguments: BudgetOptions) -> None:
-    """Compute the error budget: run the same cases without each source of error, and with each one alone."""
+    """Compute the error budget: run the same cases without each source of error, and with each one alone.
+
+    Sources of error are those of the scenario, such as attitude, altitude or detector noise (docs/error-budget.md).
+    """
     from marsyard.campaigns.studies.budget import BudgetSettings, start_budget
 
     settings = BudgetSettings(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
