@@ -152,7 +152,7 @@ class BudgetOptions(StudyOptions):
         int,
         Option(
             metavar="N",
-            help="Base samples for Sobol indices of the d dispersions and of the random streams, a power of 2: N (d + 3) "
+            help="Base samples for Sobol indices of d dispersions and the random streams, a power of 2: N (d + 3) "
             "more cases. 0: none.",
         ),
     ] = 0
