@@ -32,7 +32,7 @@ class VttOptions:
       only), a shift (``shift``), also an affine distortion (``stretch``), or also a quadratic distortion (``bend``).
       The paper's tracker had no warp: its authors removed an affine stage for reliability. In an approach, a slanted
       surface is distorted affinely and a round surface also quadratically. A simpler model has the same bias at each
-      step (docs/adr/0010). The match score is that of the shifted template.
+      step (docs/adr/0010). The match score is that of the template without this distortion.
     - epipolar_tolerance_px: Search range perpendicular to the epipolar curve of the right image (paper: 2, default)
     - stereo_search_fraction: Range of searched disparities around the prediction, as a fraction of `search_px` (paper:
       one half)

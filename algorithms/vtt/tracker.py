@@ -123,7 +123,7 @@ def next_state(state: TrackingState, lost_updates: int, is_matched: bool, limit:
 class VttDetails:
     """Intermediate products of one update (paper: Figs. 15 and 17, Table III), returned as `TargetUpdate.details`.
 
-    - seeded: Whether this update is the seed
+    - seeded: Whether this update is the first one, which designates the target (the seed of the track)
     - predicted_pixel: Predicted full-frame (u, v) in the left image; None if invisible
     - window, window_corner: Left search window, counts, and the full-frame (u, v) of its upper left pixel; None
       without `predicted_pixel`

@@ -33,7 +33,7 @@ MAST_HEAD_HEIGHT_M = 1.2
 #: Maximum distance of rendered ground and rocks behind the target, m.
 BACKGROUND_M = 25.0
 #: Mesh spacing of the ground around the target, m, and its relative growth from line to line. Half the spacing changes
-#: the brightness of 38 of 1.4 million pixels by a thousandth (ADR 34).
+#: the brightness of 38 of 1.4 million pixels by a thousandth (ADR 6).
 MESH_FINEST_M, MESH_GROWTH = 0.04, 0.012
 #: Length of the ramp divided by the terrain's period; the ramp's centre is at a quarter of the period.
 RAMP_FRACTION = 0.4

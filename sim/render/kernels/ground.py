@@ -18,7 +18,7 @@ from marsyard.sim.terrain.kernels import CEILING_BLOCK, Level, sample
 #: because even low crests hide the ground behind them.
 MIN_STEP_FRACTION = 0.00125
 #: Iterations of the search for a crest. Of 51,485 grazing rays in rover images, 4 rays miss a crest with four
-#: iterations, and 25 rays with one iteration or without this search (ADR 34).
+#: iterations, and 25 rays with one iteration or without this search (ADR 6).
 CREST_ITERATIONS = 4
 #: Maximum number of iterations with the cubic (1.1 on average; false position alone takes 3.6), and in total. The
 #: remaining iterations use false position, which always converges.
