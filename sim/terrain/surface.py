@@ -39,7 +39,7 @@ class Surface:
     factors: Float32[np.ndarray, "side side 3"] = field(default_factory=lambda: UNIFORM)
 
     def __post_init__(self) -> None:
-        # numba compiles kernels anew for writable arrays
+        # for writable arrays numba would compile the kernels again
         for level in self.levels:
             level.setflags(write=False)
 

@@ -188,8 +188,19 @@ def test_report_sends_no_network_requests(campaigns: Path, open_page: OpenPage) 
 
 
 # Layout depends on the width, contrast on the scheme: two of the four combinations cover both.
-@pytest.mark.parametrize(("width", "scheme"), [(1280, "dark"), (390, "light")])
-@pytest.mark.parametrize("page_kind", ["report", "index", "campaign", "case"])
+@pytest.mark.parametrize(
+    ("page_kind", "width", "scheme"),
+    [
+        ("report", 1280, "dark"),
+        ("index", 390, "light"),
+        ("campaign", 1280, "dark"),
+        ("case", 390, "light"),
+        pytest.param("report", 390, "light", marks=pytest.mark.slow),
+        pytest.param("index", 1280, "dark", marks=pytest.mark.slow),
+        pytest.param("campaign", 390, "light", marks=pytest.mark.slow),
+        pytest.param("case", 1280, "dark", marks=pytest.mark.slow),
+    ],
+)
 def test_pages_are_accessible_and_fit_the_window(
     campaigns: Path, open_page: OpenPage, page_kind: str, width: int, scheme: str
 ) -> None:

@@ -176,14 +176,16 @@ def _crashing_case_setting(case: int) -> str:
 @pytest.mark.parametrize(
     ("parameters", "requirement", "status", "verdict"),
     [
-        ("", "", 0, "NO REQUIREMENT"),
+        pytest.param("", "", 0, "NO REQUIREMENT", marks=pytest.mark.slow),
         (_crashing_case_setting(1), "", 1, "NO REQUIREMENT"),
         # three cases on one terrain count as one case: the lower bound of one success is 10 % at 90 % confidence
         ("", REQUIREMENT.replace("0.99", "0.09"), 0, "PASS"),
         ("error_scale = 1e3", REQUIREMENT, 1, "FAIL"),
         ("", REQUIREMENT, 3, "INSUFFICIENT"),
         # the requirement is undecided, but a crash gives status 1
-        (_crashing_case_setting(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT"),
+        pytest.param(
+            _crashing_case_setting(1), REQUIREMENT.replace("0.99", "0.9"), 1, "INSUFFICIENT", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_exit_status_follows_verdict_and_crashes(

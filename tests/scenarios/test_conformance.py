@@ -35,12 +35,17 @@ def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
 @pytest.mark.parametrize(
     "spec",
     [
-        *VELOCITY.shipped,
-        *TRACKING.shipped,
-        *LANDING.shipped,
-        "velocity_estimator:MedianShift",
+        "dimes",
+        "vtt",
+        "hda",
         "velocity_stream:ChainedShifts",
-        "velocity_stream:IntegratedShifts",
+        *(
+            pytest.param(spec, marks=pytest.mark.slow)
+            for spec in (*VELOCITY.shipped, *TRACKING.shipped, *LANDING.shipped)
+            if spec not in ("dimes", "vtt", "hda")
+        ),
+        pytest.param("velocity_estimator:MedianShift", marks=pytest.mark.slow),
+        pytest.param("velocity_stream:IntegratedShifts", marks=pytest.mark.slow),
     ],
 )
 def test_shipped_algorithms_conform(spec: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 
 #: Fixture of conftest that writes a campaign file from its parameters, dispersions and other tables.
@@ -182,14 +182,6 @@ def test_unknown_campaign_error_lists_known_campaigns() -> None:
     assert "path of a TOML file" in text
     for name in catalogue():
         assert name in text
-
-
-def test_catalogue_campaigns_load_by_name() -> None:
-    for name, path in catalogue().items():
-        assert find_campaign(name) == path
-        configuration = load_campaign(name).configuration
-        assert configuration.name == name
-        assert [key for key, dispersion in configuration.dispersions.items() if not dispersion.source] == []
 
 
 def test_documented_sampling_example_can_be_loaded(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
 from tests.campaigns.fake_campaign import write_campaign
@@ -35,11 +35,14 @@ def test_campaigns_of_requirements_exist() -> None:
     assert set(patterns) <= set(catalogue())
 
 
-@pytest.mark.parametrize("name", catalogue())
-def test_campaigns_have_the_applicable_requirements_with_their_metrics_and_bounds(name: str) -> None:
+@pytest.mark.parametrize(("name", "path"), catalogue().items(), ids=list(catalogue()))
+def test_shipped_campaign_has_sources_and_the_applicable_requirements(name: str, path: Path) -> None:
     """The requirements' lists of campaigns agree with the campaigns' lists of requirements."""
-    shipped = shipped_requirements()
-    requirements = [entry for entry in load_campaign(name).configuration.requirements if entry.id in shipped]
+    assert find_campaign(name) == path
+    configuration, shipped = load_campaign(name).configuration, shipped_requirements()
+    assert configuration.name == name
+    assert [key for key, dispersion in configuration.dispersions.items() if not dispersion.source] == []
+    requirements = [entry for entry in configuration.requirements if entry.id in shipped]
     applicable = {entry["id"] for entry in select_applicable(list(shipped.values()), name)}
     assert {requirement.id for requirement in requirements} == applicable
     for requirement in requirements:
