@@ -252,5 +252,5 @@ def draw_pair(pair: MatchedPair) -> Figure:
     scatter.set(xlim=(-axis_limit, axis_limit), ylim=(axis_limit, -axis_limit), aspect="equal")
     scatter.set(xlabel="to the right (px)", ylabel="down (px)")
     n_beyond = int(np.count_nonzero(~np.all(np.abs(offsets) <= axis_limit, axis=1)))
-    scatter.set_title("Offsets" + (f", {n_beyond} beyond" if n_beyond else ""), fontsize=9)
+    scatter.set_title("Offsets" + (f", {n_beyond} outside" if n_beyond else ""), fontsize=9)
     return figure
