@@ -77,6 +77,7 @@ def compute_points(sample: dict[str, Any], camera_file: Path, distance: np.ndarr
     return (np.array(sample["position_m"]) + world_from_body.apply(body_points)).reshape(*distance.shape, 3)
 
 
+@pytest.mark.slow
 def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> None:
     status, output = run_dataset(tmp_path)
     assert status == 0, output

@@ -74,6 +74,7 @@ def test_invalid_campaign_does_not_stop_the_nightly_run(nightly: Nightly, tmp_pa
     assert "| fake |" in report
 
 
+@pytest.mark.slow
 def test_killed_run_is_shown_and_not_compared(
     nightly: Nightly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

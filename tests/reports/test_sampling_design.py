@@ -109,6 +109,7 @@ def test_nominal_case_is_excluded_from_verdicts(make_rows: Rows, velocity: dict[
     assert (with_nominal.n, with_nominal.failures) == (231, 1)
 
 
+@pytest.mark.slow
 def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -> None:
     frame = make_rows(60)
     frame.loc[0, "velocity_error_m_s"] = 77.0

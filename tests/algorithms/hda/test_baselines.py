@@ -74,6 +74,7 @@ def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> No
     assert np.sqrt(np.mean((matches.depths - depths)[matches.accepted] ** 2)) < 0.1
 
 
+@pytest.mark.slow
 def test_essential_matrix_motion_matches_exact_scene(landing_scene: LandingScene) -> None:
     features = select_features(landing_scene.views[0].counts, OPTIONS)
     tracks = track_features(landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, OPTIONS)

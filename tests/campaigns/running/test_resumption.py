@@ -34,6 +34,7 @@ def finished_campaign(_finished_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(_finished_run, tmp_path / "done"))
 
 
+@pytest.mark.slow
 def test_appended_cases_follow_existing_cases(
     finished_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:

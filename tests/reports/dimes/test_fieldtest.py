@@ -46,6 +46,7 @@ def test_cells_are_compared_with_the_paper(make_run: MakeRun, field_frame: pd.Da
     assert np.isnan(opposite_direction["largest"])  # largest error
 
 
+@pytest.mark.slow
 def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: pd.DataFrame) -> None:
     directory = make_run(field_frame, requirements=[VELOCITY])
     page = write_report(directory).read_text(encoding="utf-8")

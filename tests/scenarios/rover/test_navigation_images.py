@@ -33,6 +33,7 @@ def _position_error_m(run: Run) -> float:
     return float(np.linalg.norm((vehicle.estimated_pose.translation - vehicle.stance.world_from_rover.translation)[:2]))
 
 
+@pytest.mark.slow
 def test_visual_odometry_measures_slip_and_wheel_odometry_does_not() -> None:
     leg = {"motion": "approach", "goal_m": 3.6, "step_fraction": 0.1}
     errors = {
