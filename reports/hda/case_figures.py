@@ -135,7 +135,7 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
         colour_bar.outline.set_visible(False)
         colour_bar.ax.tick_params(labelsize=7)
         upper.set_title(f"Map: {name}", fontsize=9)
-        lower.set_title("Truth of footprints" if limit is not None else "Truth", fontsize=9)
+        lower.set_title(f"Truth of footprints: {name}" if limit is not None else "Truth", fontsize=9)
     _draw_safety(map_row[3], truth_row[3], maps, truth)
     rows, columns = maps.elevation_m.shape
     for axes in (*map_row, *truth_row):
@@ -158,7 +158,7 @@ def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, tru
     safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
     truth_axes.pcolormesh(cells[..., 1], cells[..., 0], safety, shading="nearest", rasterized=True, **colour_scale)
     map_axes.set_title("Safe landing map", fontsize=9)
-    truth_axes.set_title("Truth of footprints", fontsize=9)
+    truth_axes.set_title("Truth of footprints: safety", fontsize=9)
     for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
         truth_axes.plot([], [], "s", color=colour, label=name)
     for marker, label in zip(_SITE_MARKERS.values(), ("a-priori site", "safe site"), strict=True):
