@@ -14,7 +14,7 @@ from marsyard.reports.campaign import section_makers, write_report
 from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.papers import PaperFacts
 from marsyard.reports.presentation import Presentation, presentations
-from marsyard.reports.section import Subject
+from marsyard.reports.section import Grid, Subject
 from marsyard.reports.section_kinds import (
     Distribution,
     Quantity,
@@ -168,3 +168,8 @@ def test_invalid_report_of_a_system_gives_a_warning(
             assert presentations() == ()
     finally:
         presentations.cache_clear()
+
+
+def test_table_with_an_additional_cell_is_rejected() -> None:
+    with pytest.raises(ValueError, match=r"row \['a', 'b', 'c'\] has 3 cells; allowed: 2"):
+        Grid(["x", "y"], [["1", "2"], ["a", "b", "c"]])

@@ -203,3 +203,13 @@ def test_relief_does_not_change_geometric_truth_and_mean_brightness(
     np.testing.assert_array_equal(first.normal, second.normal)
     assert second.radiance.std() > 2.0 * first.radiance.std()
     assert second.radiance.mean() == pytest.approx(first.radiance.mean(), rel=0.01)
+
+
+def test_kernels_receive_read_only_arrays(flat: Surface) -> None:
+    """For writable arrays numba would compile the kernels again."""
+    scene = Scene(flat, (0.0, 0.0), Sun(np.array([0.0, 0.0, 1.0])), LAMBERT, relief=_make_relief(1.0, 0.1))
+    arrays = [value for value in scene.materials.relief if isinstance(value, np.ndarray)]
+    assert len(arrays) == 3
+    assert not any(array.flags.writeable for array in (*arrays, *flat.levels))
+    # the arrays of the caller remain writable
+    assert UNIFORM.flags.writeable
