@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 from marsyard.reports import common_sections, sections
 from marsyard.reports.boundary import boundary_section
@@ -242,14 +244,16 @@ def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
 
 
 def page_environment() -> Environment:
-    """Create a Jinja environment that escapes all values."""
-    return Environment(
+    """Create a Jinja environment that escapes all values; its filter `code` marks words in backticks as code."""
+    environment = Environment(
         autoescape=True,
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         lstrip_blocks=True,
         trim_blocks=True,
         undefined=StrictUndefined,
     )
+    environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
+    return environment
 
 
 def _to_json_types(value: Any) -> Any:

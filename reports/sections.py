@@ -183,6 +183,8 @@ def dispersion_grid(run: StoredRun) -> Grid:
             statistics[1] = f"{run.frame[column].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
                 statistics = [_format_value(float(value)) for value in (values.min(), values.mean(), values.max())]
+                if dispersion.get("distribution") == "integer":
+                    statistics[1] = NOTHING  # the mean of numbers that name something has no meaning
         # defaults, which follow a semicolon, do not apply to dispersed parameters
         meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
         meaning, unit = meaning.split(";")[0], split_unit(path_parts[-1])[1]
@@ -214,6 +216,10 @@ def _parameters_type(run: StoredRun) -> type[BaseModel] | None:
         return None
 
 
+#: Machine properties whose names in the record are not words.
+_FACT_NAMES = {"processor_features": "processor features (hash)", "implementation": "Python implementation"}
+
+
 def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
     """List name and value of properties of campaign, algorithms, program and machine."""
     environment, times = table(run.recorded("environment")), numbers(run.frame, "cpu_time_s")
@@ -238,7 +244,7 @@ def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
         ("CPU time per case", f"{number(float(times.mean()))} s on average" if times.size else None),
         ("Commit", run.recorded("git_commit")),
         ("Marsyard", table(run.recorded("versions")).get("marsyard")),
-        *((f"Machine: {name}", value) for name, value in environment.items() if value not in ({}, None)),
+        *((f"Machine: {_FACT_NAMES.get(name, name)}", value) for name, value in environment.items() if value not in ({}, None)),
         ("GL backend", _distinct_values(run.frame, "gl_backend")),
         ("GL version", _distinct_values(run.frame, "gl_version")),
     ]
@@ -298,8 +304,8 @@ def _distinct_values(frame: pd.DataFrame, column: str) -> str | None:
 
 def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
     """Draw a scatter plot of a metric for the cases in `frame`; histogram and distribution for those in `all_cases`."""
-    scatter = "Error of each case. The dashed circle is the requirement. Hollow marks are cases beyond the axes."
-    histogram = "Histogram of the error magnitude. The hatched bar counts values beyond the axis."
+    scatter = "Error of each case." if bound is None else "Error of each case. The dashed circle is the requirement."
+    histogram = "Histogram of the error magnitude."
     entries: list[tuple[str, Figure | None, str]] = [("scatter", figures.error_scatter(frame, metric, bound), scatter)]
     if figures.needs_enlarged_figure(frame, metric, bound):
         figure = figures.error_scatter(frame, metric, bound, enlarged=True)
@@ -315,11 +321,13 @@ def driver_figures(frame: pd.DataFrame, metric: str, bound: float | None) -> lis
     entries, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
     for index, column in enumerate(driver_columns(frame, metric)):
         driver = estimate_driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
-        caption = f"{label(column)}." if driver is None else f"{label(column)}: rank correlation {rank_text(driver)}."
+        sentences = [] if driver is None else [f"Rank correlation {rank_text(driver)}."]
         n_beyond = figures.count_beyond_axis(frame, metric, column, bound)
         if n_beyond:
-            caption = f"{caption} Hollow marks at the upper edge: {count(n_beyond, 'error')} beyond the axis."
-        entries.append((f"driver{index}", figures.error_scatter_against(frame, metric, column, bound), caption))
+            sentences.append(f"Hollow marks at the upper edge: {count(n_beyond, 'error')} beyond the axis.")
+        entries.append(
+            (f"driver{index}", figures.error_scatter_against(frame, metric, column, bound), " ".join(sentences))
+        )
     return _svg_figures(entries)
 
 
@@ -331,10 +339,9 @@ def rank_text(driver: Driver) -> str:
 
 def outcome_figures(frame: pd.DataFrame) -> list[SvgFigure]:
     """Draw the number of cases by outcome."""
-    caption = (
-        "Solid bars: cases with an answer. Hatched bars: cases without an answer. Cross-hatched bars: cases in which "
-        "the program failed (crashed cases)."
-    )
+    caption = "Solid bars: cases with an answer. Hatched bars: cases without an answer."
+    if engine_failed(frame).any():
+        caption += " Cross-hatched bars: cases in which the program failed (crashed cases)."
     return _svg_figures([("outcomes", figures.outcome_bars(frame), caption)])
 
 

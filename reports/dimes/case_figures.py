@@ -17,6 +17,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Polygon, Rectangle
+from matplotlib.path import Path as Outline
+from matplotlib.transforms import Bbox
 from scipy import ndimage
 
 from marsyard.reports.presentation import numeric_product, save_figures, to_matrix
@@ -102,6 +104,25 @@ def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
     return figure
 
 
+def describe_marks(products: Mapping[str, Any], pair: int) -> str:
+    """Describe the marks in the figure of an image pair; marks that are not in the figure are omitted."""
+    earlier, later = pair + 1, pair + 2
+    pair_tracks = [track for track in read_tracks(products) if track.pair == pair][:_MAX_TRACKS]
+    texts = [f"Red: templates in image {earlier}."] if pair_tracks else ["No templates."]
+    if any(track.window is not None for track in pair_tracks):
+        texts.append(f"Blue: search windows in image {later}.")
+    if any(track.position is not None or np.isfinite(track.values.get("match_u", np.nan)) for track in pair_tracks):
+        texts.append(f"Green: tracked positions in image {later}.")
+    if not all(track.valid for track in pair_tracks):
+        texts.append("Dashed: the template failed a validity check.")
+    shapes = [_read_image(products, f"image_{number}").shape for number in (earlier, later)]
+    if _visible_overlap(products, pair, shapes[0]) is not None:
+        texts.append(f"Dotted yellow line: border of the overlap with image {later}, if there is no horizontal motion.")
+    if any(_visible_zero_phase(products, pair, index, shape) is not None for index, shape in enumerate(shapes)):
+        texts.append("Yellow cross: point opposite to the sun; no template is placed near it.")
+    return " ".join(texts)
+
+
 def draw_delivered_images(products: Mapping[str, Any]) -> Figure:
     """Draw the three images, binned to square pixels; raises ValueError if one is missing."""
     return draw_images([_read_image(products, f"image_{number}") for number in (1, 2, 3)])
@@ -160,7 +181,8 @@ def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> No
         axes.set_facecolor(INK)
         _mark_tracks(axes, pair_tracks, prefix, colour)
         _outline_overlap(axes, products, pair, image_index)
-        axes.set_title(f"Image {pair + image_index + 1}: {'templates' if image_index == 0 else 'tracked'}", fontsize=9)
+        content = f": {('templates', 'tracked positions')[image_index]}" if pair_tracks else ""
+        axes.set_title(f"Image {pair + image_index + 1}{content}", fontsize=9)
 
 
 def _draw_rectified(
@@ -200,7 +222,8 @@ def _draw_rectified(
                 centre = 0.5 * (len(track.window) - 1)
                 offset = np.array([track.position[1] - centre, centre - track.position[0]])
                 draw_ground_square(ground + spacing_m * offset, len(track.patch), MATCH, track.valid)
-    axes.set_title(f"Image {pair + image_index + 1} rectified{'' if image_index == 0 else ': windows'}", fontsize=9)
+    content = f": {('templates', 'search windows')[image_index]}" if pair_tracks else ""
+    axes.set_title(f"Image {pair + image_index + 1}, rectified{content}", fontsize=9)
 
 
 def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
@@ -217,7 +240,8 @@ def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndar
 def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
     """Draw the template and the search window of a track on two axes, and the match in the window."""
     line = "-" if track.valid else _DASHED
-    parts = ((track.patch, f"Template {track.template + 1}", TEMPLATE, line), (track.window, "Window", WINDOW, "-"))
+    template_title, window_title = (f"{name} {track.template + 1}" for name in ("Template", "Search window"))
+    parts = ((track.patch, template_title, TEMPLATE, line), (track.window, window_title, WINDOW, "-"))
     for panel, (image, title, colour, style) in zip(axes, parts, strict=True):
         if image is None:
             panel.set_axis_off()
@@ -246,14 +270,36 @@ def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], prefix: str, colour: 
 
 def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, image_index: int) -> None:
     """Outline the overlap in the first image, and mark the zero-phase point (direction opposite to the sun)."""
-    polygon, zero_phase = to_matrix(products.get(f"overlap_{pair}")), to_matrix(products.get(f"zero_phase_{pair}"))
-    if image_index == 0 and polygon is not None and polygon.shape[1] == 2:
+    shape = axes.get_images()[0].get_size()
+    polygon = _visible_overlap(products, pair, shape) if image_index == 0 else None
+    if polygon is not None:
         axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
-    if zero_phase is not None and zero_phase.shape == (2, 2) and np.isfinite(zero_phase[image_index]).all():
-        u, v = (float(value) for value in zero_phase[image_index])
-        rows, columns = axes.get_images()[0].get_size()
-        if 0 <= u < columns and 0 <= v < rows:
-            axes.plot([u], [v], marker="x", color="#f2e35a", markersize=7)
+    zero_phase = _visible_zero_phase(products, pair, image_index, shape)
+    if zero_phase is not None:
+        axes.plot([zero_phase[0]], [zero_phase[1]], marker="x", color="#f2e35a", markersize=7)
+
+
+def _visible_overlap(products: Mapping[str, Any], pair: int, shape: tuple[int, ...]) -> Float[np.ndarray, "_ 2"] | None:
+    """Return the outline of the overlap (u, v) in the first image of a pair; None if no part of it is in the image."""
+    polygon = to_matrix(products.get(f"overlap_{pair}"))
+    if polygon is None or polygon.shape[1] != 2 or not np.isfinite(polygon).all():
+        return None
+    outline, image_box = (
+        Outline(np.vstack([polygon, polygon[:1]])),
+        Bbox([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]]),
+    )
+    return polygon if outline.intersects_bbox(image_box, filled=False) else None
+
+
+def _visible_zero_phase(
+    products: Mapping[str, Any], pair: int, image_index: int, shape: tuple[int, ...]
+) -> tuple[float, float] | None:
+    """Return the zero-phase point (u, v) in an image of a pair; None if it is not in the image."""
+    pixels = to_matrix(products.get(f"zero_phase_{pair}"))
+    if pixels is None or pixels.shape != (2, 2):
+        return None
+    u, v = (float(value) for value in pixels[image_index])
+    return (u, v) if 0 <= u < shape[1] and 0 <= v < shape[0] else None
 
 
 def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: str, is_valid: bool) -> None:
@@ -267,8 +313,13 @@ def _read_image(products: Mapping[str, Any], key: str) -> Image:
     counts = to_matrix(products.get(key))
     if counts is None:
         raise ValueError(f"the products contain no image '{key}'")
-    rows, columns = counts.shape
-    binning = columns // rows
-    if binning < 2 or columns % rows:
+    rows, binning = len(counts), column_binning(counts)
+    if binning == 1:
         return counts
     return np.asarray(counts.reshape(rows, rows, binning).mean(axis=2), dtype=np.float64)
+
+
+def column_binning(counts: Image) -> int:
+    """Return the number of columns that are averaged for square pixels."""
+    rows, columns = counts.shape
+    return columns // rows if columns >= rows and columns % rows == 0 else 1

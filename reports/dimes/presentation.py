@@ -5,6 +5,7 @@ A DIMES case has three images. A velocity stream is an algorithm that answers af
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,12 +17,40 @@ from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.reports import presentation
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, numeric_product, to_matrix
+from marsyard.reports.presentation import (
+    CaseKind,
+    CaseView,
+    Presentation,
+    TableRow,
+    check_shape,
+    numeric_product,
+    to_matrix,
+)
 from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, svg_figure
-from marsyard.reports.wording import label, note_text, number
+from marsyard.reports.wording import NOTHING, label, note_text, number
 
-#: Columns of the tracks that are not in the table: shown elsewhere, or too wide.
+#: Columns of the tracks that the table shows in other columns, or not at all because they are too wide.
 _HIDDEN_COLUMNS = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
+#: Positions in the table: heading, and the columns (u, v) of the tracks.
+_POSITIONS = {
+    "Template in the earlier image: column, row (px)": ("template_u", "template_v"),
+    "Match in the later image: column, row (px)": ("match_u", "match_v"),
+}
+#: Headings of columns that need more words than `label` returns.
+_HEADINGS = {
+    "contrast": "contrast of the template",
+    "peak_width": "width of the peak (template px)",
+    "second_peak_ratio": "second peak / first peak",
+}
+_LEGEND = (
+    "Top row: images rectified to a view from directly above, north up. Middle row, if there are templates: templates "
+    "and search windows, cut from the rectified images. Bottom row: {images} Squares in the bottom row mark positions, "
+    "not sizes. Positions in the table are pixels of the images in the bottom row, from 0 at the upper left. Each "
+    "velocity in the table is the mean between the two images of the pair. DIMES combines each valid track of pair 1 "
+    "with each valid track of pair 2. It selects the combination whose velocity change agrees best with the IMU. It "
+    "reports the velocity of the selected track of pair 2, the later pair. If the smallest difference from the IMU is "
+    "too large, no velocity is reported."
+)
 
 
 def view(products: Mapping[str, Any], key: str) -> CaseView:
@@ -29,30 +58,48 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     if "tracks" not in products:
         images = figures.draw_delivered_images(products)
         figure = svg_figure(images, f"{key}images", "The three images that the algorithm received.", wide=True)
-        return CaseView(_format_velocities(products), [figure], [], [], note_text("dimes.plain_legend"))
-    pairs = enumerate(("first and second image", "second and third image"))
+        return CaseView(_format_velocities(products), [figure], [], [], _describe_images(products).capitalize())
     svg_figures = []
-    for index, name in pairs:
-        svg_figures.append(
-            svg_figure(figures.draw_dimes_pair(products, index), f"{key}pair{index}", f"Pair {index + 1}: {name}.")
-        )
+    for index in (0, 1):
+        caption = f"Pair {index + 1}: images {index + 1} and {index + 2}. {figures.describe_marks(products, index)}"
+        svg_figures.append(svg_figure(figures.draw_dimes_pair(products, index), f"{key}pair{index}", caption))
+    facts = [*_format_velocities(products), *_format_selection(products)]
+    legend = _LEGEND.format(images=_describe_images(products))
+    return CaseView(facts, svg_figures, *_create_track_table(products), legend)
+
+
+def _create_track_table(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
+    """Create the headings and the rows of the table of tracks."""
     tracks = figures.read_tracks(products)
     names = dict.fromkeys(name for track in tracks for name in track.values)
-    quantities = [name for name in names if name not in _HIDDEN_COLUMNS and not name.startswith("failed_")]
-    head = ["Pair", "Template", "Failed checks", *(label(name) for name in quantities)]
+    positions = {heading: pair for heading, pair in _POSITIONS.items() if {*pair} <= {*names}}
+    hidden_names = {*_HIDDEN_COLUMNS, *(name for pair in positions.values() for name in pair)}
+    quantities = [name for name in names if name not in hidden_names and not name.startswith("failed_")]
+    selected_pair = check_shape(products.get("selected"), 2)
+    head = ["Pair", "Template", *([] if selected_pair is None else ["Selected"]), "Failed checks", *positions]
+    head += [_HEADINGS.get(name) or label(name) for name in quantities]
     rows = []
     for track in tracks:
         failed_columns = [name for name, value in track.values.items() if name.startswith("failed_") and value == 1.0]
         checks = ", ".join(name.removeprefix("failed_").replace("_", " ") for name in failed_columns)
-        texts = [str(track.pair + 1), str(track.template + 1), checks or ("none" if track.valid else "unknown")]
+        texts = [str(track.pair + 1), str(track.template + 1)]
+        if selected_pair is not None:
+            is_selected = selected_pair[track.pair] == track.template
+            texts.append(("yes" if track.pair == 0 else "yes, reported") if is_selected else "no")
+        texts.append(checks or ("none" if track.valid else "unknown"))
+        texts += [_format_position(*(track.values[name] for name in pair)) for pair in positions.values()]
         texts += [number(track.values.get(name, np.nan)) for name in quantities]
         rows.append(TableRow(texts, track.valid))
-    return CaseView(_format_velocities(products), svg_figures, head, rows)
+    return head, rows
+
+
+def _format_position(u: float, v: float) -> str:
+    return NOTHING if math.isnan(u + v) else f"{u:.1f}, {v:.1f}".replace("-", "−")
 
 
 def _format_velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Format the estimated and the true velocity, if the products contain them."""
-    facts = []
+    """Format the estimated velocity, the true velocity and the error, if the products contain them."""
+    facts, velocities = [], []
     for key, name in (
         ("velocity_estimated_m_s", "Reported velocity, mean over the time between images 2 and 3"),
         ("velocity_true_m_s", "True velocity, same interval"),
@@ -60,8 +107,33 @@ def _format_velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
         velocity = numeric_product(products.get(key))
         if velocity is not None and velocity.size >= 2 and np.isfinite(velocity.ravel()[:2]).all():
             east, north = velocity.ravel()[:2]
-            facts.append((name, f"{east:+.2f} m/s east, {north:+.2f} m/s north"))
+            velocities.append((east, north))
+            facts.append((name, f"{east:+.2f} m/s east, {north:+.2f} m/s north".replace("-", "−")))
+    if len(velocities) == 2:
+        facts.append(("Velocity error", f"{number(math.dist(*velocities))} m/s"))
     return facts
+
+
+def _format_selection(products: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Format the smallest differences between velocity changes of tracks and of the IMU, if the products have them."""
+    combinations = check_shape(products.get("combinations"), None, 3)
+    if combinations is None or not len(combinations):
+        return []
+    differences = [f"{number(float(value))} m/s" for value in np.sort(combinations[:, 2])]
+    is_selected = check_shape(products.get("selected"), 2) is not None
+    other = f"; other combinations: {differences[1]} or more" if len(differences) > 1 else ""
+    text = f"{differences[0]} (selected tracks){other}" if is_selected else f"{differences[0]} or more: too large"
+    return [("Velocity change between the pairs: difference from the IMU", text)]
+
+
+def _describe_images(products: Mapping[str, Any]) -> str:
+    """Describe how the images in the figure differ from the received images."""
+    counts = to_matrix(products.get("image_1"))
+    columns = 1 if counts is None else figures.column_binning(counts)
+    if counts is None or columns == 1:
+        return "images as received."
+    averaging = f"each group of {columns} columns is averaged, for square pixels"
+    return f"images as received, but {averaging} ({len(counts)} × {len(counts)} px)."
 
 
 #: Maximum number of images in a row of a stream's figure.
@@ -145,7 +217,8 @@ STREAM_CASE = CaseKind(
     lambda directory, products: presentation.save_figures(directory, {"stream": draw_stream_case(products)}),
     note_text("dimes.stream_legend"),
 )
-DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, note_text("dimes.legend"))
+# every view has its own legend
+DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, legend="")
 DIMES = Presentation(
     cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section), outcomes=(VelocityOutcome,)
 )

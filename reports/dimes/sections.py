@@ -12,13 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy import stats
 
 from marsyard.reports import rates, section_kinds
+from marsyard.reports.dimes.landing import (
+    SPEED_CORRECTED,
+    SPEED_UNCORRECTED,
+    create_speed_blocks,
+    landing_fractions,
+    landing_rows,
+    omit_empty_rows,
+)
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import (
@@ -36,7 +43,7 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.statistics.samples import quantile_bounds
+from marsyard.reports.tables import error_summaries, statistics_rows
 from marsyard.reports.wording import (
     NOTHING,
     axis_columns,
@@ -50,7 +57,6 @@ from marsyard.reports.wording import (
     percent,
     split_unit,
 )
-from marsyard.scenarios.descent.parameters import LandingParameters
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
@@ -189,11 +195,22 @@ def _draw_scatter(rows: section_kinds.Rows, components: Sequence[str], subject: 
 
 _FIRING = "firing_velocity_error_m_s"
 _FIRING_NOTE = (
-    "The reported velocity is the mean between the second and the third image. The IMU propagates it to the time of "
-    "ignition. The error is relative to the true camera velocity at that time, including pendulum motion. It can be "
-    "smaller than that of the reported velocity: the attitude error causes errors of opposite signs in the reported "
-    "velocity and in its propagation."
+    "The first column is the magnitude of the error. The reported velocity is a mean over the time between images 2 and "
+    "3. The IMU propagates it to ignition. The error is the difference from the true velocity of the camera at ignition, "
+    "which includes the pendulum motion. It can be smaller than in the section Errors: an attitude error causes errors "
+    "of opposite sign in the reported velocity and in the propagation."
 )
+
+
+def _create_ignition_blocks(frame: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
+    """Create the table of statistics of the error at ignition."""
+    summaries = error_summaries(frame, _FIRING)
+    rows, too_few_cases = omit_empty_rows(statistics_rows([summary for _, summary in summaries]))
+    grid = Grid(["", *(name for name, _ in summaries)], rows)
+    data = {name: asdict(summary) for name, summary in summaries}
+    return [Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}")], data
+
+
 #: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
 FIRING = section_kinds.SectionDeclaration(
     "firing",
@@ -202,108 +219,39 @@ FIRING = section_kinds.SectionDeclaration(
     rows=lambda subject: None if subject.metric == _FIRING else subject.frame,
     requires=(_FIRING,),
     parts=(
-        section_kinds.Statistics(_FIRING, note=_FIRING_NOTE),
+        section_kinds.CustomBlocks(_create_ignition_blocks),
         section_kinds.Quantiles(
-            # the computation of the velocity must end within this time
             [section_kinds.Quantity("firing_after_s")],
             {"Minimum": 0.0, "Median": 0.5, "Maximum": 1.0},
-            heading="Time from the last image to thruster ignition",
+            heading="Time available to compute the velocity",
         ),
     ),
 )
 
-SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
-#: Minimum change of speed that counts as an improvement or a degradation, m/s.
-MIN_SPEED_CHANGE_M_S = 1.0
-#: Speeds above which the table gives the fraction of cases, m/s.
-SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
-
-
-def _landing_rows(subject: Subject) -> pd.DataFrame | None:
-    speeds = np.column_stack([numbers(subject.frame, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)])
-    landings = subject.frame[np.isfinite(speeds).all(axis=1)]
-    return landings if len(landings) else None
-
-
-def landing_fractions(landings: section_kinds.Rows) -> dict[str, rates.CaseFraction]:
-    """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
-    change = numbers(landings, SPEED_CORRECTED) - numbers(landings, SPEED_UNCORRECTED)
-    fractions = {
-        f"slower by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(
-            change < -MIN_SPEED_CHANGE_M_S, landings
-        ),
-        f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landings),
-    }
-    if rates.is_flag(landings, "in_time_assumed"):
-        name = "assumed computation time ends before ignition"
-        fractions[name] = rates.fraction_of(rates.flag_mask(landings, "in_time_assumed"), landings)
-    return fractions
-
-
-def _landing_model(subject: Subject) -> dict[str, str]:
-    """Return the parameters of the campaign's model of the last seconds, for the note of the table of speeds."""
-    model = LandingParameters.model_validate(subject.run.parameter("landing") or {})
-    return {
-        "deadband": f"{model.steering_deadband_m_s:g}",
-        "max_steering": f"{model.max_steering_m_s:g}",
-        "steering": f"{100.0 * model.steering_error:g}",
-        "burn": f"{model.burn_error_m_s:g}",
-    }
-
-
-def _create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
-    """Create the table of touchdown speeds with and without the correction: mean, quantiles, fractions above speeds."""
-    columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
-    groups = rates.terrain_groups(landings)
-    change = columns[0] - columns[1]
-    rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
-    for probability in (0.5, 0.95, 0.99):
-        texts = []
-        for values in columns:
-            bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
-            bound_text = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
-            texts.append(f"{number(rates.quantile(values, probability))}{bound_text}")
-        rows.append([f"{format_fraction(probability)} quantile ({format_fraction(CONFIDENCE)} upper bound)", *texts])
-    rows += [
-        [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
-        for speed in SPEEDS_M_S
-    ]
-    improved, degraded, *_ = landing_fractions(landings).values()
-    data = {
-        "landings": len(landings),
-        "reduced_fraction": improved.fraction,
-        "increased_fraction": degraded.fraction,
-        "mean_with_m_s": float(columns[0].mean()),
-        "mean_without_m_s": float(columns[1].mean()),
-        "largest_gain_m_s": float(-change.min()),
-        "largest_loss_m_s": float(change.max()),
-    }
-    gain, loss = number(data["largest_gain_m_s"]), number(data["largest_loss_m_s"])
-    note = note_text(
-        "dimes.landing", confidence=format_fraction(CONFIDENCE), gain=gain, loss=loss, **_landing_model(subject)
-    )
-    grid = Grid(["", "With correction", "Without correction"], rows)
-    return [Block(heading="Speeds with and without the correction", grid=grid, note=note)], data
-
-
-#: Horizontal speed at touchdown with and without the correction by the estimated velocity.
+#: Horizontal speed at touchdown with and without steering by the estimated velocity.
 LANDING = section_kinds.SectionDeclaration(
     "landing",
     "Landing",
     "Horizontal speed at touchdown",
-    rows=_landing_rows,
+    rows=landing_rows,
     parts=(
         section_kinds.Distribution(
             [
-                section_kinds.Quantity(SPEED_CORRECTED, "corrected"),
-                section_kinds.Quantity(SPEED_UNCORRECTED, "uncorrected"),
+                section_kinds.Quantity(SPEED_CORRECTED, "with steering"),
+                section_kinds.Quantity(SPEED_UNCORRECTED, "without steering"),
             ],
             ("horizontal speed at touchdown (m/s)", "fraction of landings above this speed"),
-            "Fraction of landings whose horizontal speed at touchdown is above the value on the axis.",
+            "The same landings with steering by the reported velocity, and without. The lower curve is better.",
             complementary=True,
         ),
-        section_kinds.RateTable(landing_fractions, cases="Landings", heading="Fractions of landings", data="fractions"),
-        section_kinds.CustomBlocks(_create_speed_blocks),
+        section_kinds.RateTable(
+            landing_fractions,
+            cases="Landings",
+            heading="Effect of steering",
+            note="The intervals are two-sided Clopper-Pearson intervals, corrected for shared terrains.",
+            data="fractions",
+        ),
+        section_kinds.CustomBlocks(create_speed_blocks),
     ),
 )
 
@@ -345,7 +293,8 @@ def sensitivity_section(subject: Subject) -> Section | None:
     if metric is None or not effects:
         return None
     unit = split_unit(metric)[1]
-    caption = f"Change of the mean {magnitude_label(metric)} from the 5 % to the 95 % quantile of each condition."
+    change_text = f"Change of the mean {magnitude_label(metric)} from the 5 % to the 95 % quantile of each condition."
+    caption = f"{change_text} Dots: estimates. Bars: {format_fraction(CONFIDENCE)} intervals."
     effect_svg = svg_figure(effect_figure(effects, unit), "sensitivity", caption)
     note = note_text("dimes.sensitivity", metric=magnitude_label(metric), confidence=format_fraction(CONFIDENCE))
     rows = [
@@ -356,7 +305,7 @@ def sensitivity_section(subject: Subject) -> Section | None:
         ]
         for effect in effects
     ]
-    head = ["", "5 % to 95 %", "Rank correlation", "Standardised coefficient", f"Effect ({unit})"]
+    head = ["", "5 % to 95 % quantile", "Rank correlation", "Standardised coefficient", f"Effect ({unit})"]
     data = {"drivers": [asdict(effect) for effect in effects]}
     blocks = [Block(figures=[effect_svg]), Block(grid=Grid(head, rows), note=note)]
     return Section("sensitivity", "Sensitivity", "Sensitivity of the error to the conditions", blocks, data)

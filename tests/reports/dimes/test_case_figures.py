@@ -128,6 +128,7 @@ def test_case_without_tracks_shows_only_images(dimes_products: dict[str, Any]) -
     assert [name for name, _ in case_view.facts] == [
         "Reported velocity, mean over the time between images 2 and 3",
         "True velocity, same interval",
+        "Velocity error",
     ]
 
 
@@ -144,3 +145,35 @@ def test_images_of_a_case_without_tracks_are_written(dimes_products: dict[str, A
     image_products = {name: value for name, value in dimes_products.items() if name.startswith("image_")}
     assert write_dimes_figures(tmp_path, image_products) == [tmp_path / "images.png"]
     assert (tmp_path / "images.png").stat().st_size > 1000
+
+
+def test_table_marks_the_reported_track(dimes_products: dict[str, Any]) -> None:
+    combinations = np.array([[1.0, 0.0, 0.52], [0.0, 0.0, 0.61]])
+    selection = {"combinations": combinations, "selected": np.array([1.0, 0.0])}
+    case_view = view({**dimes_products, **selection}, "k")
+    column = list(case_view.head).index("Selected")
+    assert [row.values[column] for row in case_view.rows] == ["no", "yes", "yes, reported", "no"]
+    assert dict(case_view.facts)["Velocity error"] == "0.583 m/s"
+    difference = "Velocity change between the pairs: difference from the IMU"
+    assert dict(case_view.facts)[difference] == "0.520 m/s (selected tracks); other combinations: 0.610 m/s or more"
+    refused_view = view({**dimes_products, **selection, "selected": np.array([])}, "k")
+    assert "Selected" not in refused_view.head
+    assert dict(refused_view.facts)[difference] == "0.520 m/s or more: too large"
+
+
+def test_captions_describe_only_drawn_marks(dimes_products: dict[str, Any]) -> None:
+    captions = [figure.caption for figure in view(dimes_products, "k").figures]
+    assert ["Dashed" in caption for caption in captions] == [False, True]
+    marks = {
+        "overlap_0": np.array([[10.0, 10.0], [300.0, 10.0], [300.0, 300.0]]),
+        "overlap_1": np.array([[-50.0, -50.0], [400.0, -50.0], [400.0, 400.0], [-50.0, 400.0]]),
+        "zero_phase_0": np.array([[-900.0, 20.0], [30.0, 20.0]]),
+        "zero_phase_1": np.full((2, 2), np.nan),
+    }
+    first_caption, second_caption = (figure.caption for figure in view({**dimes_products, **marks}, "k").figures)
+    assert "Dotted" in first_caption
+    assert "Yellow cross" in first_caption
+    assert "Dotted" not in second_caption
+    assert "cross" not in second_caption
+    without_tracks = {**dimes_products, "tracks": np.zeros((0, len(dimes_products["tracks_columns"])))}
+    assert "Red" not in view(without_tracks, "k").figures[0].caption
