@@ -138,7 +138,11 @@ def scatter_section(subject: Subject) -> Section | None:
         f"{percent(ellipse.inside)} of these errors lie inside."
     )
     rows = [
-        [format_fraction(circle.probability), number(circle.estimate), interval(circle.lower, circle.upper)]
+        [
+            format_fraction(circle.probability),
+            "too few cases" if math.isnan(circle.estimate) else number(circle.estimate),
+            interval(circle.lower, circle.upper),
+        ]
         for circle in circles
     ]
     grid = Grid(

@@ -165,12 +165,15 @@ def _bin_grid(frame: pd.DataFrame, metric: str, bins: Sequence[Mapping[str, Any]
     unit = split_unit(metric)[1]
     head = ["", "Cases", "Answered", f"{format_fraction(CONFIDENCE)} interval"]
     head += [f"{statistic}{axis} ({unit})" for axis in axes for statistic in ("Mean", "SD")]
-    head += [f"Bound of the {format_fraction(QUANTILE)} quantile ({unit})", f"Maximum ({unit})"]
+    has_bounds = any(np.isfinite(row["quantile_bound"]) for row in bins)
+    head += [f"Bound of the {format_fraction(QUANTILE)} quantile ({unit})"] if has_bounds else []
+    head += [f"Maximum ({unit})"]
     rows = []
     for row in bins:
         component_texts = [number(value) for pair in zip(row["means"], row["sds"], strict=True) for value in pair]
         answered, bound = row["answered"], row["quantile_bound"]
-        last_texts = [number(bound) if np.isfinite(bound) else "too few cases", number(row["largest"])]
+        last_texts = [number(bound) if np.isfinite(bound) else "too few cases"] if has_bounds else []
+        last_texts.append(number(row["largest"]))
         interval = rates.range_text(*answered.clustered_interval)
         rows.append(
             [row["name"], f"{answered.n:,}", percent(answered.fraction), interval, *component_texts, *last_texts]

@@ -244,7 +244,11 @@ def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
         ("CPU time per case", f"{number(float(times.mean()))} s on average" if times.size else None),
         ("Commit", run.recorded("git_commit")),
         ("Marsyard", table(run.recorded("versions")).get("marsyard")),
-        *((f"Machine: {_FACT_NAMES.get(name, name)}", value) for name, value in environment.items() if value not in ({}, None)),
+        *(
+            (f"Machine: {_FACT_NAMES.get(name, name)}", value)
+            for name, value in environment.items()
+            if value not in ({}, None)
+        ),
         ("GL backend", _distinct_values(run.frame, "gl_backend")),
         ("GL version", _distinct_values(run.frame, "gl_version")),
     ]

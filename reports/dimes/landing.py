@@ -56,13 +56,13 @@ def _landing_model(subject: Subject) -> dict[str, str]:
 
 
 _LANDING_NOTE = (
-    "{missing}{bounds}Steering tilts the rocket burn against the reported velocity, which the IMU propagates to ignition. "
-    "It removes at most {max_steering} m/s. {not_steered} of {landings} landings are not steered and have the same "
-    "speed in both columns. Possible reasons: no velocity was reported; the computation ended after ignition (assumed "
-    "duration: {computation} s); the propagated velocity was at most {deadband} m/s. The burn adds an error of {burn} "
-    "m/s to each landing. Steering adds an error of {steering} % of the removed velocity. Both errors are assumed, rms "
-    "per axis. The speed with steering is therefore usually larger than the velocity error at ignition. Largest "
-    "decrease of the speed by steering: {gain}. Largest increase: {loss}."
+    "{missing}{bounds}Steering tilts the rocket burn against the reported velocity, which the IMU propagates to "
+    "ignition. It removes at most {max_steering} m/s. {not_steered} of {landings} landings are not steered and have "
+    "the same speed in both columns. Possible reasons: no velocity was reported; the computation ended after ignition "
+    "(assumed duration: {computation} s); the propagated velocity was at most {deadband} m/s. The burn adds an error "
+    "of {burn} m/s to each landing. Steering adds an error of {steering} % of the removed velocity. Both errors are "
+    "assumed, rms per axis. The speed with steering is therefore usually larger than the velocity error at ignition. "
+    "Largest decrease of the speed by steering: {gain}. Largest increase: {loss}."
 )
 
 

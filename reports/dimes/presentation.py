@@ -44,12 +44,12 @@ _HEADINGS = {
 }
 _LEGEND = (
     "Top row: images rectified to a view from directly above, north up. Middle row, if there are templates: templates "
-    "and search windows, cut from the rectified images. Bottom row: {images} Squares in the bottom row mark positions, "
-    "not sizes. Positions in the table are pixels of the images in the bottom row, from 0 at the upper left. Each "
-    "velocity in the table is the mean between the two images of the pair. DIMES combines each valid track of pair 1 "
-    "with each valid track of pair 2. It selects the combination whose velocity change agrees best with the IMU. It "
-    "reports the velocity of the selected track of pair 2, the later pair. If the smallest difference from the IMU is "
-    "too large, no velocity is reported."
+    "and search windows, cut from the rectified images. Bottom row: {images} Squares in the bottom row mark "
+    "positions, not sizes. Positions in the table are pixels of the images in the bottom row, from 0 at the upper "
+    "left. Each velocity in the table is the mean between the two images of the pair. DIMES combines each valid track "
+    "of pair 1 with each valid track of pair 2. It selects the combination whose velocity change agrees best with "
+    "the IMU. It reports the velocity of the selected track of pair 2, the later pair. If the smallest difference "
+    "from the IMU is too large, no velocity is reported."
 )
 
 

@@ -195,10 +195,10 @@ def _draw_scatter(rows: section_kinds.Rows, components: Sequence[str], subject: 
 
 _FIRING = "firing_velocity_error_m_s"
 _FIRING_NOTE = (
-    "The first column is the magnitude of the error. The reported velocity is a mean over the time between images 2 and "
-    "3. The IMU propagates it to ignition. The error is the difference from the true velocity of the camera at ignition, "
-    "which includes the pendulum motion. It can be smaller than in the section Errors: an attitude error causes errors "
-    "of opposite sign in the reported velocity and in the propagation."
+    "The first column is the magnitude of the error. The reported velocity is a mean over the time between images 2 "
+    "and 3. The IMU propagates it to ignition. The error is the difference from the true velocity of the camera at "
+    "ignition, which includes the pendulum motion. It can be smaller than in the section Errors: an attitude error "
+    "causes errors of opposite sign in the reported velocity and in the propagation."
 )
 
 

@@ -1,9 +1,10 @@
 """Figures of one landing, as Figs. 1 to 5 and 7 of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 
 Colours are those of the paper's text, in shades that colour-blind readers can distinguish. Fig. 2: cameras red and
-green, features white. Fig. 3: structure pixels red, segments green, matches blue. Maps: green, yellow and red. A black
-X marks the a-priori site, a purple plus the safe site. The true maps in Fig. 5 and the true motion in Fig. 2 are
-additions. Missing products raise ValueError.
+green, features white. Fig. 3: structure pixels red, segments green, matches blue. Maps: green, yellow and red. Unknown
+parts of all maps are light blue; the paper marks them yellow in the safe landing map. A black X marks the a-priori
+site, a purple plus the reported site. The true maps in Fig. 5 and the true motion in Fig. 2 are additions. Missing
+products raise ValueError.
 """
 
 from __future__ import annotations
@@ -28,13 +29,15 @@ Product = TypeVar("Product")
 #: Green, yellow and red that readers with any colour vision can distinguish (after Okabe & Ito).
 GREEN, YELLOW, RED = "#009e73", "#f0e442", "#c83a12"
 BLUE, PURPLE, BLACK, WHITE = "#3da5ff", "#8f1fb0", "#000000", "#ffffff"
+#: Unknown parts of maps: not grey as elevation, and not yellow as slope or roughness near the limit.
+UNKNOWN = "#b9d3ee"
 TRACKED_COLOUR, LOST_COLOUR = "#f0a202", "#c9d1d9"
 #: Colours of slope and roughness, from 0 to twice the limit (1.0): green for small values, yellow up to the limit
 #: (0.5), red above.
 HAZARD_COLOURS = LinearSegmentedColormap.from_list(
     "hazard", [(0.0, GREEN), (0.2, GREEN), (0.42, YELLOW), (0.5, YELLOW), (0.5, RED), (1.0, "#7d1f06")]
-).with_extremes(bad="#8a929b")
-SAFETY_COLOURS = ListedColormap([GREEN, YELLOW, RED])
+).with_extremes(bad=UNKNOWN)
+SAFETY_COLOURS = ListedColormap([GREEN, UNKNOWN, RED])
 #: High ground is dark, low ground is bright.
 ELEVATION_COLOURS = "gray_r"
 #: Maximum number of drawn structure pixels; the paper's Table I has 600.
@@ -89,9 +92,12 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     _draw_squares(left, matches.grid[indices], "#ff4b3e")
     _draw_segments(right, matches.starts[indices], matches.ends[indices], "#35d46b")
     _draw_squares(right, matches.matched[indices][matches.accepted[indices]], BLUE)
-    count_text = "" if len(indices) == len(matches.grid) else f", {len(indices)} shown"
-    left.set_title(f"First image: {len(matches.grid):,} structure pixels{count_text}", fontsize=9)
-    right.set_title(f"Second image: segments, {int(matches.accepted.sum()):,} matches", fontsize=9)
+    n_pixels, n_matches = f"{len(matches.grid):,}", f"{int(matches.accepted.sum()):,}"
+    if len(indices) < len(matches.grid):
+        n_pixels = f"{len(indices):,} of {n_pixels}"
+        n_matches = f"{int(matches.accepted[indices].sum()):,} of {n_matches}"
+    left.set_title(f"First image: {n_pixels} structure pixels", fontsize=9)
+    right.set_title(f"Second image: {n_matches} matches", fontsize=9)
     return figure
 
 
@@ -100,9 +106,10 @@ def draw_elevation(products: Mapping[str, Any]) -> Figure:
     """Draw Fig. 4: two views of the elevation map."""
     maps = _require(stages.read_landing_maps(products), "maps")
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
-    for index, azimuth in enumerate((-115.0, -25.0)):
+    for index, (azimuth, name) in enumerate(((-115.0, "Elevation map (m)"), (-25.0, "The same from another side"))):
         axes = figure.add_subplot(1, 2, index + 1, projection="3d", computed_zorder=False)
-        _draw_terrain(axes, maps, np.broadcast_to(np.array(to_rgb("#b9bec4")), (*maps.elevation_m.shape, 3)), azimuth)
+        colours = np.broadcast_to(np.array(to_rgb("#b9bec4")), (*maps.elevation_m.shape, 3))
+        _draw_terrain(axes, maps, colours, azimuth, name)
     return figure
 
 
@@ -134,16 +141,15 @@ def draw_maps(products: Mapping[str, Any]) -> Figure:
         )
         colour_bar.outline.set_visible(False)
         colour_bar.ax.tick_params(labelsize=7)
-        upper.set_title(f"Map: {name}", fontsize=9)
-        lower.set_title(f"Truth of footprints: {name}" if limit is not None else "Truth", fontsize=9)
+        upper.set_title(name.capitalize(), fontsize=9)
+        lower.set_title(f"True {name}", fontsize=9)
     _draw_safety(map_row[3], truth_row[3], maps, truth)
     rows, columns = maps.elevation_m.shape
     for axes in (*map_row, *truth_row):
-        for name, (row, column) in (("apriori", maps.apriori), ("site", maps.site)):
-            if 0 <= row <= rows - 1 and 0 <= column <= columns - 1:
-                _mark_site(axes, np.array([column, row]), name)
+        for name, (row, column) in drawn_sites(maps).items():
+            _mark_site(axes, np.array([column, row]), name)
         axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[], aspect="equal")
-        axes.set_facecolor("#8a929b")
+        axes.set_facecolor(UNKNOWN)
         axes.grid(visible=False)
     return figure
 
@@ -157,13 +163,27 @@ def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, tru
     cells = maps.world_to_cell(truth.offset_from_nadir_m)
     safety = np.where(truth.covered, np.where(truth.safe, 0.0, 2.0), 1.0)
     truth_axes.pcolormesh(cells[..., 1], cells[..., 0], safety, shading="nearest", rasterized=True, **colour_scale)
+    if is_unknown_everywhere(maps):
+        map_axes.text(0.5, 0.9, "unknown everywhere", transform=map_axes.transAxes, ha="center", va="top", fontsize=9)
     map_axes.set_title("Safe landing map", fontsize=9)
-    truth_axes.set_title("Truth of footprints: safety", fontsize=9)
-    for name, colour in (("safe", GREEN), ("unknown", YELLOW), ("hazard", RED)):
+    truth_axes.set_title("True safety", fontsize=9)
+    for name, colour in (("safe", GREEN), ("hazard", RED), ("unknown", UNKNOWN)):
         truth_axes.plot([], [], "s", color=colour, label=name)
-    for marker, label in zip(_SITE_MARKERS.values(), ("a-priori site", "safe site"), strict=True):
-        truth_axes.plot([], [], **marker, label=label)
+    for name in drawn_sites(maps):
+        truth_axes.plot([], [], **_SITE_MARKERS[name], label=SITE_NAMES[name])
     truth_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
+
+
+def is_unknown_everywhere(maps: stages.LandingMaps) -> bool:
+    """Whether the safe landing map has neither a safe cell nor a hazard."""
+    return not bool(np.any((maps.safety < 0.5) | (maps.safety > 1.5)))
+
+
+def drawn_sites(maps: stages.LandingMaps) -> dict[str, Float[np.ndarray, "2"]]:
+    """Return row and column of the sites inside the map, by key of `SITE_NAMES`."""
+    rows, columns = maps.elevation_m.shape
+    sites = {"apriori": maps.apriori, "site": maps.site}
+    return {name: cell for name, cell in sites.items() if 0 <= cell[0] <= rows - 1 and 0 <= cell[1] <= columns - 1}
 
 
 @in_page_style
@@ -189,10 +209,10 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
             if pixel is not None:
                 _mark_site(axes, pixel, name)
     image_axes.set_title("First image", fontsize=9)
-    overlay_axes.set_title("Safe landing map on the first image", fontsize=9)
+    overlay_axes.set_title("Safe landing map on the image", fontsize=9)
     terrain = figure.add_subplot(1, 3, 3, projection="3d", computed_zorder=False)
     colours = SAFETY_COLOURS(np.clip(np.nan_to_num(maps.safety, nan=1.0), 0, 2).astype(np.int64))[..., :3]
-    _draw_terrain(terrain, maps, colours, -115.0)
+    _draw_terrain(terrain, maps, colours, -115.0, "On the terrain")
     return figure
 
 
@@ -265,7 +285,7 @@ def _draw_motion_view(
     poses = (
         (np.eye(3), np.zeros(3), "#ff4b3e", "-", "first camera"),
         (motion.rotation, motion.translation, "#35d46b", "-", "second camera"),
-        (motion.true_rotation, motion.true_translation, WHITE, ":", "second, true"),
+        (motion.true_rotation, motion.true_translation, WHITE, ":", "second camera, true"),
     )
     for number, (rotation, translation, colour, line, name) in enumerate(poses):
         centre = -rotation.T @ translation
@@ -287,9 +307,12 @@ def _draw_motion_view(
 
 
 def _draw_terrain(
-    axes: Any, maps: stages.LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float
+    axes: Any, maps: stages.LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float, name: str
 ) -> None:
-    """Draw the elevation map as a shaded surface in these colours, with the sites on it; the axes are 3-D."""
+    """Draw the elevation map as a shaded surface in these colours, with the sites on it; the axes are 3-D.
+
+    `name` is the title, to which the exaggeration of heights is added.
+    """
     rows, columns = maps.elevation_m.shape
     step = max(1, round(max(rows, columns) / _MAX_DRAWN_CELLS))
     x = maps.corner_m[0] + maps.cell_m * np.arange(columns)
@@ -309,20 +332,18 @@ def _draw_terrain(
         ccount=200, shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
     )  # fmt: skip
     offset_m = 0.02 * float(sides.max()) / exaggeration
-    for name, cell in (("apriori", maps.apriori), ("site", maps.site)):
+    for site, cell in (("apriori", maps.apriori), ("site", maps.site)):
         height = _value_at_cell(heights[..., None], cell)
         if height is not None and np.isfinite(height).all():
             position = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
-            axes.plot([position[0]], [position[1]], [float(height[0]) + offset_m], **_SITE_MARKERS[name], zorder=5)
+            axes.plot([position[0]], [position[1]], [float(height[0]) + offset_m], **_SITE_MARKERS[site], zorder=5)
     axes.set_box_aspect((sides[0], sides[1], max(exaggeration * height_range_m, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)
     axes.set(xlabel="x (m)", ylabel="y (m)")
-    axes.set_title(
-        "Heights in m" if exaggeration == 1.0 else f"Heights in m, exaggerated {exaggeration:g} times", fontsize=9
-    )
+    axes.set_title(name if exaggeration == 1.0 else f"{name}, heights × {exaggeration:g}", fontsize=9)
     axes.tick_params(labelsize=6, pad=-2, colors=MUTED)
-    for name, axis, bins in (("x", axes.xaxis, 4), ("y", axes.yaxis, 4), ("z", axes.zaxis, 3)):
-        axes.locator_params(axis=name, nbins=bins)
+    for axis_name, axis, bins in (("x", axes.xaxis, 4), ("y", axes.yaxis, 4), ("z", axes.zaxis, 3)):
+        axes.locator_params(axis=axis_name, nbins=bins)
         axis.label.set_size(7)
         axis.labelpad = -6
         axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
@@ -332,6 +353,8 @@ _SITE_MARKERS: Mapping[str, Mapping[str, Any]] = {
     "apriori": {"marker": "x", "color": BLACK, "markersize": 8, "markeredgewidth": 2.0, "linestyle": ""},
     "site": {"marker": "+", "color": PURPLE, "markersize": 11, "markeredgewidth": 2.6, "linestyle": ""},
 }
+#: Names of the sites in legends.
+SITE_NAMES: Mapping[str, str] = {"apriori": "a-priori site", "site": "reported site"}
 _WHITE_OUTLINE = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
 
 

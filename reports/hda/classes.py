@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports import section
 from marsyard.reports.figures import RateLine, draw_rates
-from marsyard.reports.hda.sections import PAPER, landing_rows
+from marsyard.reports.hda.sections import PAPER, drop_empty_columns, landing_rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
 from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
 from marsyard.reports.section_kinds import BlocksAndData, Rows
@@ -57,18 +57,30 @@ class HazardClass:
 #: Rates of footprints over all flights: columns of the counted and of all footprints, by name. A large hazard has at
 #: least twice the roughness limit and a diameter of at least three map cells.
 RATES: Mapping[str, tuple[str, str]] = {
+    "truly safe footprints that are classified as safe": ("footprints_called_safe_rightly", "footprints_truly_safe"),
     "truly safe footprints with a detected hazard (false alarms)": ("false_alarms", "footprints_truly_safe"),
     "footprints classified as safe that are not truly safe": (
         "footprints_called_safe_unsafe",
         "footprints_called_safe",
     ),
-    "footprints classified as safe that contain a large hazard": (
-        "gross_hazards_called_safe",
-        "footprints_called_safe",
-    ),
     "footprints with a large hazard that are classified as safe": ("gross_hazards_called_safe", "gross_hazards"),
     "footprints with a large hazard, but without a detected hazard": ("gross_hazards_unflagged", "gross_hazards"),
 }
+_CLASS_NOTE = (
+    "A footprint is the circle that the lander covers around a grid point. Only footprints that both images show "
+    "completely and that have values in the map are counted. The grid spacing is one tenth of the lander diameter, so "
+    "footprints overlap. The roughness of a footprint is the height of its highest obstacle. Detected: the map of "
+    "slope or roughness exceeds the limit in at least one cell of the footprint. Classified as safe: the safe landing "
+    "map marks the centre of the footprint as safe. Footprints within the limit of the quantity are not in the first "
+    "table."
+)
+_RATE_NOTE = (
+    "A truly safe footprint without a detected hazard is still not classified as safe if it is close to a hazard, to "
+    "a hole or to the border of the map, or if a further check of the algorithm rejects it. A large hazard is at "
+    "least three cells wide and at least twice as high as the roughness limit. The intervals are "
+    f"{format_fraction(CONFIDENCE)} bootstrap intervals over flights, or over terrains if flights share terrains. "
+    "There is no interval if the rate is 0."
+)
 
 
 def count_hazard_classes(frame: Rows) -> list[HazardClass]:
@@ -91,28 +103,33 @@ def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndDat
     classes = count_hazard_classes(frame)
     if not classes:
         return [], {}
-    rates = {name: pooled_rate(frame, *columns) for name, columns in RATES.items()}
-    caption = "Missed hazards by size: fraction classified as safe, and fraction without a detected hazard."
-    figure = section.svg_figure(class_figure(classes), key, caption)
+    n_safe_rightly = numbers(frame, "footprints_called_safe") - numbers(frame, "footprints_called_safe_unsafe")
+    rate_rows = frame.assign(footprints_called_safe_rightly=n_safe_rightly)
+    rates = {name: pooled_rate(rate_rows, *columns) for name, columns in RATES.items()}
+    hazards = [item for item in classes if item.is_hazard and item.called_safe.total]
     class_grid = build_grid(
-        [item for item in classes if item.called_safe.total],
+        hazards,
         {
             "Quantity": lambda item: item.kind,
             "Size divided by limit": lambda item: item.name,
-            "Footprints (flights)": lambda item: f"{item.called_safe.total:,} ({item.called_safe.flights:,})",
+            "Footprints": lambda item: f"{item.called_safe.total:,}",
+            "Flights": lambda item: f"{item.called_safe.flights:,}",
             "Classified as safe": lambda item: rate_text(item.called_safe),
-            "Not detected": lambda item: rate_text(item.unflagged) if item.is_hazard else NOTHING,
-            "Flights with an undetected hazard": lambda item: (
-                f"{item.unflagged.flights_hit:,} of {item.unflagged.flights:,}" if item.is_hazard else NOTHING
-            ),
+            "Not detected": lambda item: rate_text(item.unflagged),
+            "Flights with an undetected hazard": lambda item: f"{item.unflagged.flights_hit:,}",
         },
     )
-    rows = [[name, f"{item.hits:,} of {item.total:,}", rate_text(item)] for name, item in rates.items()]
-    rate_grid = Grid(["Footprints", "Counted", f"Fraction ({format_fraction(CONFIDENCE)} interval)"], rows)
-    blocks = [
-        Block(heading="Missed hazards by roughness and slope", figures=[figure], grid=class_grid),
-        Block(grid=rate_grid, note=note_text("hda.classes", confidence=format_fraction(CONFIDENCE))),
+    rows = [
+        [name, f"{item.hits:,} of {item.total:,}", rate_text(item)] for name, item in rates.items() if item.total > 0
     ]
+    rate_grid = Grid(["", "Footprints", f"Fraction ({format_fraction(CONFIDENCE)} interval)"], rows)
+    figures = []
+    if any(item.called_safe.hits or item.unflagged.hits for item in hazards):
+        caption = "Bars are the intervals of the table. There is no bar if the rate is 0."
+        figures.append(section.svg_figure(class_figure(hazards), key, caption))
+    class_blocks = [Block(heading="Missed hazards by size", figures=figures, grid=class_grid)] if hazards else []
+    rate_block = Block(heading="Safe footprints and large hazards", grid=rate_grid, note=f"{_CLASS_NOTE} {_RATE_NOTE}")
+    blocks = [*class_blocks, rate_block]
     rates_data = {name: asdict(item) for name, item in rates.items()}
     return blocks, {"rates": rates_data, "classes": [asdict(item) for item in classes]}
 
@@ -121,6 +138,8 @@ def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndDat
 def class_figure(classes: Sequence[HazardClass]) -> Figure:
     """Draw the fractions of missed hazards against their size, by roughness and by slope."""
     figure = Figure(figsize=(7.2, 3.3), layout="constrained")
+    rates = [rate for item in classes for rate in (item.called_safe, item.unflagged)]
+    top = float(np.nanmax([(rate.fraction, rate.upper) for rate in rates], initial=0.0)) or 1.0
     for axes, kind in zip(figure.subplots(1, 2, sharey=True), ("roughness", "slope"), strict=True):
         kind_classes = [item for item in classes if item.kind == kind]
         positions = np.arange(len(kind_classes))
@@ -130,9 +149,9 @@ def class_figure(classes: Sequence[HazardClass]) -> Figure:
         unflagged = RateLine("not detected", (positions + 0.08).tolist(), [item.unflagged for item in kind_classes])
         draw_rates(axes, (called_safe, unflagged), linestyle="")
         axes.set_xticks(positions, [item.name for item in kind_classes])
-        axes.set(title=f"by {kind}", xlabel="size divided by the lander's limit")
+        axes.set(title=kind, xlabel="size divided by the lander's limit", ylim=(-0.03 * top, 1.05 * top))
     figure.axes[0].set_ylabel("fraction of footprints")
-    figure.axes[1].legend(loc="upper right")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
 
@@ -211,16 +230,14 @@ def limits_section(subject: Subject) -> Section | None:
             "Size": lambda pair: f"{pair[1].size:g} {pair[0]['unit']}",
             "Flights": lambda pair: f"{pair[1].flights:,}",
             "Correctly tracked": lambda pair: rate_text(pair[1].tracked),
-            "Flights with 90 %": lambda pair: f"{pair[1].good:,}",
+            "Flights with at least 90 %": lambda pair: f"{pair[1].good:,}",
         },
     )
-    caption = (
-        "Fraction of the features in both images that are correctly tracked. Red: limits of the paper. Grey: 90 %."
-    )
+    caption = f"Bars are {format_fraction(CONFIDENCE)} intervals. Dashed: limit of the paper. Dotted: 90 %."
     figure = section.svg_figure(limits_figure(curves), "limits", caption, wide=True)
     blocks = [
         Block(text=note_text("hda.limits_text"), figures=[figure]),
-        Block(heading="Knees", grid=knee_grid, note=note_text("hda.limits")),
+        Block(heading="Knees", grid=drop_empty_columns(knee_grid), note=note_text("hda.limits")),
         Block(heading="By size", grid=size_grid),
     ]
     data = {"curves": [asdict(curve) for curve in curves]}
@@ -293,5 +310,5 @@ def limits_figure(results: Sequence[TrackingCurve]) -> Figure:
     for axes in panels.ravel()[len(results) :]:
         axes.set_axis_off()
     for axes in panels[:, 0]:
-        axes.set_ylabel("features tracked")
+        axes.set_ylabel("features correctly tracked")
     return figure

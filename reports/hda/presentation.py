@@ -13,20 +13,42 @@ import numpy as np
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
-from marsyard.reports.hda.case_figures import FIGURES, available_figures, write_hda_figures
+from marsyard.reports.hda.case_figures import (
+    FIGURES,
+    available_figures,
+    drawn_sites,
+    is_unknown_everywhere,
+    write_hda_figures,
+)
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
+from marsyard.reports.hda.paper_tables import TOUCHDOWN, run_times_section
 from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.section import draw_images, svg_figure
-from marsyard.reports.section_kinds import CustomBlocks, Distribution, RateTable, SectionDeclaration
+from marsyard.reports.section_kinds import CustomBlocks, RateTable, SectionDeclaration
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
-    "fig2-motion": "Fig. 2: estimated motion and structure, three views.",
+    "fig2-motion": "Fig. 2: estimated motion and structure. Rectangles are the fields of view on the ground; short "
+    "lines are the axes of the cameras.",
     "fig3-epipolar": "Fig. 3: structure pixels (red), epipolar segments (green), matches (blue).",
-    "fig4-elevation": "Fig. 4: two views of the elevation map.",
-    "fig5-maps": "Fig. 5: elevation, roughness, slope and safe landing map. Bottom row: ground truth.",
-    "fig7-site": "Fig. 7: first image; safe landing map overlaid on the image and on the terrain.",
+    "fig4-elevation": "Fig. 4: elevation map.",
+    "fig5-maps": "Fig. 5: maps of the algorithm (top row) and ground truth (bottom row).",
+    "fig7-site": "Fig. 7: safe landing map.",
 }
+_MARKS: Mapping[str, str] = {"apriori": "Black X: a-priori site.", "site": "Purple plus: reported site."}
+_UNKNOWN_TEXTS: Mapping[str, str] = {
+    "fig5-maps": "The safe landing map is unknown everywhere: all its cells are close to a hole or to the border.",
+    "fig7-site": "It is unknown everywhere.",
+}
+_LEGEND = (
+    "The layout follows Figs. 2 to 5 and 7 of the paper (Johnson, Montgomery and Matthies, vision guided landing). "
+    "Elevation: relative to the median of the map; high ground is dark. Roughness and slope: green is well below the "
+    "limit, yellow is near it, and red is above it. Safe landing map: green is safe, and red (hatched in Fig. 5) is a "
+    "hazard. Light blue is unknown in all maps. Cells near the border or near a hole are unknown. True slope, "
+    "roughness and safety are those of a lander footprint centred on each point, without hazard growth. They are "
+    "unknown if the images do not show the complete footprint. The a-priori site is set before the images are "
+    "processed."
+)
 #: This figure is not on the page, since its images are those of Fig. 3; only `marsyard replay` draws it.
 _OMITTED_FIGURE = "fig1-tracks"
 
@@ -43,16 +65,29 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
         figure = svg_figure(draw_images(image_pair), f"{key}images", caption, wide=True)
         return CaseView([], [figure], *_stage_rows(products), note_text("hda.plain_legend"))
     named_figures = [(name, FIGURES[name](products)) for name in names]
-    svg_figures = [svg_figure(figure, f"{key}{name[:4]}", _CAPTIONS[name], wide=True) for name, figure in named_figures]
-    facts = [("Figures", ", ".join(name.split("-")[0] for name in names) or "none")]
-    return CaseView(facts, svg_figures, *_stage_rows(products))
+    svg_figures = [
+        svg_figure(figure, f"{key}{name[:4]}", _caption(name, products), wide=True) for name, figure in named_figures
+    ]
+    return CaseView([], svg_figures, *_stage_rows(products))
+
+
+def _caption(name: str, products: Mapping[str, Any]) -> str:
+    """Create the caption of a figure, with the marks and the state of the map that it contains."""
+    maps = stages.read_landing_maps(products)
+    sentences = [_CAPTIONS[name]]
+    if maps is not None and name in _UNKNOWN_TEXTS and is_unknown_everywhere(maps):
+        sentences.append(_UNKNOWN_TEXTS[name])
+    if maps is not None and name in ("fig4-elevation", "fig7-site"):
+        sentences += [_MARKS[site] for site in drawn_sites(maps)]
+    return " ".join(sentences)
 
 
 def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
     """Create head and rows of the table of results by stage."""
     tracks, motion = stages.read_tracked_features(products), stages.read_motion(products)
     matches, maps = stages.read_matches(products), stages.read_landing_maps(products)
-    results = dict.fromkeys(("Features and tracks", "Motion", "Structure", "Map", "Site"), "")
+    names = ("Features and tracks", "Motion", "Structure", "Elevation map", "Safe landing map", "Site")
+    results = dict.fromkeys(names, "")
     if tracks is not None:
         results["Features and tracks"] = f"{tracks.accepted.sum()} of {len(tracks.first)} tracked"
     if motion is not None:
@@ -63,11 +98,17 @@ def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]
         baseline = f"baseline {number(float(np.linalg.norm(motion.true_translation)))} m, error {number(error_m)} m"
         results["Motion"] = f"{baseline}; rotation error {number(float(angle_deg))} deg"
     if matches is not None:
-        results["Structure"] = f"{matches.accepted.sum():,} of {len(matches.grid):,} matched"
+        results["Structure"] = f"{matches.accepted.sum():,} of {len(matches.grid):,} structure pixels matched"
     if maps is not None:
-        (rows, columns), (row, column) = maps.elevation_m.shape, maps.site
-        results["Map"] = f"{rows} x {columns} cells of {number(maps.cell_m)} m"
-        results["Site"] = f"row {row:.0f}, column {column:.0f}" if np.isfinite(maps.site).all() else "no safe site"
+        rows, columns = maps.elevation_m.shape
+        results["Elevation map"] = f"{rows} x {columns} cells of {number(maps.cell_m)} m"
+        safe, hazard = float(np.mean(maps.safety < 0.5)), float(np.mean(maps.safety > 1.5))
+        classes = (("safe", safe), ("hazard", hazard), ("unknown", 1.0 - safe - hazard))
+        results["Safe landing map"] = ", ".join(f"{name} {100.0 * fraction:.1f} %" for name, fraction in classes)
+        # row and column; y increases towards row 0
+        x, y = maps.corner_m + maps.cell_m * maps.site[::-1] * np.array([1.0, -1.0])
+        has_site = bool(np.isfinite(maps.site).all())
+        results["Site"] = f"x {number(x)} m, y {number(y)} m (axes of Fig. 4)" if has_site else "no safe site"
     return ["Stage", "Result"], [TableRow([name, text or "not reached"], bool(text)) for name, text in results.items()]
 
 
@@ -77,23 +118,21 @@ SITES = SectionDeclaration(
     "Sites and hazards compared with the ground truth",
     rows=sections.landing_rows,
     parts=(
-        RateTable(sections.site_fractions, cases="Flights", heading="Sites", data="fractions", shared=False),
         CustomBlocks(sections.create_outcome_blocks),
-        Distribution(
-            sections.hazard_distances,
-            ("distance to the nearest unsafe position (m)", "fraction above this distance"),
-            "Fraction of sites and touchdowns that are farther from unsafe positions than the value on the axis.",
-            heading="Distance to true hazards",
-            complementary=True,
-            table=sections.distance_grid,
-            note=note_text("hda.distances"),
+        RateTable(
+            sections.site_fractions,
+            cases="Flights",
+            heading="Fractions of correct answers",
+            note=sections.INTERVAL_NOTE,
+            data="fractions",
         ),
+        CustomBlocks(sections.create_distance_blocks),
         CustomBlocks(create_class_blocks),
     ),
 )
-_SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_ERRORS, sections.TOUCHDOWN, SITES)
+_SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_ERRORS, TOUCHDOWN, SITES)
 HDA = Presentation(
-    cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, note_text("hda.legend")),),
-    sections=(*_SECTIONS, sections.run_times_section),
+    cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, _LEGEND),),
+    sections=(*_SECTIONS, run_times_section),
     outcomes=(SiteOutcome,),
 )

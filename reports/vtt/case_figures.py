@@ -276,13 +276,14 @@ def _draw_path_axes(axes: Axes, rover_path: RoverPath) -> None:
     for number, (east, north, diameter) in enumerate(rover_path.rocks):
         rock = Circle((east, north), 0.5 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8)
         rock.set_hatch("" if number == 0 else "////")
+        rock.set_label(("rock of the target", "other rocks")[number] if number < 2 else "_rock")
         axes.add_patch(rock)
     axes.plot(*rover_path.path.T, "-", color=SERIES[0], linewidth=1.6, label="path driven")
-    axes.plot(*rover_path.stops.T, "o", color=SERIES[0], markersize=5, label="stops")
+    axes.plot(*rover_path.stops.T, "o", color=SERIES[0], markersize=5, label="true stops")
     axes.plot(
         *rover_path.estimated.T, "x", color=SERIES[1], markersize=5.5, markeredgewidth=1.3, label="estimated stops"
     )
-    axes.plot(*rover_path.target, "*", color=INK, markersize=12, label="designated target")
+    axes.plot(*rover_path.target, "*", color=INK, markersize=12, label="designated point")
     axes.set(xlabel="east (m)", ylabel="north (m)", title="Top view of the path")
     width = _set_limits(
         axes,
@@ -312,7 +313,7 @@ def _draw_estimates(axes: Axes, rover_path: RoverPath) -> None:
     axes.plot(*offsets[finite].T, "o", color=SERIES[1], markersize=5, label=text)
     axes.plot(0.0, 0.0, "*", color=INK, markersize=12)
     axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
-    axes.set_title("Estimated target positions")
+    axes.set_title("Estimated positions of the target")
     width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
     for index in _choose_numbered_points(offsets[finite], width):
         _annotate_number(axes, offsets[finite[index]], int(finite[index]) + 1)

@@ -26,7 +26,7 @@ def test_rank_correlations_have_intervals_and_need_enough_cases(make_rows: Rows)
     assert few_captions
     assert not [caption for caption in few_captions if "correlation" in caption]
     captions = [figure.caption for figure in driver_figures(make_rows(60, answer_rate=1.0), METRIC, 5.0)]
-    pattern = r"rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
+    pattern = r"Rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
     assert all(re.search(pattern, caption) for caption in captions)
 
 

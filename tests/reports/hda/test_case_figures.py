@@ -18,6 +18,7 @@ from marsyard.reports.hda.case_figures import (
     PURPLE,
     RED,
     SAFETY_COLOURS,
+    UNKNOWN,
     YELLOW,
     available_figures,
     draw_epipolar,
@@ -51,7 +52,7 @@ def test_second_camera_is_drawn_at_the_estimated_motion(hda_products: dict[str, 
     top_view = draw_motion(hda_products).axes[0]
     lines = {line.get_label(): np.array(line.get_data()) for line in top_view.lines}
     # the field of view moves with the camera: 1 m estimated, 1.1 m true
-    first, second, true = (lines[name] for name in ("first camera", "second camera", "second, true"))
+    first, second, true = (lines[name] for name in ("first camera", "second camera", "second camera, true"))
     np.testing.assert_allclose(second[0] - first[0], 1.0, atol=1e-12)
     np.testing.assert_allclose(true[0] - first[0], 1.1, atol=1e-12)
     # y is up in the figure and down in the camera frame
@@ -83,15 +84,15 @@ def test_maps_have_the_colours_of_the_paper(hda_products: dict[str, Any]) -> Non
         assert colours == [GREEN, YELLOW]
         (hazard_colour,) = image.to_rgba(np.array([1.01 * limit]))
         assert hazard_colour[0] > 1.8 * hazard_colour[1]  # red
-    assert [to_hex(colour) for colour in safety.to_rgba(np.arange(3))] == [GREEN, YELLOW, RED]
+    assert [to_hex(colour) for colour in safety.to_rgba(np.arange(3))] == [GREEN, UNKNOWN, RED]
 
 
 def test_safety_colours_differ_in_luminance() -> None:
-    """Yellow differs from green and red in luminance; hatching marks red."""
-    luminance = [float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))) for colour in (GREEN, YELLOW, RED)]
+    """The colour of unknown cells differs from green and red in luminance; hatching marks red."""
+    luminance = [float(np.dot(to_rgb(colour), (0.2126, 0.7152, 0.0722))) for colour in (GREEN, UNKNOWN, RED)]
     assert luminance[1] > 1.5 * max(luminance[0], luminance[2])
     assert SAFETY_COLOURS.N == 3
-    assert HAZARD_COLOURS(np.nan)[:3] != HAZARD_COLOURS(0.0)[:3]
+    assert to_hex(HAZARD_COLOURS(np.nan)) == UNKNOWN
 
 
 def test_sites_are_marked_in_image_and_map(hda_products: dict[str, Any]) -> None:
@@ -120,6 +121,16 @@ def test_true_terrain_is_aligned_with_the_map(hda_products: dict[str, Any]) -> N
 def test_figure_without_safe_site_has_no_site_marker(hda_products: dict[str, Any]) -> None:
     image_axes = draw_site({**hda_products, "site": np.array(())}).axes[0]
     assert [line.get_marker() for line in image_axes.lines] == ["x"]
+    captions = [figure.caption for figure in view({**hda_products, "site": np.array(())}, "case1").figures]
+    assert captions[-1] == "Fig. 7: safe landing map. Black X: a-priori site."
+
+
+def test_map_without_known_cells_is_described(hda_products: dict[str, Any]) -> None:
+    products = {**hda_products, "safety": np.ones_like(hda_products["safety"])}
+    case_view = view(products, "case1")
+    assert "unknown everywhere" in case_view.figures[3].caption
+    assert ["Safe landing map", "safe 0.0 %, hazard 0.0 %, unknown 100.0 %"] in [row.values for row in case_view.rows]
+    assert not any("unknown everywhere" in figure.caption for figure in view(hda_products, "case1").figures)
 
 
 @pytest.mark.parametrize(

@@ -11,17 +11,26 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.hda.classes import SizeResult, count_hazard_classes, find_knee, tracking_curves
+from marsyard.reports.hda.classes import (
+    SizeResult,
+    count_hazard_classes,
+    create_class_blocks,
+    find_knee,
+    tracking_curves,
+)
+from marsyard.reports.hda.paper_tables import TOUCHDOWN, run_times_section
 from marsyard.reports.hda.sections import (
     FAULT_OUTCOMES,
     FAULTS,
     MAP_EFFECTS,
+    MAP_ERRORS,
     PAPER,
     THRESHOLD,
-    TOUCHDOWN,
+    distance_grid,
+    drop_empty_columns,
+    hazard_distances,
     map_rows,
     outcome_counts,
-    run_times_section,
     site_fractions,
 )
 from marsyard.reports.rates import PooledRate, pooled_rate
@@ -94,9 +103,9 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
 def test_reported_sites_are_scored_against_the_truth() -> None:
     frame = landing_frame(400)
     rates = site_fractions(frame)
-    safe = rates["selected sites that are truly safe"]
+    safe = rates["reported sites that are truly safe"]
     assert (safe.n, safe.hits) == (frame["site_reported"].sum(), (frame["site_reported"] & frame["site_safe"]).sum())
-    assert rates["answer 'no safe site' if none exists"].fraction == 1.0
+    assert rates["answer 'no safe site' if no safe site exists"].fraction == 1.0
     counts = outcome_counts(frame)
     assert sum(sum(row.values()) for row in counts.values()) == len(frame)
     assert counts["no safe site"]["'no safe site'"] == (frame["outcome"] == "NO_SAFE_SITE").sum()
@@ -119,6 +128,34 @@ def test_hazard_classes_have_their_limits_and_rates() -> None:
     # 3 of 100 footprints of the class are reported as safe
     assert classes[1].called_safe.fraction == pytest.approx(0.03)
     assert classes[4].unflagged.fraction == 0.0
+
+
+def test_distance_to_hazards_is_0_on_unsafe_ground() -> None:
+    """Positions without a hazard in the area count as farther than all distances."""
+    frame = landing_frame(4).assign(site_reported=[True, True, True, False], landed=True)
+    frame = frame.assign(site_safe=[True, False, True, False], touchdown_safe=[False, True, True, True])
+    frame["site_hazard_distance_m"] = [0.5, 0.08, np.inf, np.nan]
+    frame["touchdown_hazard_distance_m"] = [0.04, 0.3, np.inf, np.nan]
+    distances = hazard_distances(frame)
+    np.testing.assert_array_equal(distances["reported site"], [0.5, 0.0, np.inf])
+    np.testing.assert_array_equal(distances["true touchdown"], [0.0, 0.3, np.inf])
+    grid = drop_empty_columns(distance_grid(distances))
+    # three values have no quantiles
+    assert [row[1:] for row in grid.rows] == [["3", "1", "1", "0"], ["3", "1", "1", "0"]]
+
+
+def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:
+    frame = landing_frame(10)
+    blocks, data = create_class_blocks(frame, _make_subject(frame), "sites3")
+    assert blocks[0].grid is not None
+    assert [row[1] for row in blocks[0].grid.rows] == 2 * ["1 to 1.5", "1.5 to 2", "2 to 3", "> 3"]
+    # 400 of 1000 footprints are classified as safe, 2 of them are unsafe; 600 are truly safe
+    rightly_safe = data["rates"]["truly safe footprints that are classified as safe"]
+    assert (rightly_safe["hits"], rightly_safe["total"]) == (3980, 6000)
+    assert blocks[0].figures
+    hits = [str(name) for name in frame if str(name).endswith(("_safe", "_unflagged"))]
+    blocks, _ = create_class_blocks(frame.assign(**dict.fromkeys(hits, 0)), _make_subject(frame), "sites3")
+    assert not blocks[0].figures
 
 
 def test_rates_are_reported_per_roughness_threshold() -> None:
@@ -203,11 +240,27 @@ def test_map_errors_have_the_expected_rank_correlations() -> None:
     mapped_rows = map_rows(_make_subject(frame))
     assert mapped_rows is not None
     effects = {(effect["driver"], effect["error"]): effect for effect in MAP_EFFECTS.effects(mapped_rows)}
-    noise = effects["baseline / height", "elevation error rms after removal of its mean plane (% of height)"]
+    noise = effects["baseline / height", "elevation noise (% of height)"]
     assert noise["rank_correlation"] == pytest.approx(-1.0)
     assert np.all(np.diff(noise["medians"]) < 0.0)
-    scale_error = effects["altimeter error (% of range)", "elevation error rms (% of height)"]
+    scale_error = effects["|altimeter error| (% of range)", "elevation error (% of height)"]
     np.testing.assert_allclose(scale_error["centres"], scale_error["medians"])
+
+
+@pytest.mark.parametrize(("maps", "has_statistics"), [(12, False), (40, True)])
+def test_quantiles_and_correlations_need_20_maps(maps: int, has_statistics: bool) -> None:
+    rng = np.random.default_rng(4)
+    columns = ("baseline_fraction", "texture", "elevation_noise_m", "elevation_rms_m", "slope_error_rms_deg")
+    values = {name: rng.uniform(0.1, 1.0, maps) for name in columns}
+    section = MAP_ERRORS(_make_subject(landing_frame(maps).assign(height_m=10.0, **values)))
+    assert section is not None
+    errors, effects = section.blocks
+    assert errors.grid is not None
+    assert list(errors.grid.head[1:]) == (
+        ["Minimum", "5 %", "Median", "95 %", "Maximum"] if has_statistics else ["Minimum", "Median", "Maximum"]
+    )
+    assert (effects.grid is not None) == has_statistics
+    assert ("Lines are medians" in effects.figures[0].caption) == has_statistics
 
 
 def test_page_and_json_have_the_sections(make_run: Callable[..., Path]) -> None:
