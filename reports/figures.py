@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -231,7 +232,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, condition: str, boun
     strokes: dict[str, Any] = {"color": INK, "markersize": 9, "clip_on": False}
     strokes["rasterized"] = bool(unanswered.sum() > section.MAX_VECTOR_POINTS)
     axes.plot(x[unanswered], np.full(unanswered.sum(), top), "|", **strokes)
-    axes.set(xlabel=label(condition), ylabel=magnitude_label(metric), ylim=(0.0, top))
+    axes.set(xlabel=label(condition), ylabel=textwrap.fill(magnitude_label(metric), 32), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     return figure
 

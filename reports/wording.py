@@ -145,7 +145,7 @@ _AXES = ("x", "y", "z")
 #: Pattern of columns that describe the run or the results, not the conditions of the case.
 _EXCLUDED_COLUMNS = re.compile(
     r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
-    r"|^firing_|^touchdown_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
+    r"|^firing_|^touchdown_|^site_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
     r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
 )
 #: Prefixes of the condition columns that `driver_columns` lists first.

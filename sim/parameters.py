@@ -34,9 +34,11 @@ def _read_names(section: str) -> Mapping[str, str]:
 
 def current_key(name: str, valid_keys: Collection[str], input_keys: Collection[str] = ()) -> str:
     """Return the current name of a key; the name itself if it is valid, or if the input contains both names."""
+    if name in valid_keys:
+        return name
     names = _read_section("keys").get(name, [])
     current = next((key for key in ([names] if isinstance(names, str) else names) if key in valid_keys), None)
-    if current is None or name in valid_keys or current in input_keys:
+    if current is None or current in input_keys:
         return name
     return warn_deprecated(name, current)
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -180,6 +180,7 @@ PRESETS: Mapping[str, Callable[[], Preset]] = {
 }
 
 
+@cache
 def preset(name: str) -> Preset:
     """Create a camera preset by name. Raises ValueError if it is unknown."""
     if name not in PRESETS:

@@ -85,6 +85,7 @@ def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
     assert 0.03 < compute_rms(compute_track_errors(flights, estimates)) < 0.18
 
 
+@pytest.mark.slow
 def test_velocity_is_accurate_with_flight_camera_noise() -> None:
     rng = np.random.default_rng(2025)
     flights = [draw_flight(rng) for _ in range(6)]

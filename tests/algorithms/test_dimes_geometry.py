@@ -146,6 +146,7 @@ def test_candidates_lie_within_the_overlap_polygon() -> None:
     assert min(border_distances) > 0.5 * OPTIONS.template_px * 0.7
 
 
+@pytest.mark.slow
 def test_each_candidate_fits_template_and_window() -> None:
     rng = np.random.default_rng(8)
     for _ in range(6):

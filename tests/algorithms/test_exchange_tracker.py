@@ -133,6 +133,7 @@ def test_only_a_persistent_process_serves_many_runs(tmp_path: Path) -> None:
     assert still_running == []
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("import_path")
 def test_example_tracks_the_target() -> None:
     updates = trackers.drive_to_target(make_tracker(f"exec:{sys.executable} {EXAMPLE}"))

@@ -159,6 +159,7 @@ def test_bent_image_biases_match_without_bend_model() -> None:
     assert np.mean(errors["stretch"]) > 0.2
 
 
+@pytest.mark.slow
 def test_registration_rejects_undetermined_shifts() -> None:
     image = render_blobs(8, pixel_grid(80))
     template = image[30:51, 30:51]

@@ -109,6 +109,7 @@ def test_case_is_opened_by_keyboard(campaigns: Path, open_page: OpenPage) -> Non
     assert "No such case" in page.locator(".explorer-detail").inner_text()
 
 
+@pytest.mark.slow
 def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
     axis_select = page.locator("#explorer select").first

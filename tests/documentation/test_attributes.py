@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 #: Module with one description for three attributes, in two lines.
 MODULE = '''
@@ -24,6 +26,7 @@ class Mean:
 '''
 
 
+@pytest.mark.slow
 def test_attributes_in_one_line_are_rendered_separately(tmp_path: Path) -> None:
     source = tmp_path / "docs"
     source.mkdir()

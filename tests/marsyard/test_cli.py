@@ -269,6 +269,7 @@ def test_internal_error_has_status_2(marsyard: Command, monkeypatch: pytest.Monk
     assert "ZeroDivisionError" in result.err
 
 
+@pytest.mark.slow
 def test_default_output_folder_is_runs(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = write_campaign(tmp_path, dispersions="", requirement="")
@@ -328,6 +329,7 @@ def test_invalid_campaign_is_rejected_before_slow_imports(tmp_path: Path) -> Non
         assert f" {package}\n" not in result.stderr
 
 
+@pytest.mark.slow
 def test_terminal_shows_a_progress_bar(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, dispersions="", requirement="")
     command = [sys.executable, "-m", "marsyard", "run", str(path), "-n", "2", "--jobs", "1"]

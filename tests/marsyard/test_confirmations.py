@@ -153,6 +153,7 @@ def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
     assert "not the frozen evaluation" in (tmp_path / "site" / "verification.csv").read_text()
 
 
+@pytest.mark.slow
 def test_run_on_the_seed_of_a_later_confirmation_is_recognised(
     campaign: Path, marsyard: Command, tmp_path: Path
 ) -> None:
@@ -188,6 +189,7 @@ def test_errors_are_reported_before_the_first_case(campaign: Path, marsyard: Com
     assert (status, "calibration.runs[0].options[0]" in err, "error_scale" in err) == (2, True, True)
 
 
+@pytest.mark.slow
 def test_interrupted_confirmation_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
     """A run that stopped after it had reserved its seed counts in the correction of the next confirmation."""
     marsyard("run", campaign, "--confirm", "--out", tmp_path / "first", "--jobs", 1)

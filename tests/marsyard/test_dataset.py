@@ -126,6 +126,7 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
     assert "contains another data set (configuration_sha256 differs)" in output
 
 
+@pytest.mark.slow
 def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     settings = ["terrain.samples=512", "location.bank=8"]
     arguments = [argument for setting in settings for argument in ("--set", setting)]

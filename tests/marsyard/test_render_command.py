@@ -64,6 +64,7 @@ def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
         np.testing.assert_allclose(truth["world_from_body"], metadata["world_from_body"])
 
 
+@pytest.mark.slow
 def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Path) -> None:
     prefix = tmp_path / "hover"
     status, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)

@@ -123,6 +123,7 @@ def test_two_campaigns_are_compared(make_run: MakeRun, marsyard: Command) -> Non
     assert figures["came to an end"]["first"] == {"rate": 1.0, "cases": 40}
 
 
+@pytest.mark.slow
 def test_dashboard_is_written_and_served_locally(make_run: MakeRun, marsyard: Command, tmp_path: Path) -> None:
     make_run("run")
     status, out, _ = marsyard("dashboard", tmp_path, "--out", tmp_path / "site")

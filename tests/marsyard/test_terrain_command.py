@@ -34,6 +34,7 @@ def test_list_names_every_site() -> None:
         assert name in output
 
 
+@pytest.mark.slow
 def test_site_statistics_include_values_of_the_paper() -> None:
     status, output = run_terrain_command("stats", "meridiani", "--json")
     assert status == 0

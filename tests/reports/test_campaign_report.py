@@ -156,6 +156,7 @@ def test_small_report_contains_the_main_results(
     assert len(text) < 2_000_000
 
 
+@pytest.mark.slow
 def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: MakeRun) -> None:
     text, page, report = _write_and_read(make_run(make_rows(24)[FULL_COLUMNS], []))
     _check_page(text, page)
@@ -178,6 +179,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
     assert (report["verdict"], report["exit_code"]) == ("MET BY RATE", 3)
 
 
+@pytest.mark.slow
 def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: MakeRun) -> None:
     text, _, report = _write_and_read(
         make_run(make_rows(400, answer_rate=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
@@ -258,6 +260,7 @@ def test_folder_without_valid_row_table_is_rejected(tmp_path: Path) -> None:
         write_report(tmp_path)
 
 
+@pytest.mark.slow
 def test_report_is_reproducible(make_rows: Rows, make_run: MakeRun) -> None:
     directory = make_run(make_rows(24)[[*MIN_COLUMNS, "off_nadir_max_deg", "terrain"]])
     first = write_report(directory).read_bytes()

@@ -33,6 +33,7 @@ def test_paired_comparison_averages_the_cases_that_both_algorithms_answer() -> N
     assert difference.mean == pytest.approx((1 + 1 - 5) / 3)
 
 
+@pytest.mark.slow
 def test_p_values_are_corrected_for_the_number_of_algorithms() -> None:
     frame = make_paired_rows([1.0] * 12, [2.0] * 12)
     third = frame.filter(like="other.").rename(columns=lambda name: name.replace("other.", "third."))

@@ -39,6 +39,7 @@ def _draw_all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure |
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cases", "bound"), [(1, 5.0), (24, None), (24, 0.0), (1500, 5.0)])
 def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | None) -> None:
     for index, figure in enumerate(_draw_all_figures(make_rows(cases, answer_rate=1.0), bound)):

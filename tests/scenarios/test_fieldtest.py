@@ -283,6 +283,7 @@ def test_first_cases_contain_the_runs_in_proportion_to_their_triples() -> None:
     assert sum(number == 3 for number, _ in order[:200]) / 200 == pytest.approx(expected_fraction, abs=0.03)
 
 
+@pytest.mark.slow
 def test_run_is_deterministic() -> None:
     key = RunKey(make_parameters(), 4, 5, "test")
     first, second = simulate_run(key), simulate_run(key)

@@ -121,6 +121,7 @@ def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     assert set(all_rocks.rock_of_face[::20][is_required]) <= set(objects.names)
 
 
+@pytest.mark.slow
 def test_triangle_count_is_near_its_limit() -> None:
     rocky_ground = SiteGround.from_site(_make_small_site("pisgah", 1024), "ground")
     viewpoint = Viewpoint(0.0, 0.0, 1.5, pixel_rad=3e-4, half_width_rad=np.radians(30.0))

@@ -113,6 +113,7 @@ def test_replayed_case_equals_the_stored_row(runs: Path) -> None:
     assert any((runs / "replayed").iterdir())
 
 
+@pytest.mark.slow
 def test_differing_row_is_reported(runs: Path, tmp_path: Path) -> None:
     changed_folder = tmp_path / "changed"
     changed_folder.mkdir()

@@ -38,6 +38,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_wheel_contains_one_package(wheel: Path) -> None:
     with ZipFile(wheel) as archive:
         names = archive.namelist()

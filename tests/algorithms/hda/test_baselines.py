@@ -40,6 +40,7 @@ def landing_scene(measurements: LandingMeasurements) -> LandingScene:
     return build_scene(measurements)
 
 
+@pytest.mark.slow
 def test_rectified_points_have_equal_rows_and_inverse_depth_disparity(landing_scene: LandingScene) -> None:
     true_motion = make_scene().second_from_first
     pair = rectify_views(landing_scene.views, true_motion)

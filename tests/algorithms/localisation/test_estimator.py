@@ -440,6 +440,7 @@ def test_features_find_the_position_on_a_synthetic_map() -> None:
     assert details.inliers >= LvsOptions().min_matches
 
 
+@pytest.mark.slow
 def test_features_find_no_position_on_an_unrelated_map() -> None:
     estimates = list(_descend(FeatureEstimator(), _scene(2).map_product, _traced_images()[:2]))
     assert _outcomes(estimates) == [NO_COARSE_FIX] * 3

@@ -65,6 +65,7 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_bod
     assert np.max(np.linalg.norm(drifts, axis=1)) < 2.5
 
 
+@pytest.mark.slow
 def test_published_tracker_drifts_by_a_few_pixels() -> None:
     """The quadratic fit of the correlation peak has an error of a tenth of a pixel, which later steps magnify."""
     drifts = []
@@ -78,6 +79,7 @@ def test_published_tracker_drifts_by_a_few_pixels() -> None:
     assert 0.3 < np.sqrt(np.mean(np.square(drifts))) < 10.0
 
 
+@pytest.mark.slow
 def test_track_drifts_without_subpixel_matching() -> None:
     # Each of 32 steps adds an error of up to half a pixel (0.4 px rms), which later steps magnify: about 6 px in total.
     drifts = []

@@ -65,6 +65,7 @@ def test_unreachable_scheduler_is_reported(monkeypatch: pytest.MonkeyPatch, addr
         ClusterExecutor(address)
 
 
+@pytest.mark.slow
 def test_invalid_address_does_not_delay_next_connection(monkeypatch: pytest.MonkeyPatch) -> None:
     """The garbage collector may close the failed client while the event loop of the next client starts."""
     monkeypatch.setattr("marsyard.campaigns.execution.cluster._TIMEOUT_S", 1)

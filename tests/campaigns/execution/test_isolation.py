@@ -174,6 +174,7 @@ def overwrite_board(item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_status_board_written_by_a_case_is_not_used_as_process_ids(monkeypatch: pytest.MonkeyPatch) -> None:
     signalled_processes = []
     kill = os.kill

@@ -57,6 +57,7 @@ def sleep_and_return(seconds: float, item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_number_of_worker_processes_is_respected() -> None:
     with LocalExecutor(1) as workers:
         assert {result.result for result in run_items(workers, get_process_id, range(5))} != {os.getpid()}

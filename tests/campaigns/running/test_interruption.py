@@ -58,6 +58,7 @@ def _has_ended(pid: int) -> bool:
         return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_path: Path, signal_number: int) -> None:
     process = _start_campaign(campaign_file(dispersions=""), tmp_path / "run")

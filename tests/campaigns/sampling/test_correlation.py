@@ -67,6 +67,7 @@ def rank_standard_error(rank: float, cases: int) -> float:
     return float(np.sqrt((1.0 + 0.5 * rank**2) / (cases - 3)) * (1.0 - rank**2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("design", "cases"), [("random", N_CASES), ("latin-hypercube", N_CASES), ("sobol", 4096)])
 def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile, design: str, cases: int) -> None:
     campaign = load_correlated(campaign_file, SKEWED, design, cases)

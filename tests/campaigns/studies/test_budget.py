@@ -72,6 +72,7 @@ def test_contributions_of_independent_errors_are_their_variances(campaign_path: 
     assert (error_budget.common, result.violations, result.evaluated) == (200, 0, 200 * 6)
 
 
+@pytest.mark.slow
 def test_coverage_of_the_intervals_equals_their_confidence() -> None:
     rng = np.random.default_rng(2)
     sources = [ErrorSource("a", "a", ()), ErrorSource("b", "b", ())]
@@ -87,6 +88,7 @@ def test_coverage_of_the_intervals_equals_their_confidence() -> None:
     assert 0.85 <= hits / 400 <= 0.95
 
 
+@pytest.mark.slow
 def test_interaction_of_two_sources_is_divided_between_them(campaign_path: Path, tmp_path: Path) -> None:
     result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "interaction=0.5")
     assert result.budget is not None
@@ -112,6 +114,7 @@ def test_cases_without_an_error_in_a_configuration_are_excluded(campaign_path: P
     assert no_error.exit_code == 3
 
 
+@pytest.mark.slow
 def test_margin_is_centred(campaign_path: Path, tmp_path: Path) -> None:
     """The mean of a margin is subtracted: a mean load of 100 does not change the budget."""
     settings = replace(SETTINGS, requirement="MARGIN")

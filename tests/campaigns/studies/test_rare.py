@@ -57,6 +57,7 @@ def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, 
     assert result.violations == sum(row["load"] > 100.0 for row in read_case_rows(tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_importance_sampling_interval_contains_the_probability(campaign_path: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, max_probability=1e-2, method="importance", replicates=(3,), importance_cases=300)
     result = run_study(campaign_path, tmp_path / "run", settings)

@@ -140,6 +140,7 @@ def test_search_is_not_a_study_of_rare_violations(campaign_path: Path, tmp_path:
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
 
 
+@pytest.mark.slow
 def test_rates_of_studies_cannot_be_compared(campaign_path: Path, tmp_path: Path) -> None:
     run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
     command = [sys.executable, "-m", "marsyard", "compare", str(tmp_path / "run"), str(tmp_path / "run")]

@@ -40,6 +40,7 @@ def test_estimates_are_unbiased(dimension: int, probability: float, noise_fracti
     assert ratio.std() < 1.5
 
 
+@pytest.mark.slow
 def test_intervals_of_replicates_cover_the_probability() -> None:
     rng, n_covering = np.random.default_rng(2), 0
     margins = linear_margin(10, 1e-3)

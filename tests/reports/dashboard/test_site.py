@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import pytest
 
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.reports.dashboard.entries import (
@@ -74,6 +75,7 @@ def test_finished_campaigns_precede_interrupted_ones(make_rows: Rows, make_run: 
     assert [cell.entry.name for cell in row.cells] == ["dimes-b", "dimes-a", "dimes-c"]
 
 
+@pytest.mark.slow
 def test_links_have_targets_in_the_site(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any]
 ) -> None:

@@ -37,6 +37,7 @@ def test_equal_algorithms_on_shared_terrains_have_the_nominal_false_alarm_rate()
     assert independent_alarms / 150 > 0.3
 
 
+@pytest.mark.slow
 def test_paired_mean_interval_covers_the_mean_on_shared_terrains() -> None:
     # 200 repetitions at 90 %: standard deviation 2.1 %
     rng = np.random.default_rng(2)

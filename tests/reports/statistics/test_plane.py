@@ -28,6 +28,7 @@ def test_error_ellipse_of_normal_errors_has_the_true_axes() -> None:
     assert ellipse.inside == pytest.approx(0.95, abs=0.004)
 
 
+@pytest.mark.slow
 def test_error_ellipse_of_ten_errors_contains_the_next_error_with_95_percent() -> None:
     # 4000 trials: standard deviation of the fraction 0.34 %
     rng = np.random.default_rng(2)

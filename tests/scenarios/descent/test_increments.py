@@ -85,6 +85,7 @@ def test_exact_increments_integrate_to_the_true_motion(rate_hz: float) -> None:
     assert (solution.attitudes.inv() * truth.attitudes).magnitude().max() < 1e-7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imu_class", ["ln-200", "mems"])
 def test_errors_of_increments_are_those_of_the_class(imu_class: ImuClass) -> None:
     """Mean increments minus the true ones have the variance of the biases; scale and alignment errors add to it."""

@@ -85,6 +85,7 @@ def test_three_image_estimator_receives_first_middle_and_last_image(nine_images:
     assert "dimes.stream_images" not in nine_images.row
 
 
+@pytest.mark.slow
 def test_dimes_input_images_are_stored_for_figures() -> None:
     result = run_descent(compared=[STREAM_ESTIMATOR], triple=[1, 2, 3], **NINE_IMAGES)
     assert [name for name in result.products if name.startswith("image_")] == ["image_1", "image_2", "image_3"]
@@ -108,6 +109,7 @@ def test_span_between_images_is_interpolated() -> None:
     assert "velocity_change_error_m_s" not in first.row
 
 
+@pytest.mark.slow
 def test_many_image_case_is_deterministic() -> None:
     settings: dict[str, Any] = {"images": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
     first_case, repeated_case = run_descent(**settings), run_descent(**settings)

@@ -126,6 +126,7 @@ def test_instrument_errors_have_the_specified_size() -> None:
     assert independent.max() < 0.1
 
 
+@pytest.mark.slow
 def test_attitude_error_causes_predicted_velocity_error() -> None:
     """An attitude error common to all images rotates the measured displacement, including its vertical component.
 
@@ -233,6 +234,7 @@ def test_custom_algorithm_receives_the_measurements() -> None:
     assert "tracks" not in result.products
 
 
+@pytest.mark.slow
 def test_slow_algorithm_is_not_in_time_for_the_firing() -> None:
     """The measured time is scaled by the flight computer's factor: 0.1 s become 60 s, but 14 to 24 s are available."""
     slow = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:SlowInertialEstimator").row

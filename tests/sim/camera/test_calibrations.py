@@ -267,6 +267,7 @@ def test_euroc_sensor_file_equals_kalibr_camera(tmp_path: Path) -> None:
     assert euroc.camera == read_calibrations(write_file(tmp_path, KALIBR))[0].camera
 
 
+@pytest.mark.slow
 def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
     (calibration,) = read_calibrations(write_file(tmp_path, EQUIDISTANT))
     assert isinstance(calibration.camera, Cahvore)

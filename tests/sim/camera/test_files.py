@@ -307,6 +307,7 @@ def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
         read_pds3(write_file(tmp_path, CMOD_TEXT))
 
 
+@pytest.mark.slow
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.sampled_from([CMOD_TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30)

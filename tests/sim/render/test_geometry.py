@@ -96,6 +96,7 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
     assert np.linalg.norm(pinhole - pixels[is_in_image], axis=-1).max() > 20.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height_m", [500.0, 2000.0])
 def test_world_points_are_on_the_plane_and_on_rays(
     renderer: Renderer, descent_camera: Callable[..., Cahvor], height_m: float

@@ -104,6 +104,7 @@ def test_odometry_errors_are_specified_fractions_of_the_distance() -> None:
     assert np.sqrt(np.mean(np.square(wheel_errors))) == pytest.approx(0.011 * 8.0, rel=0.2)
 
 
+@pytest.mark.slow
 def test_scale_errors_are_constant_and_random_walks_are_not() -> None:
     drives = _drive(Plane(), (STRAIGHT,) * 8)
     middle_pose, end_pose = drives[3].end.world_from_rover, drives[7].end.world_from_rover
