@@ -3,7 +3,7 @@
 A subframe is the part of an image that the cameras deliver at a stop.
 
 The first figure contains for every stop the left subframe with search window and match, the enlarged match (the next
-template), and the right subframe with the stereo match. The title contains the quantities of the update. The second
+template), and the right subframe around the stereo match. The title contains the quantities of the update. The second
 figure contains a top view of the path, and an enlarged view of the target's estimated positions.
 """
 
@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 from scipy import ndimage
 
@@ -33,6 +34,12 @@ Point = Float[np.ndarray, "2"]
 #: solid and the window is dashed, since colour must not be the only distinction.
 TARGET, WINDOW, TRUTH = "#f0a202", "#56b4e9", "#ffffff"
 _OUTLINE = [patheffects.Stroke(linewidth=2.0, foreground="#000000"), patheffects.Normal()]
+#: Styles of the marks in the subframes.
+_WINDOW_STYLE: dict[str, Any] = {"edgecolor": WINDOW, "linewidth": 1.3, "linestyle": (0, (4, 2)), "fill": False}
+_TARGET_STYLE: dict[str, Any] = {"edgecolor": TARGET, "linewidth": 1.3, "linestyle": "-", "fill": False}
+_TRUTH_STYLE: dict[str, Any] = {
+    "color": TRUTH, "marker": "+", "markersize": 5.5, "markeredgewidth": 0.9, "path_effects": _OUTLINE, "linestyle": "",
+}  # fmt: skip
 #: Side of the enlarged template as drawn, pixels.
 _ENLARGED_PX = 126
 #: Maximum number of stops in a row, and the size of a stop, inches.
@@ -180,6 +187,15 @@ def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Fig
     grid = figure.add_gridspec(rows, columns)
     for index, stop in enumerate(stops):
         _draw_stop(figure, grid[index // columns, index % columns], stop, side_px)
+    marks: list[Any] = []
+    if any(np.isfinite([*stop.window, *stop.corners[0]]).all() for stop in stops):
+        marks.append(Rectangle((0, 0), 1, 1, label="search window", **_WINDOW_STYLE))
+    if any(stop.is_matched for stop in stops):
+        marks.append(Rectangle((0, 0), 1, 1, label="tracked target", **_TARGET_STYLE))
+    if any(np.isfinite(stop.point).all() for stop in stops):
+        marks.append(Line2D([], [], label="true projection of the designated point", **_TRUTH_STYLE))
+    if marks:
+        figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), fontsize=7.5)
     return figure
 
 
@@ -212,11 +228,10 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side_px: flo
     show_subframe(left, stop.left, _CONTRAST_QUANTILES)
     corner = stop.corners[0]
     if np.isfinite([*stop.window, *corner]).all():
-        _draw_rectangle(left, stop.window[:2] - corner - 0.5, stop.window[2:], WINDOW, (0, (4, 2)))
+        _draw_rectangle(left, stop.window[:2] - corner - 0.5, stop.window[2:], _WINDOW_STYLE)
     point, limits = stop.point - corner, (left.get_xlim(), left.get_ylim()[::-1])
     if all(low <= value <= high for value, (low, high) in zip(point, limits, strict=True)):
-        style: dict[str, Any] = {"color": TRUTH, "markersize": 5.5, "markeredgewidth": 0.9, "path_effects": _OUTLINE}
-        left.plot(*point[:, None], "+", **style)
+        left.plot(*point[:, None], **_TRUTH_STYLE)
     if stop.is_matched:
         _draw_target(left, stop.matches[0] - corner, side_px)
     left.set_title("\n".join(_title_lines(stop)), fontsize=7.5, fontweight="normal", loc="left", linespacing=1.25)
@@ -236,48 +251,50 @@ def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side_px: flo
     if stop.right is None:
         right.set_axis_off()
         return
-    show_subframe(right, stop.right, _CONTRAST_QUANTILES)
-    if np.isfinite(stop.matches[1]).all():
-        _draw_target(right, stop.matches[1] - stop.corners[1], side_px)
+    match = stop.matches[1] - stop.corners[1]
+    columns = _select_columns(stop.right.shape[1], stop.left.shape[1], float(match[0]))
+    show_subframe(right, stop.right[:, columns], _CONTRAST_QUANTILES)
+    if np.isfinite(match).all():
+        _draw_target(right, match - [columns.start, 0.0], side_px)
+
+
+def _select_columns(available: int, shown: int, centre: float) -> slice:
+    """Select `shown` of the available columns around a column, by default around the middle."""
+    first = (centre if np.isfinite(centre) else 0.5 * available) - 0.5 * shown
+    start = int(np.clip(first, 0, max(0, available - shown)))
+    return slice(start, min(start + shown, available))
 
 
 def _title_lines(stop: StopImages) -> list[str]:
     """Format the three lines above a stop's images; unknown quantities are omitted."""
     formats = {
-        "range_m": "{:.2f} m", "azimuth_deg": "azimuth {:+z.1f}°", "elevation_deg": "elevation {:+z.1f}°",
-        "magnification": "× {:.3f}", "roll_change_deg": "roll {:+z.1f}°", "match_score": "NCC {:.2f}",
-        "stereo_score": "stereo {:.2f}", "error_px": "error {:.1f} px",
+        "range_m": "{:.2f} m", "magnification": "magnification {:.3f}", "roll_change_deg": "roll {:+z.1f}°",
+        "match_score": "NCC {:.2f}", "stereo_score": "stereo {:.2f}", "error_px": "error {:.1f} px",
     }  # fmt: skip
     values = {name: stop.quantity(name) for name in formats}
     texts = {
         name: formats[name].format(value).replace("-", "−") for name, value in values.items() if np.isfinite(value)
     }
-    lines = (
-        ("range_m", "azimuth_deg"),
-        ("elevation_deg", "magnification", "roll_change_deg"),
-        ("match_score", "stereo_score", "error_px"),
-    )
-    line_texts = [", ".join(texts[name] for name in names if name in texts) for names in lines]
+    names_of_lines = (("magnification", "roll_change_deg"), ("match_score", "stereo_score", "error_px"))
+    lines = [", ".join(texts[name] for name in names if name in texts) for names in names_of_lines]
+    # empty lines at the end keep the images of a row aligned
+    lines.sort(key=lambda line: not line)
     state = "" if stop.state in ("", "normal") else f" ({stop.state})"
-    return [f"{stop.number}{state}: {line_texts[0]}", *(line or " " for line in line_texts[1:])]
+    first_line = f"Stop {stop.number}{state}: {texts.get('range_m', '')}".rstrip(": ")
+    return [first_line, *(line or " " for line in lines)]
 
 
 def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side_px: float) -> None:
-    _draw_rectangle(axes, centre - 0.5 * side_px, np.full(2, side_px), TARGET, "-")
+    _draw_rectangle(axes, centre - 0.5 * side_px, np.full(2, side_px), _TARGET_STYLE)
 
 
-def _draw_rectangle(axes: Axes, corner: Point, size: Point, colour: str, line_style: Any) -> None:
+def _draw_rectangle(axes: Axes, corner: Point, size: Point, style: Mapping[str, Any]) -> None:
     (x, y), (width, height) = corner.tolist(), size.tolist()
-    axes.add_patch(Rectangle((x, y), width, height, fill=False, edgecolor=colour, linewidth=1.3, linestyle=line_style))
+    axes.add_patch(Rectangle((x, y), width, height, **style))
 
 
 def _draw_path_axes(axes: Axes, rover_path: RoverPath) -> None:
     """Draw the top view of the path; north is up."""
-    for number, (east, north, diameter) in enumerate(rover_path.rocks):
-        rock = Circle((east, north), 0.5 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8)
-        rock.set_hatch("" if number == 0 else "////")
-        rock.set_label(("rock of the target", "other rocks")[number] if number < 2 else "_rock")
-        axes.add_patch(rock)
     axes.plot(*rover_path.path.T, "-", color=SERIES[0], linewidth=1.6, label="path driven")
     axes.plot(*rover_path.stops.T, "o", color=SERIES[0], markersize=5, label="true stops")
     axes.plot(
@@ -291,12 +308,28 @@ def _draw_path_axes(axes: Axes, rover_path: RoverPath) -> None:
         0.5,
         _MIN_ASPECT,
     )
+    _draw_rocks(axes, rover_path.rocks)
     # lines of 4.5 % of the width show the heading
-    directions = np.column_stack([np.sin(rover_path.heading), np.cos(rover_path.heading)])
-    for position, direction in zip(rover_path.stops, 0.045 * width * directions, strict=True):
-        axes.plot(*np.column_stack([position, position + direction]), "-", color=MUTED, linewidth=1.1, zorder=1)
+    has_heading = np.isfinite(rover_path.heading)
+    directions = np.column_stack([np.sin(rover_path.heading), np.cos(rover_path.heading)])[has_heading]
+    for index, position in enumerate(rover_path.stops[has_heading]):
+        line = np.column_stack([position, position + 0.045 * width * directions[index]])
+        name = "true heading" if index == 0 else None
+        axes.plot(*line, "-", color=MUTED, linewidth=1.1, zorder=1, label=name)
     for number in _choose_numbered_points(rover_path.stops, width):
         _annotate_number(axes, rover_path.stops[number], number + 1)
+
+
+def _draw_rocks(axes: Axes, rocks: Float[np.ndarray, "rocks 3"]) -> None:
+    """Draw the outlines of the target's rock and of the obstacles, and label those within the axes' limits."""
+    names = {"": "rock of the target", "////": "other rocks"}
+    (low_east, high_east), (low_north, high_north) = axes.get_xlim(), axes.get_ylim()
+    for index, (east, north, diameter) in enumerate(rocks):
+        hatch, radius = "" if index == 0 else "////", 0.5 * diameter
+        within_east = low_east - radius < east < high_east + radius
+        label = names.pop(hatch, None) if within_east and low_north - radius < north < high_north + radius else None
+        rock = Circle((east, north), radius, facecolor=GRID, edgecolor=MUTED, linewidth=0.8, hatch=hatch, label=label)
+        axes.add_patch(rock)
 
 
 def _draw_estimates(axes: Axes, rover_path: RoverPath) -> None:
@@ -304,15 +337,13 @@ def _draw_estimates(axes: Axes, rover_path: RoverPath) -> None:
     # centimetres
     offsets = 100.0 * (rover_path.estimates - rover_path.target)
     finite = np.flatnonzero(np.isfinite(offsets).all(axis=1))
-    for east, north, diameter in rover_path.rocks[:1]:
-        centre = 100.0 * (np.array([east, north]) - rover_path.target)
-        axes.add_patch(Circle((centre[0], centre[1]), 50.0 * diameter, facecolor=GRID, edgecolor=MUTED, linewidth=0.8))
-    change_cm = float(np.linalg.norm(offsets[finite[-1]] - offsets[finite[0]])) if finite.size else 0.0
-    axes.plot(*offsets[finite].T, "-", color=SERIES[1], linewidth=1.0)
-    text = f"estimated target ({change_cm:.0f} cm from first to last estimate)"
-    axes.plot(*offsets[finite].T, "o", color=SERIES[1], markersize=5, label=text)
+    if finite.size:
+        change_cm = float(np.linalg.norm(offsets[finite[-1]] - offsets[finite[0]]))
+        text = f"estimated target ({change_cm:.0f} cm from first to last estimate)"
+        axes.plot(*offsets[finite].T, "-", color=SERIES[1], linewidth=1.0)
+        axes.plot(*offsets[finite].T, "o", color=SERIES[1], markersize=5, label=text)
     axes.plot(0.0, 0.0, "*", color=INK, markersize=12)
-    axes.set(xlabel="east of the target (cm)", ylabel="north of the target (cm)")
+    axes.set(xlabel="east of the designated point (cm)", ylabel="north of the designated point (cm)")
     axes.set_title("Estimated positions of the target")
     width = _set_limits(axes, np.vstack([offsets[finite], np.zeros((1, 2))]), 2.0)
     for index in _choose_numbered_points(offsets[finite], width):

@@ -6,19 +6,21 @@ Sections and equations are those of Kim et al., "Targeted Driving Using Visual T
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from marsyard.algorithms.interface import TargetLoss
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Subject, build_grid
+from marsyard.reports.section import Block, Grid, Subject
 from marsyard.reports.section_kinds import BlocksAndData, CustomBlocks, Distribution, Rows, SectionDeclaration
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers
+from marsyard.reports.wording import NOTHING, format_fraction, numbers
+from marsyard.scenarios.rover.stops import RunOutcome
 
 #: Columns of all rows of tracking cases.
 _TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")
@@ -31,6 +33,22 @@ _RATES: Mapping[str, str] = {
     f"Within {100.0 * MAX_ERROR_M:g} cm (of completed runs)": "within",
     "False track": "false_tracks",
 }
+#: Columns of lengths in the table of errors, and their keys in `summarize_cameras`.
+_ERRORS: Mapping[str, str] = {
+    "Position error, median (cm)": "median_m",
+    f"Position error, {format_fraction(QUANTILE)} quantile (cm)": "quantile_m",
+    f"Upper bound of the {format_fraction(QUANTILE)} quantile (cm)": "quantile_bound_m",
+    "Error along the line of sight, rms (cm)": "range_rms_m",
+    "Error across the line of sight, rms (cm)": "cross_rms_m",
+    "Drift, median (px)": "drift_median_px",
+    f"Drift, {format_fraction(QUANTILE)} quantile (px)": "drift_quantile_px",
+}
+_RATES_NOTE = (
+    "A target is selectable if the designated point is sunlit, unoccluded and not on the edge of the rock. Completed: "
+    f"{RunOutcome.COMPLETED.value}. False track: an update reports the target farther than 10 px from the true "
+    "projection of the designated point. The intervals are two-sided Clopper-Pearson intervals for independent cases; "
+    "the section Verdict gives one-sided bounds."
+)
 
 
 def is_tracking(frame: pd.DataFrame) -> bool:
@@ -90,9 +108,14 @@ def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
     return rows
 
 
-def _format_mm(name: str) -> Any:
-    """Create a function that formats a length of a row in millimetres."""
-    return lambda row: number(1000.0 * row[name]) if np.isfinite(row[name]) else "too few cases"
+def _errors_grid(cameras: Sequence[Mapping[str, Any]]) -> Grid:
+    """Create the table of errors in centimetres and of drift in pixels; columns without any value are omitted."""
+    columns = {heading: name for heading, name in _ERRORS.items() if np.isfinite([row[name] for row in cameras]).any()}
+    rows = []
+    for row in cameras:
+        values = [(100.0 if name.endswith("_m") else 1.0) * row[name] for name in columns.values()]
+        rows.append([row["camera"], *(f"{value:.2f}" if np.isfinite(value) else "too few runs" for value in values)])
+    return Grid(["Camera", *columns], rows)
 
 
 def _create_camera_blocks(runs: Rows, subject: Subject, key: str) -> BlocksAndData:
@@ -103,65 +126,80 @@ def _create_camera_blocks(runs: Rows, subject: Subject, key: str) -> BlocksAndDa
         for row in cameras
         for name, rate in _RATES.items()
     ]
-    run_grid = Grid(["Camera", "", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
-    error_grid = build_grid(
-        cameras,
-        {
-            "Camera": lambda row: row["camera"],
-            "Median (mm)": _format_mm("median_m"),
-            f"{format_fraction(QUANTILE)} quantile (mm)": _format_mm("quantile_m"),
-            f"Bound of the {format_fraction(QUANTILE)} quantile (mm)": _format_mm("quantile_bound_m"),
-            "Error along the line of sight, rms (mm)": _format_mm("range_rms_m"),
-            "Error across the line of sight, rms (mm)": _format_mm("cross_rms_m"),
-            "Drift, median (px)": lambda row: number(row["drift_median_px"]),
-            f"Drift, {format_fraction(QUANTILE)} quantile (px)": lambda row: number(row["drift_quantile_px"]),
-        },
-    )
-    note = note_text("vtt.goal", confidence=format_fraction(CONFIDENCE))
-    blocks = [
-        Block(heading="Runs at selectable targets", grid=run_grid, note=note),
-        Block(heading="Errors at the goal", grid=error_grid, note=_expected_errors()),
-    ]
+    run_grid = Grid(["Camera", "Result", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
+    blocks = [Block(heading="Runs at selectable targets", grid=run_grid, note=_RATES_NOTE)]
+    if any(row["completed"].hits for row in cameras):
+        grid, note = _errors_grid(cameras), _describe_errors(cameras)
+        blocks.append(Block(heading="Errors of the completed runs at the goal", grid=grid, note=note))
     loss_grid = losses_grid(runs)
     if loss_grid.rows:
-        note = note_text("vtt.losses")
-        blocks.append(Block(heading="Runs that lost the target", grid=loss_grid, note=note))
+        blocks.append(Block(heading="Runs that lost the target", grid=loss_grid, note=losses_note(runs)))
     data = [row | {rate: vars(row[rate]) for rate in _RATES.values()} for row in cameras]
     return blocks, {"cameras": data}
 
 
-def _expected_errors() -> str:
-    """Describe the errors of the paper's cameras at the goal by Eqs. 1 and 4."""
-    errors = []
-    for design in (PANCAM, NAVCAM):
-        stereo = stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)
-        drift = drift_error_m(GOAL_M, design.focal_px, 1.0)
-        errors.append(f"{design.name.lower()} {1000.0 * stereo:.1f} mm along and {1000.0 * drift:.2f} mm across")
-    min_runs = math.ceil(math.log(1.0 - CONFIDENCE) / math.log(QUANTILE))
+def pointing_error_cm(range_m: float) -> float:
+    """Compute the position error caused by a pointing error of 0.1 deg, centimetres."""
+    return 100.0 * range_m * math.radians(0.1)
+
+
+def _describe_errors(cameras: Sequence[Mapping[str, Any]]) -> str:
+    """Describe the errors, those of the paper's cameras by Eqs. 1 and 4, and the runs that the quantiles need."""
+    designs = (PANCAM, NAVCAM)
+    stereo, drift = (
+        " and ".join(f"{100.0 * error_m:.{digits}f} cm ({design.name.lower()})" for design, error_m in errors)
+        for digits, errors in (
+            (2, [(design, stereo_range_error_m(GOAL_M, design.focal_px, design.baseline_m)) for design in designs]),
+            (3, [(design, drift_error_m(GOAL_M, design.focal_px, 1.0)) for design in designs]),
+        )
+    )
+    text = (
+        "The position error is the distance of the reported from the true position of the designated point, in the "
+        "rover frame. Drift: distance in the last image from the tracked target to the true projection. By Eqs. 1 and "
+        f"4 of the paper, 1 px of disparity error at {GOAL_M:g} m is {stereo} along the line of sight, and 1 px of "
+        f"drift is {drift} across it. The measured errors also contain errors of the camera calibration and of the "
+        f"mast's pointing: 0.1 deg is {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
+    )
+    if all(np.isfinite(row["quantile_bound_m"]) for row in cameras):
+        return text
+    name, min_runs = format_fraction(QUANTILE), math.ceil(math.log(1.0 - CONFIDENCE) / math.log(QUANTILE))
     return (
-        f"Errors and drift are those of the completed runs at selectable targets. By Eqs. 1 and 4 of the paper, one "
-        f"pixel of disparity error at {GOAL_M:g} m corresponds to an error along the line of sight, and one pixel of "
-        f"drift to an error across it; for the paper's cameras: {'; '.join(errors)}. The measured errors also contain "
-        f"those of the camera calibration and of the mast angles. The "
-        f"bound of the {format_fraction(QUANTILE)} quantile at {format_fraction(CONFIDENCE)} confidence needs at least "
-        f"{min_runs} runs."
+        f"{text} Too few runs: for a camera, the {name} quantile needs at least {round(1.0 / (1.0 - QUANTILE))} runs, "
+        f"and its upper bound at {format_fraction(CONFIDENCE)} confidence at least {min_runs} runs, "
+        "or terrains if runs share terrains."
     )
 
 
 def losses_grid(frame: Rows) -> Grid:
     """Count runs that ended without a tracked target, by outcome and loss criteria."""
     failed_runs = frame[~rates.flag_mask(frame, "tracked")]
+    has_clouds = "clear_sky" in failed_runs and rates.flag_fraction(failed_runs, "clear_sky", value=False).hits > 0
     rows = []
     for (outcome, losses), runs in failed_runs.groupby([failed_runs["outcome"], failed_runs["losses"].fillna(NOTHING)]):
         azimuth = rates.finite_values(runs, "azimuth_change_max_deg")
-        distance = rates.finite_values(runs, "lost_range_m")
         azimuth_text = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
-        distance_text = f"{distance.min():.1f} to {distance.max():.1f}" if distance.size else NOTHING
-        n_cloudy = rates.flag_fraction(runs, "clear_sky", value=False).hits if "clear_sky" in runs else 0
+        distance_text = rates.median_text(rates.finite_values(runs, "lost_range_m"), 1)
         loss_text = str(losses).replace("_", " ").lower()
-        rows.append([str(outcome), loss_text, f"{len(runs):,}", distance_text, azimuth_text, f"{n_cloudy:,}"])
+        row = [str(outcome), loss_text, f"{len(runs):,}", distance_text, azimuth_text]
+        n_cloudy = rates.flag_fraction(runs, "clear_sky", value=False).hits if has_clouds else 0
+        rows.append([*row, f"{n_cloudy:,}"] if has_clouds else row)
     rows.sort(key=lambda row: -int(row[2].replace(",", "")))
-    return Grid(["Outcome", "Lost by", "Runs", "Lost at (m)", "Maximum azimuth change (deg)", "With clouds"], rows)
+    head = ["Outcome", "Lost by", "Runs", "Lost at a range of (m)", "Maximum azimuth change (deg)"]
+    return Grid([*head, "With clouds"] if has_clouds else head, rows)
+
+
+def losses_note(frame: Rows) -> str:
+    """Describe the table of `losses_grid`, with the meaning of the loss criteria that occur."""
+    occurring = ", ".join(frame.loc[~rates.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)).split(", ")
+    meanings = [
+        f"{loss.name.replace('_', ' ').capitalize()}: {loss.value}." for loss in TargetLoss if loss.name in occurring
+    ]
+    text = (
+        'The runs ended without the target within 10 px of its true projection. "Lost by" gives the criteria (section '
+        "4.6 of the paper) of the first update that lost the target. Ranges are medians, with minimum to maximum in "
+        "brackets. The azimuth change is that of the line of sight in the world between two updates with a match."
+    )
+    return " ".join([text, *meanings])
 
 
 GOAL = SectionDeclaration(
@@ -178,7 +216,8 @@ GOAL = SectionDeclaration(
                 if (error := rates.finite_values(camera_rows, "position_error_m", 100.0)).size
             },
             ("position error at the goal (cm)", "fraction of completed runs"),
-            "Fraction of completed runs with a smaller error at the goal. Dashed line: the requirement.",
+            "Completed runs at selectable targets; their number is in brackets. Red line: requirement of "
+            f"{100.0 * MAX_ERROR_M:g} cm.",
             bound=100.0 * MAX_ERROR_M,
         ),
         CustomBlocks(_create_camera_blocks),

@@ -19,7 +19,7 @@ from marsyard.reports.vtt.case_figures import (
     write_vtt_figures,
 )
 from marsyard.reports.vtt.goal import GOAL
-from marsyard.reports.wording import NOTHING, label, note_text
+from marsyard.reports.wording import NOTHING, label
 from marsyard.scenarios.rover.stops import RunOutcome
 
 #: Maximum number of stops with images on the page.
@@ -29,24 +29,32 @@ _QUANTITIES = (
     "range_m", "azimuth_deg", "elevation_deg", "magnification", "roll_change_deg", "azimuth_change_deg", "match_score",
     "stereo_score", "correction_px", "error_px", "position_error_m",
 )  # fmt: skip
-#: Short headings and numbers of decimals of the table.
+#: Headings and numbers of decimals of the table.
 _HEADS = {
     "range_m": "Range (m)", "azimuth_deg": "Mast azimuth (deg)", "elevation_deg": "Mast elevation (deg)",
     "magnification": "Magnification", "roll_change_deg": "Roll change (deg)",
-    "azimuth_change_deg": "Change of direction (deg)", "match_score": "Match NCC", "stereo_score": "Stereo NCC",
-    "correction_px": "Correction (px)", "error_px": "Tracking error (px)", "position_error_m": "Position error (cm)",
+    "azimuth_change_deg": "Azimuth change of the line of sight (deg)", "match_score": "NCC score",
+    "stereo_score": "Stereo score", "correction_px": "Correction (px)", "error_px": "Tracking error (px)",
+    "position_error_m": "Position error (cm)",
 }  # fmt: skip
-_DIGITS = {"magnification": 3, "match_score": 3, "stereo_score": 3, "correction_px": 1}
+_DIGITS = {"magnification": 3, "correction_px": 1}
 _CAPTION = (
-    "Each stop: left subframe (large), enlarged target (above right) and right subframe (below right). Blue, dashed: "
-    "search window. Orange: tracked target. White cross: true projection of the designated point. At the first stop "
-    "the range is unknown, so the right subframe is a narrow strip along the rows in which the target can be. Above "
-    "the images: number of the stop, range, mast azimuth and elevation, magnification (×) and roll change since the "
-    "last match, NCC of the match and of the stereo match, and tracking error."
+    "Each stop: left subframe (large), enlarged target (above right), and right subframe (below right) around the "
+    "stereo match. The numbers are those of the table below; stereo is the stereo score, error the tracking error."
+)
+_STRIP_CAPTION = (
+    "At stop 1 the range is unknown. The right subframe is a strip, because the rows of the target are known, but not "
+    "the columns."
 )
 _PATH_CAPTION = (
-    "Left: top view of the rover's path, north up; grey lines are headings, numbers are stops. Right: estimated "
-    "positions of the target relative to the designated point, enlarged."
+    "Numbers are stops. Left: top view, north up. Right: estimated positions of the target in the rover's estimated "
+    "world frame. They contain the error of the rover's pose; the position error in the table does not."
+)
+_LEGEND = (
+    "The layout follows Figs. 15, 17 and 16b of the paper (Kim, Nesnas and Bajracharya, visual target tracking). Mast "
+    "azimuth (positive to the right) and elevation are the pointing angles of the mast relative to the rover. "
+    f"{sections.DEFINITIONS} Position error: distance of the reported from the true position of the designated point, "
+    "both in the rover frame. It contains errors of stereo, calibration and mast pointing."
 )
 
 
@@ -54,17 +62,24 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
     """Create the view of a tracking case."""
     stops = read_stops(products)
     shows_selection = len(stops) > _MAX_STOPS
-    caption = f"{_MAX_STOPS} of the {len(stops)} stops. {_CAPTION}" if shows_selection else _CAPTION
+    captions = [f"{_MAX_STOPS} of the {len(stops)} stops."] if shows_selection else []
+    captions.append(_CAPTION)
+    if stops[0].right is not None and 2 * len(stops[0].right) < len(stops[0].left):
+        captions.append(_STRIP_CAPTION)
+    caption = " ".join(captions)
     svg_figures = [svg_figure(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
     if read_rover_path(products) is not None:
         svg_figures.append(svg_figure(draw_path(products), f"{key}way", _PATH_CAPTION, wide=True))
     names = [name for name in _QUANTITIES if any(name in stop.quantities for stop in stops)]
+    # without a loss, the tracker's state does not vary
+    shows_state = any(stop.state not in ("", "normal") for stop in stops)
     rows = []
     for stop in stops:
-        texts = [str(stop.number), stop.state or NOTHING, *(_format(name, stop.quantity(name)) for name in names)]
+        texts = [str(stop.number), *([stop.state or NOTHING] if shows_state else [])]
+        texts += [_format(name, stop.quantity(name)) for name in names]
         rows.append(TableRow(texts, stop.is_matched))
-    head = ["Stop", "State", *(_HEADS.get(name, label(name)) for name in names)]
-    return CaseView([("Stops", str(len(stops)))], svg_figures, head, rows)
+    head = ["Stop", *(["State"] if shows_state else []), *(_HEADS.get(name, label(name)) for name in names)]
+    return CaseView([], svg_figures, head, rows)
 
 
 def _format(name: str, value: float) -> str:
@@ -75,7 +90,7 @@ def _format(name: str, value: float) -> str:
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, note_text("vtt.legend")),),
+    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, _LEGEND),),
     first=(*sections.SECTIONS, GOAL),
     outcomes=(RunOutcome, HandOffOutcome),
 )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, AccuracyRow, table_1, tracked_approach_error_m
 from marsyard.reports import rates
 from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.papers import PaperFacts, read_paper
@@ -26,107 +25,14 @@ from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
 from marsyard.reports.section_kinds import BlocksAndData, CustomBlocks, Rows
 from marsyard.reports.stored import table
-from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, selectable_targets
+from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, losses_note, selectable_targets
+from marsyard.reports.vtt.table_1 import table_1_section
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)
-#: Table I as printed.
-PRINTED = {name: AccuracyRow(name, **row) for name, row in PAPER["table_1"].items()}
 #: Campaigns of Tables II and III, and of the regression runs.
 TERRAINS, CHECKOUT_1, CHECKOUT_3, REGRESSION = "vtt-terrains", "vtt-checkout-1", "vtt-checkout-3", "vtt-regression"
-#: Maximum relative deviation of the start and goal distances of a run from those of Table I.
-_MAX_DEVIATION = 0.1
-
-
-def table_1_section(subject: Subject) -> Section | None:
-    """Create the section on Table I: computed, printed and measured; None without completed runs from 10 m to 2 m."""
-    accuracy = measured_accuracy(subject.frame)
-    if not accuracy:
-        return None
-    computed_rows = {row.name: row for row in table_1()}
-    pairs = [
-        (source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed_rows))
-    ]
-    grid = build_grid(
-        pairs,
-        {
-            "Camera": lambda pair: pair[1].name,
-            "": lambda pair: pair[0],
-            "3 sigma at the designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
-            "3 sigma at the goal without tracking (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
-            "3 sigma at the goal with tracking, drift N px (cm)": lambda pair: pair[1].tracked_formula,
-        },
-    )
-    measured_note = note_text("vtt.table_1_measured", start=f"{START_M:g}", goal=f"{GOAL_M:g}")
-    blocks = [
-        Block(heading="Computed", grid=grid, note=note_text("vtt.table_1")),
-        Block(heading="Measured", grid=_measured_grid(accuracy), note=measured_note),
-    ]
-    data = {
-        "computed": {name: asdict(row) for name, row in computed_rows.items()},
-        "printed": {name: asdict(row) for name, row in PRINTED.items()},
-        "measured": accuracy,
-    }
-    return Section(
-        "table-1", "Position accuracy", "Accuracy of a target's position (Table I of the paper)", blocks, data
-    )
-
-
-def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
-    """Compute the 3-sigma errors (three times the root mean square) of the completed runs of each camera.
-
-    - disparity_px: 1-sigma disparity error, computed from the designation error by Eq. 1
-    - untracked_cm: error without tracking, computed by Eq. 3 from the errors of designation and pose
-    """
-    if not is_closed_loop(frame) or "designation_error_m" not in frame or "camera" not in frame:
-        return []
-    distances = {"range_start_m": START_M, "range_end_m": GOAL_M}
-    is_near = [np.abs(numbers(frame, name) / value - 1.0) < _MAX_DEVIATION for name, value in distances.items()]
-    completed_runs = selectable_targets(
-        frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))]
-    )
-    # factor 300: 3 sigma in centimetres
-    rows = []
-    for camera in sorted(completed_runs["camera"].unique()):
-        runs = completed_runs[completed_runs["camera"].eq(camera)]
-        designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
-        rows.append(
-            {
-                "camera": str(camera),
-                "runs": len(runs),
-                "designation_cm": 300.0 * rates.rms(designation),
-                "disparity_px": rates.rms(designation / numbers(runs, "designation_3_sigma_m")),
-                "untracked_cm": 300.0 * rates.rms(np.hypot(designation, pose)),
-                "tracked_cm": 300.0 * rates.rms(numbers(runs, "position_error_m")),
-                "drift_px": rates.rms(numbers(runs, "drift_px")),
-            }
-        )
-    return rows
-
-
-def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
-    head = [
-        "Camera",
-        "Runs",
-        "3 sigma at the designation (cm)",
-        "Paper: designation (cm)",
-        "Disparity error, 1 sigma (px)",
-    ]
-    head += ["Without tracking (cm)", "Paper (cm)", "With tracking (cm)", "Paper's formula (cm)"]
-    rows = []
-    for row in accuracy:
-        printed_row = next(
-            (row_of_paper for name, row_of_paper in PRINTED.items() if row["camera"].endswith(name.lower())), None
-        )
-        paper = [NOTHING] * 3
-        if printed_row is not None:
-            tracked_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
-            paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{tracked_cm:.1f}"]
-        first_texts = [row["camera"], f"{row['runs']:,}", f"{row['designation_cm']:.1f}", paper[0]]
-        second_texts = [number(row["disparity_px"]), f"{row['untracked_cm']:.1f}", paper[1]]
-        rows.append([*first_texts, *second_texts, f"{row['tracked_cm']:.1f}", paper[2], f"{row['drift_px']:.1f}"])
-    return Grid([*head, "Drift rms (px)"], rows)
 
 
 def read_legs(subject: Subject) -> list[Mapping[str, Any]]:
@@ -178,10 +84,27 @@ SINGLE_RUNS = PaperFacts(_PAPER_FILE, extra_parts={CHECKOUT_3: CustomBlocks(_cre
 
 #: Quantities of an update in the table: heading, suffix of the column `update_<number>_<suffix>`, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
-    ("Distance (m)", "range_m", 2), ("Magnification", "magnification", 2), ("Roll change (deg)", "roll_change_deg", 2),
+    ("Range (m)", "range_m", 2), ("Magnification", "magnification", 2), ("Roll change (deg)", "roll_change_deg", 2),
     ("Azimuth change (deg)", "azimuth_change_deg", 2), ("NCC score", "match_score", 2),
-    ("Stereo score", "stereo_score", 2), ("Correction (px)", "correction_px", 1), ("Error (px)", "error_px", 1),
+    ("Stereo score", "stereo_score", 2), ("Correction (px)", "correction_px", 1),
+    ("Tracking error (px)", "error_px", 1),
 )  # fmt: skip
+#: Definitions of the quantities of an update.
+DEFINITIONS = (
+    "Range: true distance from the left camera to the designated point. Magnification and roll change: change of the "
+    "target's image since the last match, computed from the estimated motion of the rover. Roll is positive clockwise. "
+    "Azimuth change: rotation of the line of sight in the world since the last match, positive to the right. NCC score "
+    "and stereo score: normalised cross-correlation of the match in the left and in the right image; the maximum is 1. "
+    "Correction: distance from the predicted to the matched position, the larger of columns and rows. Tracking error: "
+    "distance from the match to the true projection of the designated point. A dash means that there is no value; at "
+    "the first update, no match precedes."
+)
+_UPDATES_NOTE = "The values are medians over all cases that reached the update, with minimum to maximum in brackets."
+_TABLE_3_NOTE = (
+    'Rows "ours": median over all cases, with minimum to maximum in brackets. All values are without signs, as in the '
+    "paper. Ranges are those of Fig. 15. Path and steps are the paper's. The paper does not specify rock, ground and "
+    "light. A dash means that no value is printed, or that no match precedes."
+)
 
 
 def updates_section(subject: Subject) -> Section | None:
@@ -206,7 +129,7 @@ def updates_section(subject: Subject) -> Section | None:
         if update["range_m"].size
     ]
     grid = Grid(["Update", "Cases", *(heading for heading, _, _ in QUANTITIES)], rows)
-    note = note_text("vtt.updates")
+    note = f"{_UPDATES_NOTE} {DEFINITIONS}"
     blocks, title = [Block(grid=grid, note=note)], "All updates"
     if subject.run.name == CHECKOUT_1:
         title = "Updates of the first checkout (Table III of the paper)"
@@ -221,12 +144,12 @@ def updates_section(subject: Subject) -> Section | None:
                     for update_number in values
                 ]
                 simulated_texts = [rates.median_text(np.abs(update[suffix]), digits) for update in values.values()]
-                comparison_rows += [[heading, "paper", *paper], ["", "ours", *simulated_texts]]
+                comparison_rows += [[heading, "paper", *paper], [heading, "ours", *simulated_texts]]
         table_3 = Grid(
-            ["Parameter", "Rover position", *(str(update_number) for update_number in values)], comparison_rows
+            ["Quantity", "Source", *(f"Update {update_number}" for update_number in values)], comparison_rows
         )
         blocks = [
-            Block(heading="Comparison with the paper", grid=table_3, note=note_text("vtt.table_3")),
+            Block(heading="Comparison with the paper", grid=table_3, note=_TABLE_3_NOTE),
             Block(heading="All updates of Marsyard", grid=grid, note=note),
         ]
     data = {
@@ -240,6 +163,11 @@ def updates_section(subject: Subject) -> Section | None:
 #: that varies is used.
 _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
+_OBLIQUITY_NOTE = (
+    "Obliquity: angle between the line of sight and the surface normal at the target; 0 is face-on. Rows are classes "
+    "of its maximum over the stops, columns are steps. Cells: tracked targets, of sunlit targets in view to the end. "
+    "The template is scaled and rolled, but not foreshortened like the image of a rotating oblique patch."
+)
 #: Edges of the classes of maximum obliquity, deg.
 _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
 
@@ -264,24 +192,28 @@ def steps_section(subject: Subject) -> Section | None:
     ]
     unit = "% of the distance" if motion["per_cent"] else "deg"
     xlabel = "step (% of the target's distance)" if motion["per_cent"] else "step (deg)"
-    caption = "Fraction of selectable targets tracked to the end, with intervals. Open marks: text of the paper."
-    grid = build_grid(
-        steps,
-        {
-            "Tracker": lambda cell: cell["line"] or "vtt",
-            f"Step ({unit})": lambda cell: number(cell["step"]).rstrip("0").rstrip("."),
-            "Tracked, of selectable": lambda cell: rates.fraction_text(cell["good"]),
-            f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.interval_text(cell["good"]),
-            "Paper": lambda cell: NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']:.0f} %",
-            "Tracked, of all targets": lambda cell: rates.fraction_text(cell["all_targets"]),
-            "False track, of selectable": lambda cell: rates.fraction_text(cell["false_tracks"]),
-        },
-    )
+    caption = f"Selectable targets that are tracked to the end, with {format_fraction(CONFIDENCE)} intervals."
+    columns: dict[str, Callable[[dict[str, Any]], str]] = {
+        f"Step ({unit})": lambda cell: number(cell["step"]).rstrip("0").rstrip("."),
+        "Tracked, of selectable": lambda cell: rates.fraction_text(cell["good"]),
+        f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.interval_text(cell["good"]),
+        "Tracked, of all targets": lambda cell: rates.fraction_text(cell["all_targets"]),
+        "False track, of selectable": lambda cell: rates.fraction_text(cell["false_tracks"]),
+    }
+    if any(cell["line"] for cell in steps):
+        name = "Search window" if str(steps[0]["line"]).endswith("px") else "Tracker"
+        columns = {name: lambda cell: cell["line"], **columns}
+    if any(line.paper for line in lines):
+        caption += " Open marks: text of the paper."
+        columns["Paper, of selectable"] = lambda cell: (
+            NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']:.0f} %"
+        )
+    grid = build_grid(steps, columns)
     svg_figures = [svg_figure(rate_figure(lines, (xlabel, "targets tracked")), "steps", caption)]
     blocks = [Block(text=motion["text"], figures=svg_figures), Block(grid=grid, note=_STEPS_NOTE)]
     oblique = None if motion["per_cent"] else _obliquity_grid(subject.frame)
     if oblique is not None:
-        blocks.append(Block(grid=oblique, note=note_text("vtt.obliquity")))
+        blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=_OBLIQUITY_NOTE))
     keys = ("good", "all_targets", "false_tracks")
     data = [cell | {name: asdict(cell[name]) for name in keys} for cell in steps]
     return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
@@ -388,7 +320,7 @@ def terrains_section(subject: Subject) -> Section | None:
         fractions = {"failed": asdict(failure_fraction), "failed_all": asdict(failure_fraction_all)}
         data.append({"name": name, **fractions, "causes": cause_counts, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
-    head += ["Cause, ours", "Failures, all targets", "Maximum slip"]
+    head += ["Cause, ours", "Failures, all targets", "Maximum wheel slip"]
     note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
     title = "Tracking with visual odometry on four kinds of ground (Table II of the paper)"
     return Section("table-2", "Kinds of ground", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})
@@ -434,10 +366,15 @@ def regression_section(subject: Subject) -> Section | None:
             "Navigation updates": lambda group: rates.median_text(rates.finite_values(group[1], "autonav_updates"), 0),
         },
     )
-    note = "According to the paper, all 14 runs were successful. Small rocks are at most 10 cm high."
+    note = (
+        "According to the paper, all 14 runs were successful. Small rocks are at most 10 cm high. Position error "
+        "(rover frame) and drift are those at the goal. Drift: distance from the match to the true projection. The "
+        "last three columns are medians, with minimum to maximum in brackets."
+    )
     blocks, loss_grid = [Block(grid=grid, note=note)], losses_grid(frame)
     if loss_grid.rows:
-        blocks.append(Block(heading="Runs that lost the target", grid=loss_grid))
+        note = losses_note(frame)
+        blocks.append(Block(heading="Runs that lost the target", grid=loss_grid, note=note))
     data = {"tracked": asdict(rates.flag_fraction(frame, "tracked"))}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
 

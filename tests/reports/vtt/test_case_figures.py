@@ -63,27 +63,62 @@ def test_matches_with_the_deprecated_name_are_read() -> None:
     np.testing.assert_array_equal(stop.matches, matches)
 
 
-def test_titles_contain_range_azimuth_and_match_score() -> None:
-    figure = draw_stops(make_products())
+def test_titles_contain_range_roll_and_match_score() -> None:
+    case_products = make_products()
+    case_products["figures"]["roll_change_deg"] = np.array([np.nan, -0.04, 1.0])
+    figure = draw_stops(case_products)
     titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
-    assert titles[0].startswith("1: 10.00 m, azimuth +0.0°")  # -0.04 deg is rounded to +0.0, not to -0.0
-    assert titles[1].startswith("2: 6.00 m")
-    assert "NCC 0.90" in titles[1]
-    assert titles[2].startswith("3 (lost): 2.00 m")
+    assert titles[0].startswith("Stop 1: 10.00 m\n")
+    # -0.04 deg is rounded to +0.0, not to -0.0
+    assert titles[1].splitlines() == ["Stop 2: 6.00 m", "roll +0.0°", "NCC 0.90"]
+    assert titles[2].startswith("Stop 3 (lost): 2.00 m")
     assert "not found" in [text.get_text() for axes in figure.axes for text in axes.texts]
+
+
+def test_legend_contains_only_marks_of_the_figure() -> None:
+    def labels(figure: Figure) -> list[str]:
+        return [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+
+    truth = "true projection of the designated point"
+    assert labels(draw_stops(make_products())) == ["search window", "tracked target", truth]
+    lost_products = make_products(1)  # the target is lost at the only stop
+    assert labels(draw_stops(lost_products)) == ["search window", truth]
+    names = labels(draw_path(make_products()))
+    assert {"rock of the target", "true heading"} <= {*names}
+    assert "other rocks" not in names
+    rocks = np.array([[10.1, 0.0, 0.4], [5.0, 0.5, 0.3], [5.0, 90.0, 0.3]])
+    assert "other rocks" in labels(draw_path(make_products() | {"rocks_m": rocks}))
+    distant_rocks = labels(draw_path(make_products() | {"rocks_m": rocks[[0, 2]], "heading_deg": None}))
+    assert not {"other rocks", "true heading"} & {*distant_rocks}
+    without_estimates = make_products() | {"target_estimated_m": np.full((3, 3), np.nan)}
+    assert not [name for name in labels(draw_path(without_estimates)) if "estimated target" in name]
+
+
+def test_right_subframe_is_cut_to_the_width_of_the_left_one() -> None:
+    counts = np.zeros((51, 540), dtype=np.uint16)
+    right_px = [700.0, 310.0]
+    matches = np.array([[480.0, 370.0], right_px])
+    figure = draw_stops(make_products() | {"stop_1_right": counts, "stop_1_matches": matches})
+    right = figure.axes[2]
+    assert np.shape(right.get_images()[0].get_array())[:2] == (51, 161)
+    # the match at column 320 of the subframe is at the centre of the 161 columns from column 239
+    (square,) = [patch for patch in right.patches if isinstance(patch, Rectangle)]
+    assert square.get_xy() == (320.0 - 239.0 - 10.5, 8.0 - 10.5)
+    assert "strip" in view(make_products() | {"stop_1_right": counts}, "case1").figures[0].caption
+    assert "strip" not in view(make_products(), "case1").figures[0].caption
 
 
 def test_selected_stops_include_first_and_last() -> None:
     titles = [axes.get_title(loc="left") for axes in draw_stops(make_products(9), max_stops=4).axes]
-    assert [title.split(":")[0].split(" ")[0] for title in titles if title] == ["1", "4", "6", "9"]
+    assert [title.split(":")[0].split(" ")[1] for title in titles if title] == ["1", "4", "6", "9"]
 
 
 def test_path_and_estimates_are_drawn_at_their_positions() -> None:
     top_view, detail = draw_path(make_products(4)).axes
     lines = {line.get_label(): np.column_stack(line.get_data()) for line in top_view.lines}
-    assert lines["stops"][-1].tolist() == [8.0, 0.0]
+    assert lines["true stops"][-1].tolist() == [8.0, 0.0]
     assert lines["estimated stops"][0].tolist() == pytest.approx([0.05, 0.05])
-    assert lines["designated target"].tolist() == [[10.0, 0.0]]
+    assert lines["designated point"].tolist() == [[10.0, 0.0]]
     # the target is tracked at three of four stops; the estimates are 0, 3 and 6 cm east of the designated point
     (name,) = [str(line.get_label()) for line in detail.lines if "estimated" in str(line.get_label())]
     assert name == "estimated target (6 cm from first to last estimate)"
@@ -134,5 +169,8 @@ def test_incomplete_products_are_not_a_tracking_case() -> None:
 def test_case_view_has_one_row_per_stop() -> None:
     case_view = view(make_products(), "case7")
     assert [row.succeeded for row in case_view.rows] == [True, True, False]
-    assert case_view.head == ["Stop", "State", "range (m)", "azimuth (deg)", "correlation of the match"]
-    assert list(case_view.rows[1].values)[:3] == ["2", "normal", "6.000"]
+    assert case_view.head == ["Stop", "State", "Range (m)", "Mast azimuth (deg)", "NCC score"]
+    assert list(case_view.rows[1].values)[:3] == ["2", "normal", "6.00"]
+    # the state is shown only if it varies
+    normal_view = view(make_products() | {"states": ["NORMAL"] * 3}, "case7")
+    assert normal_view.head[:2] == ["Stop", "Range (m)"]

@@ -16,21 +16,20 @@ from marsyard.reports.vtt.sections import (
     REGRESSION,
     SINGLE_RUNS,
     TERRAINS,
-    measured_accuracy,
     regression_section,
     step_rates,
     steps_section,
-    table_1_section,
     terrains_section,
     updates_section,
 )
+from marsyard.reports.vtt.table_1 import measured_accuracy, table_1_section
 from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table, set_values
 
 
 def test_table_1_agrees_with_the_printed_digits() -> None:
     table_rows = read_table(table_1_section(make_subject(make_rows(4))))
     for printed_row, computed_row in (table_rows[:2], table_rows[2:]):
-        assert (printed_row.pop(""), computed_row.pop("")) == ("paper", "computed")
+        assert (printed_row.pop("Source"), computed_row.pop("Source")) == ("paper", "computed")
         assert computed_row == printed_row
     assert table_rows[0]["3 sigma at the designation (cm)"] == "9.7"
     assert table_rows[2]["3 sigma at the goal without tracking (cm)"] == "42.0"
@@ -43,13 +42,14 @@ def test_measured_accuracy_is_3_sigma_per_camera() -> None:
     navcam, pancam = measured_accuracy(frame)
     # the errors have 0.1 m rms: 3 sigma in cm
     assert navcam["designation_cm"] == pytest.approx(300.0 * 0.1)
-    assert navcam["disparity_px"] == pytest.approx(0.1 / 0.388)
     # Eq. 3 of the tracking paper: sqrt(0.1^2 + 0.05^2)
     assert navcam["untracked_cm"] == pytest.approx(300.0 * np.hypot(0.1, 0.05))
     assert pancam["drift_px"] == pytest.approx(np.sqrt(12.5))
+    # the disparity error does not follow from the designation error: most of it is caused by the mast
+    assert "disparity_px" not in navcam
     table = read_table(table_1_section(make_subject(frame)), 1)
     # Navcam, 2 px of drift: sqrt(1.6^2 + 0.32^2) = 1.63
-    assert table[0]["Paper's formula (cm)"] == "1.6"
+    assert table[0]["Paper's formula: with tracking (cm)"] == "1.6"
     # runs from other ranges, at unselectable targets or without result are excluded
     assert measured_accuracy(frame.assign(range_start_m=7.0)) == []
     assert measured_accuracy(frame.assign(selectable=False)) == []
@@ -95,6 +95,8 @@ def test_step_rates_are_compared_with_fig_8() -> None:
     section = steps_section(make_subject(frame, legs=[{"motion": "approach"}]))
     assert section is not None
     assert "Fig. 8" in section.title
+    assert "Open marks" in section.blocks[0].figures[0].caption
+    assert read_table(section)[0]["Tracker"] == "vtt"
 
 
 def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
@@ -115,6 +117,12 @@ def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
     assert circle_rates[2]["paper_percent"] == pytest.approx(100.0 * 9 / 11)
     turn_rates = step_rates(make_subject(frame, legs=[{"motion": "turn"}]))
     assert {rate["paper_percent"] for rate in turn_rates} == {None}
+    section = steps_section(make_subject(frame, legs=[{"motion": "turn"}]))
+    assert section is not None
+    # without numbers in the paper, there is no column of dashes and no mark to explain
+    assert "Open marks" not in section.blocks[0].figures[0].caption
+    assert "Paper, of selectable" not in read_table(section)[0]
+    assert read_table(section)[0]["Search window"] == "200 px"
     assert steps_section(make_subject(make_rows(3))) is None
 
 
@@ -152,11 +160,11 @@ def test_updates_are_compared_with_table_3() -> None:
     frame = _make_update_rows(8)
     frame.loc[0, "update_8_match_score"] = 0.5
     table = read_table(updates_section(make_subject(frame, CHECKOUT_1)))
-    score_row = next(index for index, row in enumerate(table) if row["Parameter"] == "NCC score")
-    assert (table[score_row]["8"], table[score_row]["1"]) == ("0.79", "–")
-    assert table[score_row + 1]["8"] == "0.90 (0.50 to 0.90)"
-    roll_row = next(index for index, row in enumerate(table) if row["Parameter"] == "Roll change (deg)")
-    assert table[roll_row + 1]["2"] == "2.00"  # absolute value, as printed in the paper
+    score_row = next(index for index, row in enumerate(table) if row["Quantity"] == "NCC score")
+    assert (table[score_row]["Update 8"], table[score_row]["Update 1"]) == ("0.79", "–")
+    assert table[score_row + 1]["Update 8"] == "0.90 (0.50 to 0.90)"
+    roll_row = next(index for index, row in enumerate(table) if row["Quantity"] == "Roll change (deg)")
+    assert table[roll_row + 1]["Update 2"] == "2.00"  # absolute value, as printed in the paper
     other_campaign = read_table(updates_section(make_subject(frame, "another")))
     assert other_campaign[7]["NCC score"] == "0.90 (0.50 to 0.90)"
     assert other_campaign[7]["Roll change (deg)"] == "−2.00"
@@ -260,11 +268,21 @@ def test_goal_statistics_are_computed_per_camera() -> None:
     assert (pancam["within"].hits, pancam["within"].n) == (n - 1, n - 1)
     assert pancam["false_tracks"].hits == 1
     assert np.isfinite(pancam["quantile_bound_m"])
-    assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5 to 3.5", "3.0", "0"]]
+    assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5", "3.0"]]
+    set_values(frame, n, clear_sky=False)
+    assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5", "3.0", "1"]]
     table = read_table(GOAL(make_subject(frame)), 1)
-    assert table[1]["Median (mm)"] == "4.000"
-    small_sample = read_table(GOAL(make_subject(frame.iloc[:20])), 1)
-    assert small_sample[0]["Bound of the 99 % quantile (mm)"] == "too few cases"
+    assert table[1]["Position error, median (cm)"] == "0.40"
+    bound = "Upper bound of the 99 % quantile (cm)"
+    one_small_camera = read_table(GOAL(make_subject(frame.iloc[: n + 20])), 1)
+    assert [row[bound] for row in one_small_camera] == [table[0][bound], "too few runs"]
+
+
+def test_quantiles_without_enough_runs_are_omitted() -> None:
+    section = GOAL(make_subject(make_rows(20)))
+    assert "99 %" not in " ".join(read_table(section, 1)[0])
+    assert section is not None
+    assert "Too few runs" in section.blocks[-1].note
 
 
 def test_other_campaigns_have_no_tracking_section() -> None:
