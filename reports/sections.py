@@ -183,8 +183,8 @@ def dispersion_grid(run: StoredRun) -> Grid:
             statistics[1] = f"{run.frame[column].nunique()} values"
             if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
                 statistics = [_format_value(float(value)) for value in (values.min(), values.mean(), values.max())]
-                if dispersion.get("distribution") == "integer":
-                    statistics[1] = NOTHING  # the mean of numbers that name something has no meaning
+                if path_parts[-1] == "terrain":
+                    statistics[1] = NOTHING  # the mean of numbers of terrains has no meaning
         # defaults, which follow a semicolon, do not apply to dispersed parameters
         meaning = str(dispersion.get("description") or (model and description_at(model, str(path))) or NOTHING)
         meaning, unit = meaning.split(";")[0], split_unit(path_parts[-1])[1]

@@ -100,7 +100,7 @@ def test_right_subframe_is_cut_to_the_width_of_the_left_one() -> None:
     matches = np.array([[480.0, 370.0], right_px])
     figure = draw_stops(make_products() | {"stop_1_right": counts, "stop_1_matches": matches})
     right = figure.axes[2]
-    assert np.shape(right.get_images()[0].get_array())[:2] == (51, 161)
+    assert np.asarray(right.get_images()[0].get_array()).shape[:2] == (51, 161)
     # the match at column 320 of the subframe is at the centre of the 161 columns from column 239
     (square,) = [patch for patch in right.patches if isinstance(patch, Rectangle)]
     assert square.get_xy() == (320.0 - 239.0 - 10.5, 8.0 - 10.5)
