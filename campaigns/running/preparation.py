@@ -182,7 +182,8 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> Estimate:
     with create_executor(ExecutorConfig()) as executor:
         start_s = time.monotonic()
         for case in (index * total // trial_count for index in range(trial_count)):
-            if trials and time.monotonic() - start_s > _MAX_TRIAL_TIME_S:
+            # at least two: the first one includes the start of the worker and possibly the compilation of kernels
+            if len(trials) > 1 and time.monotonic() - start_s > _MAX_TRIAL_TIME_S:
                 break
             build_times += _build_inputs(campaign, executor, case)
             case_start_s = time.monotonic()

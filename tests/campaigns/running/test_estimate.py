@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.running import preparation
 from marsyard.campaigns.running.preparation import estimate_campaign
 
 CampaignFile = Callable[..., Path]
@@ -23,3 +24,11 @@ def test_estimate_follows_from_trial_cases(campaign_file: CampaignFile) -> None:
     # 1000 rows of about 15 columns (0.1 to 1 kB each), and products of 0.5 to 5 kB per case
     assert 1e5 < cost.rows_bytes < 1e6
     assert 5e5 < cost.products_bytes < 5e6
+
+
+def test_time_of_the_first_trial_case_is_left_out(campaign_file: CampaignFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    # the first trial case includes the start of the worker and the compilation of kernels
+    monkeypatch.setattr(preparation, "_MAX_TRIAL_TIME_S", 0.0)
+    cost = estimate_campaign(load_campaign(str(campaign_file("sleep_s = 0.05")), ["cases=1000"]), jobs=1)
+    assert cost.trials == 2
+    assert cost.case_range_s[0] == cost.case_range_s[1]
