@@ -353,8 +353,10 @@ def _find_near_rocks(
 def _find_visible_triangles(mesh: RockMesh, viewpoint: Viewpoint) -> Bool[np.ndarray, "triangles"]:
     """Select the triangles whose first corner is in the viewpoint's sector or near the viewpoint."""
     offsets = mesh.vertices[:, :2] - (viewpoint.east_m, viewpoint.north_m)
-    bearing = np.arctan2(offsets[:, 0], offsets[:, 1]) - viewpoint.azimuth_rad
-    bearing = np.abs((bearing + np.pi) % (2.0 * np.pi) - np.pi)
+    distance = np.hypot(*offsets.T)
+    forward = offsets @ (np.sin(viewpoint.azimuth_rad), np.cos(viewpoint.azimuth_rad))
     near_m = max(_NEAR_HEIGHTS * viewpoint.height_m, _NEAR_M)
-    is_selected = (bearing <= viewpoint.half_width_rad) | (np.hypot(*offsets.T) <= near_m)
+    # with a margin for rounding, so that a half width of pi selects all
+    min_cosine = np.cos(viewpoint.half_width_rad) - 1e-9
+    is_selected = (forward >= min_cosine * distance) | (distance <= near_m)
     return np.asarray(is_selected[mesh.faces[:, 0]])

@@ -41,14 +41,21 @@ def ray_distances(triangles: Triangles, origin: Vector, directions: Rays) -> Flo
     return np.asarray(first_hits(triangles, origin, directions)[0])
 
 
-def triangles_near_line(triangles: Triangles, viewpoint: Vector, point: Vector, half_angle_rad: float) -> Triangles:
-    """Select all triangles that rays within an angle of the line of sight can hit, and possibly some more."""
+def enclosing_spheres(triangles: Triangles) -> Float64[np.ndarray, "triangles 4"]:
+    """Return spheres that contain the triangles: centroid, and the longer of the two edges from the first corner."""
+    edges = np.linalg.norm(triangles[:, 1:] - triangles[:, :1], axis=2)
+    return np.column_stack([triangles.mean(axis=1), edges.max(axis=1)])
+
+
+def spheres_near_line(
+    spheres: Float64[np.ndarray, "spheres 4"], viewpoint: Vector, point: Vector, half_angle_rad: float
+) -> Bool[np.ndarray, "spheres"]:
+    """Select all spheres that rays within an angle of the line of sight can hit, and possibly some more."""
     axis = (point - viewpoint) / np.linalg.norm(point - viewpoint)
-    centres = triangles.mean(axis=1) - viewpoint
+    centres = spheres[:, :3] - viewpoint
     depths = centres @ axis
     offsets = np.linalg.norm(centres - depths[:, None] * axis, axis=1)
-    size = np.linalg.norm(triangles[:, 1:] - triangles[:, :1], axis=2).max(axis=1)
-    return np.asarray(triangles[offsets <= np.tan(half_angle_rad) * np.maximum(depths, 0.0) + size])
+    return np.asarray(offsets <= np.tan(half_angle_rad) * np.maximum(depths, 0.0) + spheres[:, 3])
 
 
 def patch_normal(triangles: Triangles, viewpoint: Vector, point: Vector, half_angle_rad: float) -> Vector:
@@ -61,7 +68,8 @@ def patch_normal(triangles: Triangles, viewpoint: Vector, point: Vector, half_an
     offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     rays = axes[0] + offsets @ axes[1:]
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    candidates = triangles_near_line(triangles, viewpoint, point, np.sqrt(2.0) * half_angle_rad)
+    spheres = enclosing_spheres(triangles)
+    candidates = triangles[spheres_near_line(spheres, viewpoint, point, np.sqrt(2.0) * half_angle_rad)]
     _, indices = first_hits(candidates, viewpoint, rays)
     corners = candidates[indices[indices >= 0]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

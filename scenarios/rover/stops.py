@@ -314,10 +314,10 @@ def evaluate_visibility(
     to_cameras = np.array([left - point for left, _ in cameras_m])
     to_cameras /= np.linalg.norm(to_cameras, axis=1, keepdims=True)
     obliquity_deg = np.degrees(np.arccos(np.clip(to_cameras @ normal, -1.0, 1.0)))
-    foot_m = float(world.rocks.position_m[world.target_number, 2])
+    foot_m, spheres = float(world.rocks.position_m[world.target_number, 2]), points.enclosing_spheres(triangles)
 
     def is_clear(viewpoint: Vector) -> bool:
-        nearby = points.triangles_near_line(triangles, viewpoint, point, half_rad)
+        nearby = triangles[points.spheres_near_line(spheres, viewpoint, point, half_rad)]
         is_occluded = points.find_self_occlusion(nearby, point[None], viewpoint)[0]
         return not is_occluded and not _is_on_edge(nearby, foot_m, viewpoint, point, half_rad)
 

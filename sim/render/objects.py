@@ -105,11 +105,18 @@ class Objects:
         return np.asarray(body_spheres(self.triangles, self.first_triangle))
 
     def in_cone(
-        self, apex: Float64[np.ndarray, "3"], axis: Float64[np.ndarray, "3"], half_angle_rad: float
+        self,
+        apex: Float64[np.ndarray, "3"],
+        axis: Float64[np.ndarray, "3"],
+        half_angle_rad: float,
+        apex_radius_m: float = 0.0,
     ) -> Int64[np.ndarray, "selected"]:
-        """Numbers of the triangles that face a cone's apex, for bodies whose bounding spheres intersect the cone."""
+        """Select triangles of bodies whose bounding spheres intersect a cone, if they face a point near its apex.
+
+        Returns their numbers; `apex_radius_m` is the maximum distance of that point from the apex.
+        """
         is_selected = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        return np.asarray(select_facing(self.triangles, self._triangles_of(is_selected), *apex))
+        return np.asarray(select_facing(self.triangles, self._triangles_of(is_selected), *apex, apex_radius_m))
 
     def select(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
         """Return the selected bodies, renumbered."""
@@ -126,11 +133,16 @@ class Objects:
     def _triangles_of(self, is_selected: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "selected"]:
         return np.flatnonzero(np.repeat(is_selected, np.diff(self.first_triangle)))
 
-    @cached_property
-    def hierarchy(self) -> Hierarchy:
-        """The bounding volume hierarchy of the triangles."""
-        order = np.argsort(morton_codes(self.triangles), kind="stable")
+    def hierarchy(self, numbers: Int64[np.ndarray, "selected"]) -> Hierarchy:
+        """Build the bounding volume hierarchy of the triangles with these numbers."""
+        is_selected = np.zeros(len(self.triangles), dtype=np.bool_)
+        is_selected[numbers] = True
+        order = self._morton_order[is_selected[self._morton_order]]
         return self.triangles, order, node_boxes(self.triangles, order)
+
+    @cached_property
+    def _morton_order(self) -> Int64[np.ndarray, "triangles"]:
+        return np.argsort(morton_codes(self.triangles), kind="stable")
 
 
 def spheres_in_cone(

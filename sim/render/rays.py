@@ -76,6 +76,11 @@ class PixelRays:
         """Maximum angle between a ray and the axis."""
         return float(np.arccos(np.clip(min_component(self.directions, self.axis), -1.0, 1.0)))
 
+    @cached_property
+    def origin_radius_m(self) -> float:
+        """Maximum distance of a ray's origin from the centre of projection."""
+        return float(np.linalg.norm(self.origins, axis=1).max()) if self.origins.any() else 0.0
+
     def cone(self, world_from_body: RigidTransform) -> Cone:
         """The cone that contains all rays of a camera in this pose."""
         axis = rotation_matrix(world_from_body) @ self.axis

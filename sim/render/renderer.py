@@ -75,8 +75,9 @@ def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side:
     """Compute `side` x `side` rays in each of these pixels, with the pixel angle of the pixel."""
     columns, rows = rays.size
     count = len(pixels) * side**2
-    origins, directions = np.empty((count, 3), dtype=np.float32), np.empty((count, 3), dtype=np.float32)
-    split_rays(rays.origins, (rows, columns), pixels, side, False, origins)
+    origins, directions = np.zeros((count, 3), dtype=np.float32), np.empty((count, 3), dtype=np.float32)
+    if rays.origin_radius_m > 0.0:
+        split_rays(rays.origins, (rows, columns), pixels, side, False, origins)
     split_rays(rays.directions, (rows, columns), pixels, side, True, directions)
     return Rays(origins, directions, np.repeat(rays.pixel_angles[pixels], side**2))
 
@@ -134,13 +135,18 @@ class Renderer:
         clearance = pose.position[2] - float(scene.surface.height(pose.position[0], pose.position[1]))
         if clearance <= 0.0:
             raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {pose.position}")
-        views = self._draw_views(scene, rays, pose, clearance)
+        # a margin of one pixel for the subpixel rays of the pixels at the image's border
+        half_angle_rad = rays.half_angle_rad + rays.pixel_rad
+        numbers = scene.objects.in_cone(
+            pose.position, pose.rotation @ rays.axis, half_angle_rad, apex_radius_m=rays.origin_radius_m
+        )
+        views = self._draw_views(scene, rays, pose, clearance, numbers)
         columns, rows = rays.size
         highest_ray = np.arcsin(np.clip((pose.rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
         is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
         # height bounds save time only for rays almost parallel to the ground
         ground = ground_struct(scene.surface, scene.extent_m, ceilings=is_grazing)
-        hits, light, tree = _empty_hits(rows * columns, scene), scene.light(time_s), scene.objects.hierarchy
+        hits, light, tree = _empty_hits(rows * columns, scene), scene.light(time_s), scene.objects.hierarchy(numbers)
 
         def trace_part(part: slice) -> None:
             part_views = views._replace(view_of_pixel=rays.view_of_pixel[part])
@@ -172,8 +178,13 @@ class Renderer:
             self._views[side_px] = DepthRenderer(side_px, self._backend)
         return self._views[side_px]
 
-    def _draw_views(self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float) -> Views:
-        """Draw the pinhole views by OpenGL; `clearance_m` is the height of the camera above the ground."""
+    def _draw_views(
+        self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float, numbers: Int64[np.ndarray, "triangles"]
+    ) -> Views:
+        """Draw the pinhole views by OpenGL: the ground, and the triangles of objects with these numbers.
+
+        `clearance_m` is the height of the camera above the ground.
+        """
         if self._last_scene is not scene:
             self._last_scene = scene
             self._scene_count += 1
@@ -198,7 +209,6 @@ class Renderer:
             grid_lines_between(centre + scene.mesh_offsets, first, last)
             for centre, first, last in zip(scene.centre_m, points.min(axis=0), points.max(axis=0), strict=True)
         )
-        numbers = scene.objects.in_cone(pose.position, pose.rotation @ rays.axis, rays.half_angle_rad)
         ground = ground_mesh(scene.surface, x, y, cell_spans_in_hull(x, y, points))
         renderer = self._view_renderer(rays.view_side_px)
         renderer.load(ground, scene.objects.triangles[numbers], numbers)

@@ -194,8 +194,14 @@ class Detector:
         return cls(p, response.astype(np.float32), calibration, hot_e_s, listed)
 
     def with_exposure(self, exposure_s: float) -> Detector:
-        """Return the same detector with another exposure time; the calibration is updated."""
-        parameters = DetectorParameters.model_validate(self.parameters.model_dump() | {"exposure_s": exposure_s})
+        """Return the same detector with another exposure time; the calibration is updated.
+
+        Raises ValueError if the exposure time is not positive.
+        """
+        if not 0.0 < exposure_s <= 10.0:
+            raise ValueError(f"exposure_s is {exposure_s:g}; allowed: above 0, at most 10")
+        # without validation of the other parameters, which takes longer than the exposure of a small image
+        parameters = self.parameters.model_copy(update={"exposure_s": exposure_s})
         return replace(self, parameters=parameters, calibration=replace(self.calibration, exposure_s=exposure_s))
 
     def window(self, column: int, row: int, size: tuple[int, int]) -> Detector:

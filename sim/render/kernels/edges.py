@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from marsyard.sim.render.kernels.ground import entry_distance, exit_distance, intersect_ground
+from marsyard.sim.render.kernels.ground import (
+    MAX_NEWTON_RATE,
+    clearance_at,
+    entry_distance,
+    exit_distance,
+    intersect_ground,
+)
 from marsyard.sim.render.kernels.hierarchy import Hierarchy, TriangleHit, list_in_beam, nearer_hit, nearest_hit
 from marsyard.sim.render.kernels.structs import (
     Array32,
@@ -19,6 +25,7 @@ from marsyard.sim.render.kernels.structs import (
     Ints,
     Longs,
     Pose,
+    Ray,
     Rays,
     world_ray,
 )
@@ -35,6 +42,8 @@ MIN_RANGE_JUMP, MIN_JUMP_RATIO = 0.02, 3.0
 SEARCH_START, SEARCH_END = 0.95, 1.05
 #: Far limit next to the sky, where range grows without bound from pixel to pixel.
 HORIZON_SEARCH_END = 5.0
+#: Maximum number of Newton steps from a neighbouring pixel's range on smooth ground.
+MAX_NEWTON_STEPS = 3
 #: Maximum number of triangles listed for a pixel's beam; with more triangles, each ray traverses the hierarchy.
 MAX_LISTED = 96
 #: Half a pixel's diagonal, in pixels, with a margin because pixels are not exactly square.
@@ -178,6 +187,33 @@ def _gather_neighbours(
     return count, has_sky, has_objects, farthest
 
 
+@njit(cache=True, inline="always")
+def _is_smooth_ground(ranges: Array, levels: Longs) -> bool:
+    """Return whether nine sorted ranges of the ground on one terrain level have no jump."""
+    is_smooth = levels[0] >= 0 and ranges[8] - ranges[0] < MIN_RANGE_JUMP * ranges[8]
+    for index in range(1, 9):
+        is_smooth &= levels[index] == levels[0]
+    return bool(is_smooth)
+
+
+@njit(cache=True, fastmath={"contract"})
+def _refine_on_smooth_ground(level: GroundLevel, ray: Ray, guess: float) -> float:
+    """Distance of the intersection with the ground by Newton's method; infinite if it does not converge."""
+    t = guess
+    for _ in range(MAX_NEWTON_STEPS):
+        clearance = clearance_at(level.field, level.per_metre, ray, t)
+        if clearance.rate > MAX_NEWTON_RATE:
+            break
+        step = clearance.height / clearance.rate
+        t -= step
+        if abs(t - guess) > MIN_RANGE_JUMP * guess:
+            break
+        # after a shorter horizontal step the error is below 1e-6 of the distance: curvature is at most 1 / spacing
+        if step * step * (ray.dx * ray.dx + ray.dy * ray.dy) < 2e-6 * guess / level.per_metre:
+            return t
+    return math.inf
+
+
 @njit(cache=True, fastmath={"contract"})
 def trace_subpixel_rays(
     ground: Ground, pose: Pose, tree: Hierarchy, columns: int, pixels: Longs, rays: Rays, primary: Hits, hits: Hits
@@ -185,7 +221,8 @@ def trace_subpixel_rays(
     """Trace the subpixel rays of these pixels, with the hits of each pixel's 3 x 3 neighbourhood as first guesses.
 
     Only triangles inside a beam around the pixel are tested. The ground is searched near the ranges of the neighbouring
-    pixels, on their terrain levels, so that the ground is continuous. `rays` contains the same number of rays for each
+    pixels, on their terrain levels, so that the ground is continuous. On smooth ground without objects, Newton's method
+    replaces this search. `rays` contains the same number of rays for each
     pixel, in order; `primary` are the hits of all pixels; `hits` is the output.
     """
     fields, ceilings, _top_level, spacing, extent = ground
@@ -198,6 +235,7 @@ def trace_subpixel_rays(
         pixel = pixels[k]
         count, has_sky, has_objects, farthest = _gather_neighbours(primary, pixel, columns, ranges, levels)
         beam_count = -1
+        is_smooth = count == 9 and _is_smooth_ground(ranges, levels)
         first, last = k * rays_per_pixel, (k + 1) * rays_per_pixel
         if has_objects:
             # the ray through the pixel's centre is the mean of the first and the last subpixel ray
@@ -217,6 +255,10 @@ def trace_subpixel_rays(
             level = 0
             end = math.inf
             index = 0
+            if is_smooth:
+                level = levels[0]
+                ground_level = GroundLevel(fields[level], ceilings[level], 1.0 / spacing / (1 << level))
+                t = _refine_on_smooth_ground(ground_level, ray, primary.distance[pixel])
             while index < count and t == math.inf:
                 # consecutive ranges on one level form one interval, which starts at the end of the previous interval
                 level = levels[index]

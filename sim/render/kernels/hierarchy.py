@@ -100,8 +100,8 @@ def body_spheres(triangles: Array, first_triangle: Longs) -> Array:
 
 
 @njit(cache=True)
-def select_facing(triangles: Array, numbers: Longs, x: float, y: float, z: float) -> Longs:
-    """Select the numbers of the triangles that face a position."""
+def select_facing(triangles: Array, numbers: Longs, x: float, y: float, z: float, radius: float) -> Longs:
+    """Select the numbers of the triangles that face a position within a radius of x, y, z."""
     selected = np.empty(numbers.size, dtype=np.int64)
     count = 0
     for n in numbers:
@@ -110,7 +110,8 @@ def select_facing(triangles: Array, numbers: Longs, x: float, y: float, z: float
         vx, vy, vz = triangles[n, 2, 0] - ax, triangles[n, 2, 1] - ay, triangles[n, 2, 2] - az
         nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         selected[count] = n
-        count += nx * (x - ax) + ny * (y - ay) + nz * (z - az) > 0.0
+        largest_offset = radius * math.sqrt(nx * nx + ny * ny + nz * nz)
+        count += nx * (x - ax) + ny * (y - ay) + nz * (z - az) + largest_offset > 0.0
     return selected[:count]
 
 

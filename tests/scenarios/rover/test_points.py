@@ -6,11 +6,12 @@ import trimesh
 
 from marsyard.scenarios.rover.points import (
     RockOutline,
+    enclosing_spheres,
     find_self_occlusion,
     find_self_shadow,
     patch_normal,
     ray_distances,
-    triangles_near_line,
+    spheres_near_line,
 )
 
 
@@ -69,7 +70,7 @@ def test_triangles_near_a_line_contain_all_intersections(sphere: np.ndarray) -> 
     eye, half_angle_rad = np.array([0.0, 0.0, 0.5]), 0.03
     rng = np.random.default_rng(2)
     for point in RockOutline.from_triangles(sphere, eye, 0.0).point(0.4, 0.7), np.array([5.0, 0.4, 0.8]):
-        near_triangles = triangles_near_line(sphere, eye, point, half_angle_rad)
+        near_triangles = sphere[spheres_near_line(enclosing_spheres(sphere), eye, point, half_angle_rad)]
         assert 0 < len(near_triangles) < 0.2 * len(sphere)
         central_direction = (point - eye) / np.linalg.norm(point - eye)
         rays = central_direction + np.tan(half_angle_rad) * rng.uniform(-0.7, 0.7, (200, 3))

@@ -86,7 +86,8 @@ def test_nearest_triangle_equals_exhaustive_search(rocky_view: View) -> None:
     rays = pose.rotation.apply(rocky_view.rays(rocky_view.camera).directions[::37].astype(np.float64))
     starts = np.broadcast_to(pose.translation, rays.shape)
     expected = cast_triangles(objects, starts, rays)
-    result = np.array([nearest_hit(objects.hierarchy, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
+    tree = objects.hierarchy(np.arange(len(objects.triangles)))
+    result = np.array([nearest_hit(tree, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.95
     np.testing.assert_allclose(result, expected, rtol=1e-9)
 

@@ -30,7 +30,8 @@ def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
 def test_nearest_triangle_equals_exhaustive_search(objects: Objects) -> None:
     rays = _draw_rays(np.random.default_rng(7), 800)
     expected = cast_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
-    result = np.array([nearest_hit(objects.hierarchy, Ray(*EYE, *ray), np.inf).distance for ray in rays])
+    tree = objects.hierarchy(np.arange(1500))
+    result = np.array([nearest_hit(tree, Ray(*EYE, *ray), np.inf).distance for ray in rays])
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
     np.testing.assert_allclose(result, expected, rtol=1e-9)
 
@@ -41,9 +42,10 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     """The list contains all triangles that random rays in the beam hit, and only triangles near the frustum."""
     max_distance_m = 9.0
     rng = np.random.default_rng(9)
+    tree = objects.hierarchy(np.arange(1500))
     buffer = np.empty(1500, dtype=np.int64)
     listed_triangles = set(
-        buffer[: list_in_beam(objects.hierarchy, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist()
+        buffer[: list_in_beam(tree, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist()
     )
     perpendicular = np.cross(axis, _draw_rays(rng, 100))
     perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
@@ -64,13 +66,13 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
 
 
 def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
-    axis = direction(1.0, 0.2)
+    axis, tree = direction(1.0, 0.2), objects.hierarchy(np.arange(1500))
     buffer = np.empty(1500, dtype=np.int64)
-    count = list_in_beam(objects.hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer)
+    count = list_in_beam(tree, Ray(*EYE, *axis), 0.3, 9.0, buffer)
     assert count > 5
-    assert list_in_beam(objects.hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer[:count].copy()) == count
-    assert list_in_beam(objects.hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer[: count - 1].copy()) == -1
-    assert list_in_beam(Objects.none().hierarchy, Ray(*EYE, *axis), 0.3, 9.0, buffer) == 0
+    assert list_in_beam(tree, Ray(*EYE, *axis), 0.3, 9.0, buffer[:count].copy()) == count
+    assert list_in_beam(tree, Ray(*EYE, *axis), 0.3, 9.0, buffer[: count - 1].copy()) == -1
+    assert list_in_beam(Objects.none().hierarchy(np.arange(0)), Ray(*EYE, *axis), 0.3, 9.0, buffer) == 0
 
 
 def _list_hits(objects: Objects, ray: np.ndarray, max_distance_m: float) -> set[int]:
