@@ -45,9 +45,6 @@ MIN_GAP_M = 0.05
 NAVIGATION_ROCKS_M, NAVIGATION_HALF_WIDTH_M = 25.0, 60.0
 #: Half side of the square around the target in which wheels roll over rocks, minus the start distance, m.
 ROUTE_MARGIN_M = 1.5
-#: Half width of the sector, seen from the target, that contains the route if all legs lead to the target or from it.
-#: (Rocks near the target are included in all directions.) Other legs can leave the sector.
-ROUTE_HALF_WIDTH_RAD, RADIAL_MOTIONS = np.pi / 3.0, {"stay", "approach", "back-off", "turn"}
 
 
 def terrain_parameters(world: WorldParameters) -> TerrainParameters:
@@ -73,7 +70,6 @@ class RunWorld:
     base: Scene  #: scene at the start, without the rover
     viewpoint: Viewpoint  #: position of the target and resolution of the cameras
     start_distance_m: float
-    route_half_width_rad: float  #: half width of the sector with the route, seen from the target
     sun: SunParameters
     target_number: int  #: index of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: rendered mesh of the target's rock, used as truth
@@ -110,12 +106,7 @@ class RunWorld:
         offsets = objects.spheres[bodies, :2] - rocks.position_m[number][:2]
         nearest = bodies[np.argmin(np.linalg.norm(offsets, axis=1))]
         first, end = objects.first_triangle[nearest : nearest + 2]
-        is_radial = all(leg.motion in RADIAL_MOTIONS for leg in p.legs)
-        route_half_width = ROUTE_HALF_WIDTH_RAD if is_radial else np.pi
-        target_triangles = objects.triangles[first:end]
-        return cls(
-            ground, rocks, scene, viewpoint, p.start.distance_m, route_half_width, p.sun, number, target_triangles
-        )
+        return cls(ground, rocks, scene, viewpoint, p.start.distance_m, p.sun, number, objects.triangles[first:end])
 
     def face_distance_m(self, p: RoverScenarioParameters) -> float:
         """Compute the horizontal distance of the designated point from the rock's centre towards the start, metres.
@@ -158,13 +149,8 @@ class RunWorld:
         """Ground with the rocks on the route from the target to `ROUTE_MARGIN_M` behind the start."""
         centre = (self.viewpoint.east_m, self.viewpoint.north_m)
         half_side_m = self.start_distance_m + ROUTE_MARGIN_M
-        sector = replace(
-            self.viewpoint,
-            azimuth_rad=self.viewpoint.azimuth_rad + np.pi,
-            half_width_rad=self.route_half_width_rad,
-            max_distance_m=float(np.sqrt(2.0)) * half_side_m,
-        )
-        rocks = select_rocks(self.ground, sector)
+        max_distance_m = float(np.sqrt(2.0)) * half_side_m
+        rocks = select_rocks(self.ground, replace(self.viewpoint, half_width_rad=np.pi, max_distance_m=max_distance_m))
         return RockyGround.from_triangles(self.ground.surface, rocks.triangles, centre, half_side_m)
 
     def brightness(self, time_s: float) -> float:

@@ -10,6 +10,7 @@ from numba import njit
 
 from marsyard.sim.render.kernels.ground import (
     MAX_NEWTON_RATE,
+    Clearance,
     clearance_at,
     entry_distance,
     exit_distance,
@@ -201,7 +202,7 @@ def _refine_on_smooth_ground(level: GroundLevel, ray: Ray, guess: float) -> floa
     """Distance of the intersection with the ground by Newton's method; infinite if it does not converge."""
     t = guess
     for _ in range(MAX_NEWTON_STEPS):
-        clearance = clearance_at(level.field, level.per_metre, ray, t)
+        clearance: Clearance = clearance_at(level.field, level.per_metre, ray, t)
         if clearance.rate > MAX_NEWTON_RATE:
             break
         step = clearance.height / clearance.rate

@@ -119,6 +119,21 @@ def _may_be_shaded(region: Footprint, x: float, y: float) -> bool:
 # "contract" allows fused multiplications: they round differently, but always the same way on one processor.
 
 
+@njit(cache=True, inline="always")
+def _exp(x: float) -> float:
+    """Exponential function to 3e-7 for -4 < x < 4, by the series for x / 16.
+
+    The compiler vectorises it, in contrast to `math.exp`.
+    """
+    y = x / 16.0
+    power = 1.0 / 24.0 + y * (1.0 / 120.0 + y * (1.0 / 720.0))
+    power = 1.0 + y * (1.0 + y * (1.0 / 2.0 + y * (1.0 / 6.0 + y * power)))
+    power *= power
+    power *= power
+    power *= power
+    return power * power
+
+
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _locate_pixels(
     rotation: Matrix,
@@ -336,9 +351,8 @@ def _apply_texture(materials: Materials, width: int, n_objects: int, strip: _Str
         add_texture(position, footprint, materials.object_texture, strength, strip.noise, change)
         for m in range(n_objects):
             work[LOG_ALBEDO + strip.other[m]] = work[OBJECT_LOG_ALBEDO + m]
-    for k in range(width):
-        if work[LOG_ALBEDO + k] != 0.0:
-            work[ALBEDO + k] *= math.exp(work[LOG_ALBEDO + k])
+    for k in range(min(width, STRIP)):
+        work[ALBEDO + k] *= _exp(work[LOG_ALBEDO + k])
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})

@@ -44,9 +44,7 @@ def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.nda
     rng = np.random.default_rng(9)
     tree = objects.hierarchy(np.arange(1500))
     buffer = np.empty(1500, dtype=np.int64)
-    listed_triangles = set(
-        buffer[: list_in_beam(tree, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist()
-    )
+    listed_triangles = set(buffer[: list_in_beam(tree, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist())
     perpendicular = np.cross(axis, _draw_rays(rng, 100))
     perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
     angles = half_angle * rng.uniform(0.0, 1.0, (100, 1))

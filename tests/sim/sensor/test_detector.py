@@ -1,12 +1,15 @@
 """Tests of the detector model: noise, smear, dark current, defects and calibration."""
 
+from typing import Any, cast
+
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.sensor import Detector, DetectorParameters
-from marsyard.sim.sensor.detector import BurstParameters, DefectParameters, dark_seconds
+from marsyard.sim.sensor.detector import MIN_COMMON_E, BurstParameters, DefectParameters, add_noise, dark_seconds
 from marsyard.sim.sensor.optics import OpticsParameters
 from tests.sim.sensor.motions import uniform_motion
 
@@ -119,6 +122,37 @@ def test_dark_current_doubles_every_six_degrees() -> None:
     assert seconds[0] == pytest.approx(parameters.exposure_s + 64 * parameters.transfer_row_s)
     np.testing.assert_allclose(np.diff(seconds), parameters.readout_row_s)
     np.testing.assert_allclose(detector.dark_charge()[:, 0], 4 * parameters.dark_e_s * seconds, rtol=1e-6)
+
+
+class _GivenNormals:
+    """A random generator with given normal numbers."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+
+    def standard_normal(self, size: tuple[int, ...], dtype: type) -> np.ndarray:
+        return self.values.reshape(size).astype(dtype)
+
+
+@pytest.mark.parametrize("mean_e", [MIN_COMMON_E, 300.0, 1e4])
+@pytest.mark.parametrize(("read_noise_e", "tolerance"), [(0.0, 6e-3), (5.0, 5e-5), (25.0, 5e-5)])
+def test_common_noise_has_the_distribution_of_poisson_and_normal_noise(
+    mean_e: float, read_noise_e: float, tolerance: float
+) -> None:
+    normal = np.linspace(-4.0, 4.0, 161)
+    mean = np.full((1, normal.size), mean_e, dtype=np.float32)
+    charge = add_noise(mean, read_noise_e, True, cast(Any, _GivenNormals(normal))).ravel().astype(np.float64)
+    # Exact distribution: Poisson probabilities, each with normal noise (a whole number without it).
+    counts = np.arange(int(mean_e + 10.0 * mean_e**0.5))
+    excess = charge[:, None] - counts
+    below = stats.norm.cdf(excess / read_noise_e) if read_noise_e else np.clip(excess + 0.5, 0.0, 1.0)
+    np.testing.assert_allclose(below @ stats.poisson.pmf(counts, mean_e), stats.norm.cdf(normal), atol=tolerance)
+
+
+def test_few_electrons_have_poisson_noise() -> None:
+    charge = add_noise(np.full((200, 500), 4.0, dtype=np.float32), 0.0, True, np.random.default_rng(3))
+    observed = np.bincount(charge.astype(int).ravel(), minlength=16)[:16] / charge.size
+    np.testing.assert_allclose(observed, stats.poisson.pmf(np.arange(16), 4.0), atol=5e-3)
 
 
 def test_dark_current_adds_signal_and_shot_noise() -> None:
