@@ -119,13 +119,15 @@ def reduce_level(fine: Level) -> Level:
     half = side // 2
     mask = side - 1
     weights = np.array([1.0, 4.0, 6.0, 4.0, 1.0], dtype=np.float32) / np.float32(16.0)
-    half_width = np.zeros((side, half, 2), dtype=np.float32)
+    half_width = np.empty((side, half, 2), dtype=np.float32)
+    # a row with two samples of the opposite end on each side
+    row = np.empty((side + 4, 2), dtype=np.float32)
     for i in range(side):
+        row[:2], row[2:-2], row[-2:] = fine[i, -2:], fine[i], fine[i, :2]
         for j in range(half):
-            for k in range(5):
-                source = (2 * j + k - 2) & mask
-                for c in range(2):
-                    half_width[i, j, c] += weights[k] * fine[i, source, c]
+            for c in range(2):
+                outer, inner = row[2 * j, c] + row[2 * j + 4, c], row[2 * j + 1, c] + row[2 * j + 3, c]
+                half_width[i, j, c] = weights[0] * outer + weights[1] * inner + weights[2] * row[2 * j + 2, c]
     coarse = np.zeros((half, half, 2), dtype=np.float32)
     for i in range(half):
         for k in range(5):

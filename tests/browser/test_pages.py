@@ -15,6 +15,8 @@ from playwright.sync_api import Page
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
 
+pytestmark = pytest.mark.slow
+
 #: Fixture `open_page` of conftest: it opens a file and returns the page and its log.
 OpenPage = Callable[..., tuple[Page, Any]]
 #: Rule sets of axe-core for WCAG 2.2, levels A and AA.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from jaxtyping import Complex64, Float32, Float64
+from jaxtyping import Complex64, Float32, Float64, Inexact
 from numpy.random import Generator
 
 from marsyard.sim.streams import hash_words
@@ -140,15 +140,23 @@ class Spectrum:
         along_x = (2.0 * np.pi * scipy.fft.rfftfreq(samples, spacing_m)).astype(np.float32)[None, :]
         stretch = np.float32(np.sqrt(elongation))
         c, s = np.float32(np.cos(azimuth_rad)), np.float32(np.sin(azimuth_rad))
-        squared = ((c * along_x + s * along_y) * stretch) ** 2 + ((c * along_y - s * along_x) / stretch) ** 2
+        is_isotropic = elongation == 1.0
+        if is_isotropic:
+            # modes of opposite wavenumbers along y are equal
+            along_y = along_y[: samples // 2 + 1]
+            squared = along_x * along_x + along_y * along_y
+        else:
+            squared = ((c * along_x + s * along_y) * stretch) ** 2 + ((c * along_y - s * along_x) / stretch) ** 2
         squared += np.float32((2.0 * np.pi / outer_scale_m) ** 2)
         amplitude = np.exp(np.float32(-(hurst + 1.0) / 2.0) * np.log(squared))
+        if is_isotropic:
+            amplitude = np.concatenate([amplitude, amplitude[-2:0:-1]])
         amplitude[0, 0] = 0.0
         return cls(amplitude, spacing_m, _compute_column_power(amplitude))
 
     def apply_low_pass(self, wavelength_m: float) -> Spectrum:
         """Return the spectrum after a Gaussian low-pass filter that attenuates waves shorter than `wavelength_m`."""
-        amplitude = self.amplitude * _compute_low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m)
+        amplitude = self._filter(self.amplitude, wavelength_m)
         return Spectrum(amplitude, self.spacing_m, _compute_column_power(amplitude))
 
     def draw_field(self, rng: Generator, scale: float) -> Float32[np.ndarray, "samples samples"]:
@@ -164,12 +172,21 @@ class Spectrum:
     ) -> tuple[Float32[np.ndarray, "samples samples"], Float32[np.ndarray, "samples samples"]]:
         """Draw the field of `draw_field` as the sum of a coarse and a fine field, separated at a wavelength."""
         modes = self._draw_modes(rng)
-        coarse = self._transform(
-            modes * _compute_low_pass(self.amplitude.shape[0], self.spacing_m, wavelength_m), scale
-        )
+        coarse = self._transform(self._filter(modes, wavelength_m), scale)
         fine = self._transform(modes, scale)
         fine -= coarse
         return coarse, fine
+
+    def _filter(
+        self, modes: Inexact[np.ndarray, "samples half"], wavelength_m: float
+    ) -> Inexact[np.ndarray, "samples half"]:
+        """Apply a Gaussian low-pass filter with the gain exp(-1/2) at a wavelength to modes."""
+        samples, factor = modes.shape[0], np.float32(wavelength_m)
+        along_y = scipy.fft.fftfreq(samples, self.spacing_m).astype(np.float32) * factor
+        along_x = scipy.fft.rfftfreq(samples, self.spacing_m).astype(np.float32) * factor
+        filtered = modes * np.exp(np.float32(-0.5) * along_x**2)
+        filtered *= np.exp(np.float32(-0.5) * along_y**2)[:, None]
+        return np.asarray(filtered)
 
     def _draw_modes(self, rng: Generator) -> Complex64[np.ndarray, "samples half"]:
         """Draw the Fourier modes of a field: white noise times the amplitude."""
@@ -207,11 +224,3 @@ def _compute_column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Flo
     # each mode of the half spectrum represents two conjugate modes, except in the first and last column
     power[1:-1] *= 2.0
     return np.asarray(power)
-
-
-def _compute_low_pass(samples: int, spacing_m: float, wavelength_m: float) -> Float32[np.ndarray, "samples half"]:
-    """Compute a Gaussian filter with the gain exp(-1/2) at a wavelength."""
-    along_y = scipy.fft.fftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
-    along_x = scipy.fft.rfftfreq(samples, spacing_m).astype(np.float32) * np.float32(wavelength_m)
-    exponent = np.float32(-0.5) * (along_y[:, None] ** 2 + along_x[None, :] ** 2)
-    return np.asarray(np.exp(exponent))

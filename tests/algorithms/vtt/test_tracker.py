@@ -38,7 +38,11 @@ from tests.algorithms.vtt.synthetic_drive import (
 
 @pytest.mark.parametrize(
     ("fraction", "make_body", "seeds"),
-    [(0.1, make_face, range(3)), (0.1, make_boulder, range(3)), (0.05, make_face, range(10, 11))],
+    [
+        (0.1, make_face, range(3)),
+        pytest.param(0.1, make_boulder, range(3), marks=pytest.mark.slow),
+        (0.05, make_face, range(10, 11)),
+    ],
 )
 def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_body: MakeBody, seeds: range) -> None:
     # Requirement without noise: 1 px rms, 2.5 px maximum. An error of one pixel at 10 m grows to 5 px at 2 m.

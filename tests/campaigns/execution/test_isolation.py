@@ -246,7 +246,7 @@ def read_and_change_state(sleep_s: float, item: int) -> object:
     return item, [part for part in process_state if not isinstance(part, dict)], sorted(set(process_state[1]))  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("sleep_s", [0.01, 0.0])
+@pytest.mark.parametrize("sleep_s", [0.01, pytest.param(0.0, marks=pytest.mark.slow)])
 def test_changed_process_state_is_restored_for_the_next_case(sleep_s: float) -> None:
     """The state is also restored between short cases (0 s), which run in one batch."""
     n_items = 2 * len(STATE_CHANGES)
