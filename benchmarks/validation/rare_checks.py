@@ -1,4 +1,6 @@
-"""Checks of subset simulation on limit states with known probabilities: coverage of intervals, and cost.
+"""Checks of subset simulation and importance sampling on limit states with known probabilities.
+
+The checks measure the coverage of the intervals, and the cost.
 
 A limit state returns the margin of a case, which is negative if the requirement is violated.
 """
@@ -6,13 +8,15 @@ A limit state returns the margin of a case, which is negative if the requirement
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from scipy.stats import norm
 
 from benchmarks.validation.records import Check, Measure
-from marsyard.campaigns.studies.interval import replicate_interval
+from marsyard.campaigns.studies.importance import fit_density
+from marsyard.campaigns.studies.interval import ProbabilityInterval, replicate_interval, weighted_interval
+from marsyard.campaigns.studies.rare import MIN_EFFECTIVE_VIOLATIONS, RareSettings
 from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
 
 #: Cases per level and replicates of `marsyard rare`, and confidence of its interval.
@@ -24,6 +28,8 @@ MIN_COVERAGE, MIN_SAVINGS = 0.87, {1e-4: 8.0, 1e-6: 300.0}
 LOWEST_LEVEL = 1e-9
 #: Probabilities of violation of the linear limit states.
 PROBABILITIES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
+#: Minimum number of studies with an interval of importance sampling whose coverage has a limit.
+MIN_STUDIES = 100
 #: Function of coordinates and stream numbers that returns margins.
 LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -79,6 +85,20 @@ def run_subset(margins: LimitState, dimension: int, seed: int, samples: int = SA
         return stop.value, cases
 
 
+def run_importance(
+    results: Sequence[SubsetResult], margins: LimitState, dimension: int, seed: int
+) -> ProbabilityInterval | None:
+    """Sample around the violations of subset simulations; None where `marsyard rare` does not use the interval."""
+    density = fit_density(np.concatenate([result.violations for result in results]))
+    if density is None:
+        return None
+    count = RareSettings.importance_cases
+    coordinates, weights = density.draw(count, np.random.default_rng((seed, dimension)))
+    violation_weights = weights * (margins(coordinates, 10**12 + seed * count + np.arange(count)) < 0.0)
+    effective = violation_weights.sum() ** 2 / max(float(np.sum(violation_weights**2)), 1e-300)
+    return weighted_interval(violation_weights.tolist(), CONFIDENCE) if effective >= MIN_EFFECTIVE_VIOLATIONS else None
+
+
 def limit_states() -> Iterator[tuple[str, LimitState, int, float]]:
     """Yield name, margins, dimension and probability of each limit state."""
     for dimension in (2, 20, 100):
@@ -99,6 +119,7 @@ def run_rare(quick: bool) -> Iterator[Measure]:
     trials = 40 if quick else 300
     for name, margins, dimension, probability in limit_states():
         covered_count, cases, widths = 0, 0, []
+        importance_intervals: list[ProbabilityInterval] = []
         for trial in range(trials):
             runs = [run_subset(margins, dimension, 1 + trial * REPLICATES + index) for index in range(REPLICATES)]
             results = [result for result, _ in runs]
@@ -107,6 +128,8 @@ def run_rare(quick: bool) -> Iterator[Measure]:
             interval = replicate_interval(estimates, is_reached, CONFIDENCE)
             covered_count += interval.lower <= probability <= interval.upper
             widths.append(math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf)
+            importance = run_importance(results, margins, dimension, 1 + trial)
+            importance_intervals += [importance] if importance else []
         how = f"{trials} studies, each of {REPLICATES} simulations with {SAMPLES} cases per level"
         yield Measure(
             f"rare violations, coverage of the 90 % interval: {name}",
@@ -116,6 +139,14 @@ def run_rare(quick: bool) -> Iterator[Measure]:
             how,
             "at least",
         )
+        n_importance = len(importance_intervals)
+        claim = f"rare violations, studies with an interval of importance sampling: {name}"
+        how = f"at least {MIN_EFFECTIVE_VIOLATIONS:.0f} effective violations of {RareSettings.importance_cases} cases"
+        yield Measure(claim, n_importance / trials, "", None, how)
+        if n_importance >= min(MIN_STUDIES, trials):
+            covered = sum(item.lower <= probability <= item.upper for item in importance_intervals)
+            claim = f"rare violations, coverage of the 90 % interval of importance sampling: {name}"
+            yield Measure(claim, covered / n_importance, "", MIN_COVERAGE, f"{n_importance} studies", "at least")
         if probability in MIN_SAVINGS:
             # n cases of crude Monte Carlo have the interval p exp(+-z sqrt((1 - p) / (n p)))
             z = float(norm.ppf(0.5 * (1.0 + CONFIDENCE)))

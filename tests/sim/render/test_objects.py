@@ -51,3 +51,18 @@ def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
     assert set(np.flatnonzero(is_facing & is_in_cone)) <= set(result)
     assert is_facing[result].all()
     assert (np.diff(result) > 0).all()
+
+
+def test_cone_with_apex_radius_selects_triangles_that_face_a_point_near_the_apex() -> None:
+    objects, radius_m = _make_bodies(), 3.0
+    eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 20.0])
+    first, second, third = objects.triangles.transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    # The point of the sphere that is most in front of a triangle.
+    is_facing = np.einsum("ij,ij->i", normals, eye + radius_m * normals - first) > 0.0
+    is_candidate = objects.body_of_triangle == 2
+    axis = np.array([0.0, 0.0, -1.0])
+    result, exact = objects.in_cone(eye, axis, 1e-2, radius_m), objects.in_cone(eye, axis, 1e-2)
+    np.testing.assert_array_equal(result[is_candidate[result]], np.flatnonzero(is_facing & is_candidate))
+    assert set(exact) < set(result)
