@@ -109,7 +109,7 @@ def rare_section(subject: Subject) -> Section | None:
         + (
             "The interval comes from the spread of the replicates."
             if study["method"] == "subset"
-            else "The interval comes from importance sampling around the violations of the replicates."
+            else "The interval contains those of importance sampling around the violations, and of the replicates."
         )
     )
     figure = svg_figure(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -73,6 +73,11 @@ def weighted_interval(contributions: Sequence[float], confidence: float) -> Prob
     relative_error = float(values.std(ddof=1)) / math.sqrt(values.size) / mean
     factor = math.exp(float(student_t.ppf(0.5 * (1.0 + confidence), values.size - 1)) * relative_error)
     return ProbabilityInterval(mean, mean / factor, min(mean * factor, 1.0), confidence, relative_error)
+
+
+def enclose(first: ProbabilityInterval, second: ProbabilityInterval) -> ProbabilityInterval:
+    """Return the first interval, extended so that it contains the second one."""
+    return replace(first, lower=min(first.lower, second.lower), upper=max(first.upper, second.upper))
 
 
 def decide(interval: ProbabilityInterval, max_probability: float) -> RareVerdict:
