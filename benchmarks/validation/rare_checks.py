@@ -15,7 +15,13 @@ from scipy.stats import norm
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.importance import fit_density
-from marsyard.campaigns.studies.interval import ProbabilityInterval, enclose, replicate_interval, weighted_interval
+from marsyard.campaigns.studies.interval import (
+    ProbabilityInterval,
+    effective_number,
+    enclose,
+    replicate_interval,
+    weighted_interval,
+)
 from marsyard.campaigns.studies.rare import MIN_EFFECTIVE_VIOLATIONS, RareSettings
 from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
 
@@ -94,9 +100,12 @@ def run_importance(
         return None
     count = RareSettings.importance_cases
     coordinates, weights = density.draw(count, np.random.default_rng((seed, dimension)))
-    violation_weights = weights * (margins(coordinates, 10**12 + seed * count + np.arange(count)) < 0.0)
-    effective = violation_weights.sum() ** 2 / max(float(np.sum(violation_weights**2)), 1e-300)
-    return weighted_interval(violation_weights.tolist(), CONFIDENCE) if effective >= MIN_EFFECTIVE_VIOLATIONS else None
+    # streams that no subset simulation uses
+    streams = 10**12 + seed * count + np.arange(count)
+    violation_weights = (weights * (margins(coordinates, streams) < 0.0)).tolist()
+    if effective_number(violation_weights) < MIN_EFFECTIVE_VIOLATIONS:
+        return None
+    return weighted_interval(violation_weights, CONFIDENCE)
 
 
 def limit_states() -> Iterator[tuple[str, LimitState, int, float]]:

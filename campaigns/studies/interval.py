@@ -75,6 +75,13 @@ def weighted_interval(contributions: Sequence[float], confidence: float) -> Prob
     return ProbabilityInterval(mean, mean / factor, min(mean * factor, 1.0), confidence, relative_error)
 
 
+def effective_number(weights: Sequence[float]) -> float:
+    """Compute the number of equally weighted cases that are equivalent to these weights (Kish 1965); 0 without any."""
+    values = np.array(weights, dtype=np.float64)
+    square_sum = float(np.sum(values**2))
+    return float(values.sum()) ** 2 / square_sum if square_sum > 0.0 else 0.0
+
+
 def enclose(first: ProbabilityInterval, second: ProbabilityInterval) -> ProbabilityInterval:
     """Return the first interval, extended so that it contains the second one."""
     return replace(first, lower=min(first.lower, second.lower), upper=max(first.upper, second.upper))

@@ -22,6 +22,7 @@ from marsyard.campaigns.studies.interval import (
     RareVerdict,
     additional_replicates,
     decide,
+    effective_number,
     enclose,
     replicate_interval,
     weighted_interval,
@@ -212,8 +213,7 @@ class _Study:
         subset_interval = replicate_interval(estimates, reached, confidence)
         interval, n_effective = subset_interval, math.nan
         if violation_weights:
-            squares = sum(value**2 for value in violation_weights)
-            n_effective = sum(violation_weights) ** 2 / squares if squares else 0.0
+            n_effective = effective_number(violation_weights)
             # alone, the interval of importance sampling covers the probability too rarely (docs/validation.md)
             interval = enclose(weighted_interval(violation_weights, settings.confidence), subset_interval)
             if n_effective < MIN_EFFECTIVE_VIOLATIONS:

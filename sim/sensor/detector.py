@@ -33,6 +33,7 @@ from marsyard.sim.sensor.optics import (
 #: Charge, electrons, from which `add_noise` draws both noises together.
 MIN_COMMON_E = 100.0
 CODES = 256  #: Number of 8-bit codes.
+MAX_EXPOSURE_S = 10.0  #: Longest allowed exposure time, seconds.
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]
 Counts = UInt16[np.ndarray, "rows columns"]
 #: Counts of an image after the summation of rows.
@@ -68,7 +69,7 @@ class DetectorParameters(Parameters):
     `marsyard.sim.sensor.optics`). The clearing time is assumed.
     """
 
-    exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="exposure time, s")] = 0.004
+    exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="exposure time, s")] = 0.004
     responsivity_e_s: Annotated[Positive, Field(description="electrons/s on axis at radiance factor 1")] = 1.019e7
     sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance of the sun for this responsivity, AU")] = 1.5
     rows_summed: Annotated[int, Field(ge=1, le=16, description="rows summed on the chip")] = 4
@@ -138,8 +139,8 @@ class AutoExposureParameters(Parameters):
     target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile / full scale")] = 0.75
     tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative deviation from the target")] = 0.05
     images: Annotated[int, Field(ge=1, le=20, description="maximum number of test images")] = 5
-    min_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="shortest exposure, s")] = 1e-4
-    max_exposure_s: Annotated[float, Field(gt=0.0, le=10.0, description="longest exposure, s")] = 1.0
+    min_exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="shortest exposure, s")] = 1e-4
+    max_exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="longest exposure, s")] = 1.0
 
     @model_validator(mode="after")
     def _check_limits(self) -> AutoExposureParameters:
@@ -198,11 +199,11 @@ class Detector:
     def with_exposure(self, exposure_s: float) -> Detector:
         """Return the same detector with another exposure time; the calibration is updated.
 
-        Raises ValueError if the exposure time is not positive.
+        Raises ValueError if the exposure time is not allowed.
         """
-        if not 0.0 < exposure_s <= 10.0:
-            raise ValueError(f"exposure_s is {exposure_s:g}; allowed: above 0, at most 10")
-        # without validation of the other parameters, which takes longer than the exposure of a small image
+        if not 0.0 < exposure_s <= MAX_EXPOSURE_S:
+            raise ValueError(f"exposure_s is {exposure_s:g}; allowed: above 0, at most {MAX_EXPOSURE_S:g}")
+        # the other parameters are valid; to validate all of them takes about 2 ms
         parameters = self.parameters.model_copy(update={"exposure_s": exposure_s})
         return replace(self, parameters=parameters, calibration=replace(self.calibration, exposure_s=exposure_s))
 

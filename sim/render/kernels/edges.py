@@ -223,8 +223,8 @@ def trace_subpixel_rays(
 
     Only triangles inside a beam around the pixel are tested. The ground is searched near the ranges of the neighbouring
     pixels, on their terrain levels, so that the ground is continuous. On smooth ground without objects, Newton's method
-    replaces this search. `rays` contains the same number of rays for each
-    pixel, in order; `primary` are the hits of all pixels; `hits` is the output.
+    replaces this search. `rays` contains the same number of rays for each pixel, in order; `primary` are the hits of
+    all pixels; `hits` is the output.
     """
     fields, ceilings, _top_level, spacing, extent = ground
     rays_per_pixel = rays.directions.shape[0] // max(pixels.size, 1)

@@ -135,10 +135,11 @@ class _GivenNormals:
 
 
 @pytest.mark.parametrize("mean_e", [MIN_COMMON_E, 300.0, 1e4])
-@pytest.mark.parametrize(("read_noise_e", "tolerance"), [(0.0, 6e-3), (5.0, 5e-5), (25.0, 5e-5)])
+@pytest.mark.parametrize(("read_noise_e", "tolerance"), [(0.0, 2.5e-3), (5.0, 5e-5), (25.0, 5e-5)])
 def test_common_noise_has_the_distribution_of_poisson_and_normal_noise(
     mean_e: float, read_noise_e: float, tolerance: float
 ) -> None:
+    """Tolerances: terms that the expansion omits, plus rounding of single precision (docstring of `add_noise`)."""
     normal = np.linspace(-4.0, 4.0, 161)
     mean = np.full((1, normal.size), mean_e, dtype=np.float32)
     charge = add_noise(mean, read_noise_e, True, cast(Any, _GivenNormals(normal))).ravel().astype(np.float64)
@@ -152,6 +153,7 @@ def test_common_noise_has_the_distribution_of_poisson_and_normal_noise(
 def test_few_electrons_have_poisson_noise() -> None:
     charge = add_noise(np.full((200, 500), 4.0, dtype=np.float32), 0.0, True, np.random.default_rng(3))
     observed = np.bincount(charge.astype(int).ravel(), minlength=16)[:16] / charge.size
+    # Four standard errors of a frequency of 0.2 in 100,000 numbers.
     np.testing.assert_allclose(observed, stats.poisson.pmf(np.arange(16), 4.0), atol=5e-3)
 
 
