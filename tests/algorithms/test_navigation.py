@@ -91,8 +91,17 @@ def test_goal_behind_requires_turn_or_reverse_drive() -> None:
     assert positions[-1] == pytest.approx([-3.0, 0.5], abs=0.02)
 
 
-@pytest.mark.parametrize("offset_m", [-0.3, 0.0, 0.4])
-@pytest.mark.parametrize("yaw_deg", [0.0, 135.0])
+@pytest.mark.parametrize(
+    ("yaw_deg", "offset_m"),
+    [
+        (0.0, 0.4),
+        (135.0, -0.3),
+        *(
+            pytest.param(*pair, marks=pytest.mark.slow)
+            for pair in ((0.0, -0.3), (0.0, 0.0), (135.0, 0.0), (135.0, 0.4))
+        ),
+    ],
+)
 def test_hazard_is_passed_with_clearance(offset_m: float, yaw_deg: float) -> None:
     rotation = Rotation.from_euler("Z", yaw_deg, degrees=True).as_matrix()[:2, :2]
     rock = rotation @ np.array([3.0, offset_m])

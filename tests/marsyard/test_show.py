@@ -244,7 +244,7 @@ def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple
 
 
 @given(text=st.binary(max_size=60) | st.text("[]{}=\"'.,abc123\n#\\", max_size=60).map(str.encode))
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_bytes_are_rejected_without_traceback(campaign: Path, text: bytes) -> None:
     campaign.write_bytes(text)
     result = marsyard("show", campaign)

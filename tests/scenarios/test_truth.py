@@ -36,6 +36,8 @@ from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.streams import Streams
 from tests.scenarios import spies
 
+#: The first case runs in the suite, the other ones in `make validate`.
+CASES = [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
 RECORDING_SCORE = {"scores": ["tests.scenarios.spies:record_case"]}
 
 Numbers = Float[np.ndarray, "..."]
@@ -85,7 +87,7 @@ def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]
     assert {entry.name for entry in fields(measurement_class)} == names
 
 
-@pytest.mark.parametrize("case", range(3))
+@pytest.mark.parametrize("case", CASES)
 def test_descent_inputs_differ_from_truth(case: int) -> None:
     from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
 
@@ -159,7 +161,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
 
 
 @pytest.mark.parametrize("helicopter", [None, {}])
-@pytest.mark.parametrize("case", range(3))
+@pytest.mark.parametrize("case", CASES)
 def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] | None) -> None:
     """Time tags are not compared: they are exact, because the pose errors include the clock error."""
     parameters = LandingScenarioParameters.model_validate(
@@ -190,7 +192,7 @@ def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] 
         assert_differs("distance of the a-priori site", np.linalg.norm(site - pose.translation), range_m)
 
 
-@pytest.mark.parametrize("case", range(2))
+@pytest.mark.parametrize("case", CASES)
 def test_rover_inputs_differ_from_truth(case: int) -> None:
     """The first stop is not compared: the estimated pose is defined as exact at the start."""
     from tests.scenarios.rover.short_run import SHORT_RUN

@@ -41,7 +41,7 @@ from tests.algorithms.vtt.synthetic_drive import (
     [
         (0.1, make_face, range(3)),
         pytest.param(0.1, make_boulder, range(3), marks=pytest.mark.slow),
-        (0.05, make_face, range(10, 11)),
+        pytest.param(0.05, make_face, range(10, 11), marks=pytest.mark.slow),
     ],
 )
 def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_body: MakeBody, seeds: range) -> None:

@@ -291,6 +291,7 @@ def crash_after_other_case(item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
     _worker_state.clear()
     results = run_items(crash_after_other_case, range(5))
