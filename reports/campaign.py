@@ -22,8 +22,9 @@ from marsyard.reports.budget import budget_section, budget_sentences, read_budge
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
-from marsyard.reports.presentation import presentations, showcase_views
+from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
 from marsyard.reports.rare import rare_section, read_result, result_sentences
+from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import read_search, search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
@@ -109,6 +110,8 @@ def page_context(
     metric, bound = subject.metric, subject.bound
     crash_text = f"{count(overall.crashed, 'case')} crashed. Fix the cause before you use the verdict."
     cautions = [crash_text] if overall.crashed else []
+    finder = CaseFinder(subject.run, verdicts)
+    showcases = showcase_views(run, finder.notable_cases(CASES_PER_GROUP))
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
@@ -126,7 +129,10 @@ def page_context(
         "outcome_figures": sections.outcome_figures(run.all_cases),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
-        "showcases": showcase_views(run),
+        "requirement_cases": finder.requirement_cases(),
+        "showcases": showcases,
+        "links": {case.case: f"#case-{case.case}" for case in showcases},
+        "summaries": {case.case: finder.summary(case.case) for case in showcases},
         "provenance": sections.list_provenance(run),
         "versions": sections.list_versions(run),
         "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
@@ -143,7 +149,10 @@ def page_context(
         return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
     context["explorer"], random_run = None, subject.run
     if np.isfinite(numbers(random_run.frame, metric)).any():
-        data, script = sections.explorer_data(random_run, metric, bound, cases_with_images), sections.read_script()
+        data, script = (
+            sections.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images),
+            sections.read_script(),
+        )
         content_hash = sections.script_hash(script)
         context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": content_hash}
     return context | {

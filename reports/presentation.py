@@ -9,6 +9,7 @@ Each system of `marsyard.scenarios.systems` defines the import path of its prese
 
 from __future__ import annotations
 
+import base64
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
@@ -73,6 +75,14 @@ class CaseKind:
 
 
 @dataclass(frozen=True)
+class Cause:
+    """Cause of a violation: a short name, by which violations are grouped, and a text with the case's numbers."""
+
+    name: str
+    detail: str
+
+
+@dataclass(frozen=True)
 class Presentation:
     """Report sections and case figures of a system.
 
@@ -80,12 +90,14 @@ class Presentation:
     - sections: functions that create sections after the sections common to all campaigns
     - first: functions that create sections before the common sections
     - outcomes: enumerations of outcomes; each value describes its outcome
+    - explain: return the cause of a row's violation of a requirement with this metric; None if it is unknown
     """
 
     cases: Sequence[CaseKind] = ()
     sections: Sequence[SectionMaker] = ()
     first: Sequence[SectionMaker] = ()
     outcomes: Sequence[type[Enum]] = ()
+    explain: Callable[[Mapping[str, Any], str], Cause | None] | None = None
 
 
 @cache
@@ -131,6 +143,37 @@ def find_case_kind(products: Products) -> CaseKind | None:
     return next((kind for kind in kinds if kind.is_case(products)), None)
 
 
+#: Size of thumbnails, pixels, and their JPEG quality.
+_THUMBNAIL_PX, _THUMBNAIL_QUALITY = 96, 70
+#: Minimum size of an image, pixels. An image that is wider by a larger ratio than this has summed rows.
+_MIN_IMAGE_PX, _MAX_ASPECT = 48, 2.0
+
+
+def thumbnail(products: Products) -> str:
+    """Return a square preview of a case's last image as a data URI; empty if the products contain no image.
+
+    An image is a product at the top level with integer values and two dimensions.
+    """
+    images = [value for value in products.values() if isinstance(value, np.ndarray) and _is_image(value)]
+    if not images:
+        return ""
+    image = images[-1].astype(np.float32)
+    rows, columns = image.shape
+    if columns < _MAX_ASPECT * rows and rows < _MAX_ASPECT * columns:
+        size = min(rows, columns)
+        top, left = (rows - size) // 2, (columns - size) // 2
+        image = image[top : top + size, left : left + size]
+    low, high = np.percentile(image, (1.0, 99.0))
+    small = cv2.resize(image, (_THUMBNAIL_PX, _THUMBNAIL_PX), interpolation=cv2.INTER_AREA)
+    grey = np.clip((small - low) * (255.0 / max(high - low, 1.0)), 0.0, 255.0).astype(np.uint8)
+    _, jpeg = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _THUMBNAIL_QUALITY])
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg.tobytes()).decode()}"
+
+
+def _is_image(value: np.ndarray) -> bool:
+    return value.ndim == 2 and np.issubdtype(value.dtype, np.integer) and min(value.shape) >= _MIN_IMAGE_PX
+
+
 def save_figures(directory: Path, figures: Mapping[str, Figure], dpi: int = 110) -> list[Path]:
     """Write figures as PNG on white; returns their paths."""
     paths = [directory / f"{name}.png" for name in figures]
@@ -147,6 +190,11 @@ def numeric_product(value: object) -> Float[np.ndarray, "..."] | None:
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         return None
+
+
+def to_float(value: object) -> float:
+    """Convert a number to float; NaN for other values."""
+    return float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
 
 
 def to_matrix(value: object) -> Float[np.ndarray, "_ _"] | None:
@@ -177,6 +225,8 @@ def read_arrays(
 
 #: Number of selected cases of each group (largest errors, no answer, random); a case has half a megabyte of images.
 CASES_PER_GROUP = 2
+#: Maximum number of violations that the gallery shows.
+MAX_SHOWN_VIOLATIONS = 6
 #: Fixed seeds of the random selection, for reproducible reports.
 _GALLERY_SEED, _NOTABLE_SEED = 20260301, 20260302
 
@@ -191,24 +241,29 @@ class ShowcaseView:
     legend: str
 
 
-def showcase_views(run: StoredRun) -> list[ShowcaseView]:
+def showcase_views(run: StoredRun, violations: Sequence[int] = ()) -> list[ShowcaseView]:
     """Create the views of the gallery's cases; cases that no system can draw are omitted."""
-    return [view for case in gallery_cases(run) if (view := showcase_view(run, case)) is not None]
+    return [view for case in gallery_cases(run, violations) if (view := showcase_view(run, case)) is not None]
 
 
-def gallery_cases(run: StoredRun) -> list[int]:
-    """List the cases of the gallery: the case selected for the report, largest errors, no answer, and random cases.
+def gallery_cases(run: StoredRun, violations: Sequence[int] = ()) -> list[int]:
+    """List the cases of the gallery: violations, the case selected for the report, and cases of three groups.
 
-    All of them have stored products. Without a metric, the first cases with products are listed.
+    The groups are the largest errors, no answer, and random cases. All listed cases have stored products. Without a
+    metric, the first cases with products are listed. `violations` are those that the page lists by requirement.
     """
+    shown_violations = [case for case in violations if case in run.showcases][:MAX_SHOWN_VIOLATIONS]
     stored_cases = list(run.showcases)
     metric = primary_metric(run.frame, run.requirements)
     if len(stored_cases) <= 1 or metric is None or "case" not in run.all_cases:
-        return stored_cases[: 3 * CASES_PER_GROUP]
+        return list(dict.fromkeys([*shown_violations, *stored_cases[: 3 * CASES_PER_GROUP]]))
+    if len(shown_violations) == MAX_SHOWN_VIOLATIONS:
+        return list(dict.fromkeys([*shown_violations, *stored_cases[:1]]))
     by_error, without_error = _sort_by_error(run.all_cases[run.all_cases["case"].isin(stored_cases)], metric)
     unanswered = [case for case in stored_cases if case in without_error]
     random_order = np.random.default_rng(_GALLERY_SEED).permutation(stored_cases)
-    return _select_cases(stored_cases[:1], by_error, unanswered, random_order.tolist())
+    first = list(dict.fromkeys([*shown_violations, *stored_cases[:1]]))
+    return _select_cases(first, by_error, unanswered, random_order.tolist())
 
 
 def notable_cases(run: StoredRun) -> list[int]:

@@ -246,6 +246,11 @@ def category_column(frame: pd.DataFrame) -> str | None:
     return next((name for name in names if 2 <= frame[name].nunique() <= _MAX_CATEGORIES), None)
 
 
+def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
+    """Whether a column contains numbers of more than one value."""
+    return _is_number(frame, column) and frame[column].nunique() > 1
+
+
 def _to_words(name: str) -> str:
     return name.replace("_", " ").replace(".", " ")
 

@@ -112,14 +112,14 @@ class Retain(Parameters):
 
     showcase: Literal["worst", "first", "none"] = "worst"
     products: Literal["none", "failed", "worst", "every", "all"] = Field(
-        default="none",
+        default="failed",
         description="cases in addition to the showcase: none, those that fail a requirement, the `worst` by the metric "
         "of the first requirement with a bound, every `every`-th case, or all",
     )
     worst: _Count = 10
     every: _Count = 100
     budget_gb: Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)] = Field(
-        default=10.0, description="maximum disk space of the stored products; further products are not stored"
+        default=1.0, description="maximum disk space of the stored products; further products are not stored"
     )
 
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 
 import numpy as np
 
@@ -54,7 +54,11 @@ def pack_products(products: Mapping[str, Any]) -> PackedProducts:
     arrays: dict[str, np.ndarray] = {}
     text = json.dumps(_move_arrays(products, "products", arrays), indent=2) + "\n"
     file = io.BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **arrays)
+    # images with noise hardly compress: the fastest level needs half of the time, and 1 % more space
+    with ZipFile(file, "w", ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
     return PackedProducts(text.encode(), file.getvalue())
 
 

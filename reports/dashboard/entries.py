@@ -273,7 +273,7 @@ class RequirementRow:
 
 
 def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequirement]) -> list[RequirementRow]:
-    """Create a row for each requirement of `shared`, then for each further requirement of the campaigns."""
+    """Create a row for each requirement of `shared` and of the campaigns, the most severe verdict first."""
     cells: dict[str, list[Cell]] = {name: [] for name in shared}
     for entry in entries:
         for verdict in entry.requirements:
@@ -301,7 +301,17 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
                 studies.setdefault(entry.title, entry)
         line = sparkline(history[::-1])
         rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, line, [*studies.values()]))
-    return rows
+    return sorted(rows, key=_severity)
+
+
+#: Order of the requirements by their latest verdict.
+_SEVERITY = ("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS")
+
+
+def _severity(row: RequirementRow) -> int:
+    """Return the rank of a row by its latest verdict: failed requirements first, those without a campaign last."""
+    status = "" if row.latest is None else row.latest.verdict.status
+    return _SEVERITY.index(status) if status in _SEVERITY else len(_SEVERITY)
 
 
 def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
@@ -328,7 +338,7 @@ def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
 def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Count the requirements per latest verdict; requirements without a campaign come last."""
     statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
-    ordered = dict.fromkeys(("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS", *statuses))
+    ordered = dict.fromkeys((*_SEVERITY, *statuses))
     present_statuses = [status for status in ordered if status in statuses]
     counts = [(status, statuses.count(status)) for status in present_statuses]
     n_missing = sum(row.latest is None for row in rows)

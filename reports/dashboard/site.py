@@ -18,9 +18,11 @@ from marsyard.campaigns.definition.requirements import SharedRequirement, shippe
 from marsyard.reports.campaign import PAGE_FILE, REPORT_JSON, VERIFICATION_FILE, page_environment, write_atomic
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
-from marsyard.reports.presentation import showcase_view
+from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.presentation import ShowcaseView, showcase_view
+from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sections import embed_json, replay_command, script_hash
-from marsyard.reports.stored import read_run
+from marsyard.reports.stored import StoredRun
 from marsyard.reports.traceability import algorithm_cells, verification_csv
 from marsyard.reports.wording import percent
 
@@ -93,29 +95,41 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
         except OSError:
             shutil.copyfile(report, partial_path)
         partial_path.replace(folder / PAGE_FILE)
-    cases = _write_cases(folder, entry)
-    write_atomic(page, _render("dashboard_campaign.html.j2", entry=entry, cases=cases, **_FORMATTERS))
+    evaluation = evaluate_run(entry.directory)
+    finder = CaseFinder(evaluation.run, evaluation.verdicts)
+    cases = _write_cases(folder, entry, evaluation.run, finder)
+    links = {int(case["case"]): case["file"] for case in cases}
+    lists = finder.requirement_cases()
+    text = _render("dashboard_campaign.html.j2", entry=entry, cases=cases, lists=lists, links=links, **_FORMATTERS)
+    write_atomic(page, text)
 
 
-def _write_cases(folder: Path, entry: Entry) -> list[dict[str, str]]:
-    """Write a page for each stored case and return the links to these pages."""
-    if not entry.showcases:
-        return []
-    run, links = read_run(entry.directory), []
-    # largest errors first
-    cases = sorted(entry.showcases, key=lambda case: _rank_among_worst(entry, case))
-    for case in cases[:_MAX_CASES]:
-        showcase = showcase_view(run, case)
-        if showcase is None:
-            continue
+def _write_cases(folder: Path, entry: Entry, run: StoredRun, finder: CaseFinder) -> list[dict[str, str]]:
+    """Write a page for each stored case and return the links to these pages: violations, then the largest errors."""
+    notable = finder.notable_cases(_MAX_CASES)
+    order = {case: rank for rank, case in enumerate(notable)}
+    cases = sorted(entry.showcases, key=lambda case: (order.get(case, len(order)), _rank_among_worst(entry, case)))[
+        :_MAX_CASES
+    ]
+    views: dict[int, ShowcaseView] = {case: view for case in cases if (view := showcase_view(run, case)) is not None}
+    files, links = {case: f"case-{case}.html" for case in views}, []
+    for case, showcase in views.items():
         row = run.all_cases[run.all_cases["case"] == case] if "case" in run.all_cases else run.all_cases[:0]
         values = {str(name): str(value) for name, value in row.iloc[0].items()} if len(row) else {}
         command = replay_command(run, str(case))
-        page = _render("dashboard_case.html.j2", entry=entry, showcase=showcase, values=values, command=command)
-        write_atomic(folder / f"case-{case}.html", page)
+        page = _render(
+            "dashboard_case.html.j2",
+            entry=entry,
+            showcase=showcase,
+            values=values,
+            command=command,
+            summary=finder.summary(case),
+            links=files,
+        )
+        write_atomic(folder / files[case], page)
         index = _rank_among_worst(entry, case)
         rank = "" if index == len(entry.worst) else ("the largest error" if index == 0 else "among the largest errors")
-        links.append({"case": str(case), "outcome": showcase.outcome, "file": f"case-{case}.html", "rank": rank})
+        links.append({"case": str(case), "outcome": showcase.outcome, "file": files[case], "rank": rank})
     return links
 
 

@@ -20,14 +20,16 @@ from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section,
 from marsyard.reports.presentation import (
     CaseKind,
     CaseView,
+    Cause,
     Presentation,
     TableRow,
     check_shape,
     numeric_product,
+    to_float,
     to_matrix,
 )
 from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, svg_figure
-from marsyard.reports.wording import NOTHING, label, note_text, number
+from marsyard.reports.wording import NOTHING, label, note_text, number, percent
 
 #: Columns of the tracks that the table shows in other columns, or not at all because they are too wide.
 _HIDDEN_COLUMNS = ("pair", "template", "valid", "ground_east_m", "ground_north_m")
@@ -219,7 +221,34 @@ STREAM_CASE = CaseKind(
 )
 # every view has its own legend
 DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, legend="")
+
+
+def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
+    """Compare a velocity error with the errors that attitude and altitude cause alone.
+
+    An attitude error a makes v tan(a) of the descent rate v appear as horizontal velocity; a relative altitude error
+    scales the horizontal velocity.
+    """
+    error_m_s = abs(to_float(row.get(metric)))
+    if "velocity_error" not in metric or math.isnan(error_m_s):
+        return None
+    attitude_deg, rate_m_s = (to_float(row.get(name)) for name in ("attitude_error_common_deg", "descent_rate_m_s"))
+    altitude, speed_m_s = (to_float(row.get(name)) for name in ("altitude_error_common", "horizontal_speed_m_s"))
+    by_attitude_m_s = abs(rate_m_s * math.tan(math.radians(attitude_deg)))
+    by_altitude_m_s = abs(altitude * speed_m_s)
+    if by_attitude_m_s >= 0.5 * error_m_s:
+        text = f"the attitude error of {number(attitude_deg)} deg causes up to {number(by_attitude_m_s)} m/s"
+        return Cause("attitude error", text)
+    if by_altitude_m_s >= 0.5 * error_m_s:
+        text = f"the altitude error of {percent(abs(altitude))} causes up to {number(by_altitude_m_s)} m/s"
+        return Cause("altitude error", text)
+    return Cause("images", "attitude and altitude errors explain less than half of it")
+
+
 DIMES = Presentation(
-    cases=(STREAM_CASE, DIMES_CASE), sections=(FIRING, LANDING, sensitivity_section), outcomes=(VelocityOutcome,)
+    cases=(STREAM_CASE, DIMES_CASE),
+    sections=(FIRING, LANDING, sensitivity_section),
+    outcomes=(VelocityOutcome,),
+    explain=explain,
 )
-FIELD_TEST = Presentation(first=(field_test_section,))
+FIELD_TEST = Presentation(first=(field_test_section,), explain=explain)

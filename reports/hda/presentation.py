@@ -5,6 +5,7 @@ The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +23,7 @@ from marsyard.reports.hda.case_figures import (
 )
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
 from marsyard.reports.hda.paper_tables import TOUCHDOWN, run_times_section
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
+from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, to_float
 from marsyard.reports.section import draw_images, svg_figure
 from marsyard.reports.section_kinds import CustomBlocks, RateTable, SectionDeclaration
 from marsyard.reports.wording import note_text, number
@@ -112,6 +113,25 @@ def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]
     return ["Stage", "Result"], [TableRow([name, text or "not reached"], bool(text)) for name, text in results.items()]
 
 
+def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
+    """Return the cause of an unsafe site or touchdown, or the number of tracks of a flight without a map."""
+    place = metric.removesuffix("_safe")
+    if place in ("site", "touchdown"):
+        slope_deg, roughness_m = (to_float(row.get(f"{place}_{name}")) for name in ("slope_deg", "roughness_m"))
+        if math.isnan(slope_deg + roughness_m):
+            return None
+        ratios = slope_deg / to_float(row.get("max_slope_deg")), roughness_m / to_float(row.get("max_roughness_m"))
+        detail = f"ground with a slope of {number(slope_deg)} deg and a roughness of {number(roughness_m)} m"
+        if place == "touchdown" and not math.isnan(distance_m := to_float(row.get("touchdown_error_m"))):
+            detail += f", {number(distance_m)} m from the site"
+        return Cause("slope" if ratios[0] > ratios[1] else "roughness", detail)
+    if metric in ("converged", "site_reported") and not row.get("converged"):
+        return Cause(
+            "few tracks", f"{to_float(row.get('tracks')):.0f} of {to_float(row.get('features')):.0f} features tracked"
+        )
+    return None
+
+
 SITES = SectionDeclaration(
     "sites",
     "Sites",
@@ -135,4 +155,5 @@ HDA = Presentation(
     cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, _LEGEND),),
     sections=(*_SECTIONS, run_times_section),
     outcomes=(SiteOutcome,),
+    explain=explain,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from marsyard.algorithms.localisation.interface import PositionOutcome
 from marsyard.reports.localisation import case_figures as figures
 from marsyard.reports.localisation.consistency import create_consistency_blocks
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, save_figures
+from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, save_figures, to_float
 from marsyard.reports.section import svg_figure
 from marsyard.reports.section_kinds import (
     CustomBlocks,
@@ -133,9 +134,24 @@ CONDITIONS = SectionDeclaration(
         ),
     ),
 )
+#: Number of inliers of an image below which landmarks are named as the cause.
+_MIN_INLIERS = 15
+
+
+def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
+    """Return whether a wrong or missing position has few landmarks, with the difference of the suns."""
+    if "position_error" not in metric and metric != "fixed_in_time":
+        return None
+    inliers, suns_deg = to_float(row.get("inliers_median")), to_float(row.get("sun_difference_deg"))
+    name = "few landmarks" if not inliers >= _MIN_INLIERS else "biased landmarks"
+    text = "no landmarks matched" if math.isnan(inliers) else f"{inliers:.0f} landmarks per image (median)"
+    return Cause(name, f"{text}, suns of map and image differ by {number(suns_deg)} deg")
+
+
 LOCALISATION = Presentation(
     cases=(CaseKind(figures.is_localisation_case, view, write_figures, _LEGEND),),
     first=(POSITION,),
     sections=(CONDITIONS,),
     outcomes=(PositionOutcome,),
+    explain=explain,
 )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.algorithms.vtt.accuracy import HandOffOutcome
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow
+from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, to_float
 from marsyard.reports.section import svg_figure
 from marsyard.reports.vtt import sections
 from marsyard.reports.vtt.case_figures import (
@@ -19,7 +19,7 @@ from marsyard.reports.vtt.case_figures import (
     write_vtt_figures,
 )
 from marsyard.reports.vtt.goal import GOAL
-from marsyard.reports.wording import NOTHING, label
+from marsyard.reports.wording import NOTHING, label, number, percent
 from marsyard.scenarios.rover.stops import RunOutcome
 
 #: Maximum number of stops with images on the page.
@@ -89,8 +89,35 @@ def _format(name: str, value: float) -> str:
     return f"{scale * value:z.{digits}f}".replace("-", "−") if math.isfinite(value) else NOTHING
 
 
+#: Obliquity of a face, degrees, and slip, above which they are named as the cause of a loss.
+_MAX_OBLIQUITY_DEG, _MAX_SLIP = 60.0, 0.5
+
+
+def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
+    """Return the larger component of a position error, or the probable cause of a lost or false track."""
+    if metric == "position_error_m":
+        range_m, cross_m = (abs(to_float(row.get(f"{name}_error_m"))) for name in ("range", "cross"))
+        if math.isnan(range_m + cross_m):
+            return None
+        errors = f"{1e3 * range_m:.0f} mm along and {1e3 * cross_m:.0f} mm across the line of sight"
+        detail = f"{errors}, drift {number(to_float(row.get('drift_px')))} px"
+        return Cause("range" if range_m > cross_m else "direction", detail)
+    if metric not in ("answered", "tracked", "no_false_track", "handed_over"):
+        return None
+    obliquity_deg, slip = to_float(row.get("obliquity_max_deg")), to_float(row.get("slip_max"))
+    causes = {
+        "shadow of the mast": bool(row.get("rover_shadow_on_target")),
+        "slip": slip > _MAX_SLIP,
+        "oblique face": obliquity_deg > _MAX_OBLIQUITY_DEG,
+    }
+    name = next((name for name, applies in causes.items() if applies), "not identified")
+    detail = f"losses: {row.get('losses')}, face seen at up to {number(obliquity_deg)} deg, slip up to {percent(slip)}"
+    return Cause(name, detail if name == "not identified" else f"{name}: {detail}")
+
+
 VTT = Presentation(
     cases=(CaseKind(is_vtt_case, view, write_vtt_figures, _LEGEND),),
     first=(*sections.SECTIONS, GOAL),
     outcomes=(RunOutcome, HandOffOutcome),
+    explain=explain,
 )

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pandas as pd
 import pytest
 from axe_playwright_python.sync_playwright import Axe  # type: ignore[import-untyped]
 from playwright.sync_api import Page
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
+from tests.reports.hda import synthetic_landing
+from tests.reports.localisation import synthetic_localisation
+from tests.reports.vtt import tracking_rows
 
 pytestmark = pytest.mark.slow
 
@@ -97,7 +102,7 @@ def test_case_is_shown_on_hover_and_opened_by_click(campaigns: Path, open_page: 
 
 def test_case_is_opened_by_keyboard(campaigns: Path, open_page: OpenPage) -> None:
     page, _ = open_page(_report_path(campaigns))
-    page.locator("#explorer input").focus()
+    page.locator("#explorer input[type=number]").focus()
     page.keyboard.type("3")
     page.keyboard.press("Enter")
     assert page.locator(".explorer-detail h3").inner_text().startswith("Case 3:")
@@ -106,7 +111,7 @@ def test_case_is_opened_by_keyboard(campaigns: Path, open_page: OpenPage) -> Non
     page.keyboard.press("Enter")
     assert page.url.endswith("#case-3")
     assert page.locator("#case-3").is_visible()
-    page.locator("#explorer input").fill("999999")
+    page.locator("#explorer input[type=number]").fill("999999")
     page.keyboard.press("Enter")
     assert "No such case" in page.locator(".explorer-detail").inner_text()
 
@@ -114,12 +119,13 @@ def test_case_is_opened_by_keyboard(campaigns: Path, open_page: OpenPage) -> Non
 @pytest.mark.slow
 def test_axes_of_the_explorer_are_selectable(campaigns: Path, open_page: OpenPage) -> None:
     page, log = open_page(_report_path(campaigns))
-    axis_select = page.locator("#explorer select").first
+    axis_select = page.locator(".explorer-canvas select").first
     axis_labels = axis_select.locator("option").all_inner_texts()
+    plot = page.locator(".explorer-plot").first
     for label in axis_labels:
         axis_select.select_option(label=label)
-        assert page.locator(".explorer-plot .point").count() > 250
-        assert label in (page.locator(".explorer-plot").text_content() or "")
+        assert plot.locator(".point").count() > 250
+        assert label in (plot.text_content() or "")
     assert log.messages == []
 
 
@@ -169,6 +175,80 @@ def test_filter_is_consistent_after_browser_back(campaigns: Path, open_page: Ope
     # a browser may restore the filter or clear it
     assert (selected_site, n_rows) in {("meridiani", 1), ("", 3)}
     assert log.messages == []
+
+
+@pytest.mark.parametrize("system", ["descent", "landing", "rover", "localisation"])
+def test_one_click_leads_from_the_report_to_the_images_of_a_violation(
+    system: str, tmp_path: Path, open_page: OpenPage
+) -> None:
+    frame, products, metric = _make_case_with_images(system)
+    requirement = {"id": "R", "metric": metric, "probability": 0.9, "confidence": 0.9, "population": "all"}
+    frame[metric] = frame["case"] != 3
+    directory = _load_synthetic_runs().write_run(tmp_path, frame, [requirement], products=products)
+    shutil.copytree(directory / "cases" / "3", directory / "cases" / "5")
+    page, log = open_page(write_report(directory))
+    # with several cases, their images are folded
+    assert not page.locator("#case-3 svg").first.is_visible()
+    thumbnail = page.locator("#violations img")
+    assert thumbnail.evaluate("image => image.naturalWidth") == 96
+    page.locator("#violations").get_by_role("link", name="Case 3").click()
+    assert page.locator("#case-3 svg").first.is_visible()
+    assert "violated" in page.locator("#case-3").inner_text()
+    assert log.messages == []
+
+
+def _make_case_with_images(system: str) -> tuple[pd.DataFrame, dict[str, Any], str]:
+    """Return rows of a system, products of case 3, and the metric of a requirement."""
+    if system == "descent":
+        runs = _load_synthetic_runs()
+        return runs.synthetic_frame(24), runs.synthetic_products(), "answered"
+    if system == "landing":
+        return synthetic_landing.landing_frame(24), synthetic_landing.synthetic_products(), "site_safe"
+    if system == "rover":
+        return tracking_rows.make_rows(24), tracking_rows.make_products(), "tracked"
+    products = synthetic_localisation.synthetic_products()
+    return synthetic_localisation.localisation_frame(24), products, "fixed_in_time"
+
+
+def test_brushed_cases_are_marked_in_both_plots(campaigns: Path, open_page: OpenPage) -> None:
+    page, log = open_page(_report_path(campaigns))
+    first, second = (page.locator(".explorer-plot").nth(index) for index in (0, 1))
+    first.scroll_into_view_if_needed()
+    box = first.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.2 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.45 * box["width"], box["y"] + 0.6 * box["height"], steps=4)
+    page.mouse.up()
+    text = page.locator(".explorer-selection").inner_text()
+    n_selected = int(text.split()[0])
+    assert 0 < n_selected < 250
+    for plot in (first, second):
+        assert plot.locator(".point:not(.faded)").count() <= n_selected
+        assert plot.locator(".point.faded").count() > 20
+    page.get_by_role("button", name="Clear the selection").click()
+    assert page.locator(".point.faded").count() == 0
+    assert log.messages == []
+
+
+def test_points_are_filtered_by_outcome_and_marked_by_requirement(campaigns: Path, open_page: OpenPage) -> None:
+    page, log = open_page(_report_path(campaigns))
+    points = page.locator(".explorer-plot").nth(1).locator(".point")
+    n_all = points.count()
+    page.locator("select[name=outcome]").select_option(label="NO_VALID_TRACK")
+    assert 0 < points.count() < n_all
+    page.locator("select[name=outcome]").select_option(label="all")
+    assert points.count() == n_all
+    assert page.locator("select[name=colour] option").all_inner_texts() == ["DIMES-VEL"]
+    assert log.messages == []
+
+
+def test_short_campaign_has_a_short_page(campaigns: Path, open_page: OpenPage) -> None:
+    page, _ = open_page(campaigns / "run-2" / "report.html")
+    assert page.evaluate("document.documentElement.scrollHeight") <= 6000
+    navigation = page.locator("nav > ul").bounding_box()
+    assert navigation is not None
+    assert navigation["height"] < 60
 
 
 def test_two_clicks_lead_to_images_of_the_worst_case(campaigns: Path, open_page: OpenPage) -> None:

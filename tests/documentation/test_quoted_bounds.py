@@ -6,8 +6,6 @@ import json
 import re
 from pathlib import Path
 
-import pytest
-
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.statistics.proportions import (
     minimum_sample_size,
@@ -25,42 +23,31 @@ def read_page(page: str) -> str:
     return " ".join((DOCS / page).read_text(encoding="utf-8").split())
 
 
-def find_cells(page: str, row_start: str) -> list[str]:
-    """Return the cells of the table row that starts with the text `row_start`."""
-    (row,) = [
-        line for line in (DOCS / page).read_text(encoding="utf-8").splitlines() if line.startswith(f"| {row_start}")
-    ]
-    return [cell.strip() for cell in row.strip("|").split("|")]
-
-
-def parse_counts(cell: str) -> tuple[int, int]:
-    """Return (k, n) of the first `k of n` in a cell; a single number n gives (n, n)."""
-    match = re.search(r"(?:([\d,]+) of )?([\d,]+)", cell)
-    assert match is not None
-    total = int(match[2].replace(",", ""))
-    return (total if match[1] is None else int(match[1].replace(",", "")), total)
-
-
 def parse_percent(text: str) -> float:
     match = re.search(r"([\d.]+) %", text)
     assert match is not None
     return float(match[1])
 
 
-@pytest.mark.parametrize("column", [1, 2, 3])
-def test_quoted_bounds_on_wrong_velocities_are_correct(column: int) -> None:
-    wrong, answers = parse_counts(find_cells("dimes.md", "wrong answers (error above 5 m/s)")[column])
-    bound_cell = find_cells("dimes.md", "upper 90 % confidence bound of the rate of wrong answers")[column]
-    assert parse_percent(bound_cell) == round(100.0 * proportion_upper(wrong, answers, 0.9), 2)
+def test_quoted_bounds_on_wrong_velocities_are_correct() -> None:
+    lines = (DOCS / "dimes.md").read_text(encoding="utf-8").splitlines()
+    tables = [
+        index for index, line in enumerate(lines) if line.startswith("| valid answers, of these errors above 5 m/s")
+    ]
+    assert len(tables) == 2
+    for index in tables:
+        counts, bounds = (re.split(r"\s*\|\s*", line.strip("| "))[1:] for line in lines[index : index + 2])
+        assert len(counts) == len(bounds) == 4
+        for cell, bound in zip(counts, bounds, strict=True):
+            answers, wrong = map(int, re.findall(r"\d+", cell)[:2])
+            assert parse_percent(bound) == round(100.0 * proportion_upper(wrong, answers, 0.9), 2)
 
 
-def test_quoted_intervals_of_wrong_answers_are_correct() -> None:
-    """The page gives 1 of 5 and 3 of 10 wrong answers; so few answers cannot show a rate of one in 300."""
+def test_quoted_interval_of_wrong_answers_is_correct() -> None:
+    """The page gives two of 6 wrong answers; so few answers cannot show a rate of one in 300."""
     page = read_page("dimes.md")
-    for (wrong, answers), interval_text in (((1, 5), "0.5 to 71.6 %"), ((3, 10), "6.7 to 65.2 %")):
-        low, high = proportion_interval(wrong, answers, 0.95)
-        assert interval_text == f"{100.0 * low:.1f} to {100.0 * high:.1f} %"
-        assert interval_text in page
+    low, high = proportion_interval(2, 6, 0.95)
+    assert f"two of 6 answers are wrong (95 % confidence interval {100.0 * low:.1f} to {100.0 * high:.1f} %)" in page
     assert "one in 300" not in page
 
 

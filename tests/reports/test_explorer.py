@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports.presentation import gallery_cases, notable_cases
-from marsyard.reports.sections import MAX_POINTS, choose_points, embed_json, explorer_data
+from marsyard.reports.sections import MAX_POINTS, ExploredRequirement, choose_points, embed_json, explorer_data
 from marsyard.reports.stored import read_run
 
 Rows = Callable[..., pd.DataFrame]
@@ -26,18 +26,28 @@ def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> N
     assert int(np.nanargmax(frame[METRIC])) in points
     assert {11_997, 11_998, 11_999} <= set(points.tolist())
     assert frame.iloc[points]["outcome"].nunique() == frame["outcome"].nunique()
+    # violations are kept, also if they are neither large nor among the first cases
+    is_violation = np.arange(len(frame)) == 9_000
+    assert 9_000 in choose_points(frame, METRIC, is_violation)
+    assert 9_000 not in points
     assert choose_points(frame.head(50), METRIC).tolist() == list(range(50))
 
 
 def test_explorer_data_contain_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
     frame = make_rows(30, n_crashed=1)
     run = read_run(make_run(frame))
-    data = explorer_data(run, METRIC, 5.0, ["3"])
-    assert [data["labels"][index] for index in data["axes"]] == [
+    status = np.where(np.arange(30) == 4, 1, 0)
+    requirement = ExploredRequirement("DIMES-VEL", METRIC, 5.0, status)
+    data = explorer_data(run, METRIC, [requirement], ["3"])
+    assert [data["labels"][index] for index in data["axes"][0]] == [
         "east velocity error (m/s)",
         "north velocity error (m/s)",
     ]
     assert (data["cases"], data["with_images"], data["shown"], data["all"]) == (list(range(30)), [3], 30, 30)
+    # every column of varying numbers is explored
+    assert {"sun elevation (deg)", "off nadir max (deg)", "wall time (s)"} & set(data["labels"])
+    (explored,) = data["requirements"]
+    assert (explored["column"], explored["bound"], explored["status"]) == (data["metric"], 5.0, status.tolist())
     assert data["outcomes"][data["outcome"][29]] == "CRASHED"
     assert data["columns"][data["metric"]][29] is None
     first_error = frame[METRIC].iloc[0]

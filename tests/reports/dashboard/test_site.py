@@ -193,3 +193,18 @@ def test_margin_is_printed_in_percentage_points() -> None:
 def test_index_without_campaigns_is_written(tmp_path: Path) -> None:
     assert all(row.latest is None for row in requirement_rows([], shipped_requirements()))
     assert "0 stored campaigns" in _write_index(tmp_path)
+
+
+def test_failed_requirements_precede_others(
+    make_rows: Rows, make_run: MakeRun, tmp_path: Path, velocity: dict[str, Any]
+) -> None:
+    requirements = [
+        {**velocity, "id": "MET", "probability": 0.5},
+        {**velocity, "id": "UNDECIDED", "probability": 0.9999},
+        {**velocity, "id": "FAILED", "bound": 0.5},
+    ]
+    make_run(make_rows(300, terrains=100_000), requirements)
+    entries, _ = read_entries(find_campaigns([tmp_path]))
+    rows = requirement_rows(entries, shipped_requirements())
+    assert [row.requirement for row in rows[:3]] == ["FAILED", "UNDECIDED", "MET"]
+    assert all(row.latest is None for row in rows[3:])

@@ -1,0 +1,352 @@
+"""Cases of each requirement: the violations first, then the cases nearest to the limit, each with its cause.
+
+The margin of a case is that of `marsyard.campaigns.definition.margins`: negative for a violation, infinite outside the
+population. A driver is a condition that may affect the metric.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int
+
+from marsyard.campaigns.errors import ENGINE_FAILURES
+from marsyard.reports import rates
+from marsyard.reports.presentation import Cause, system_presentation, thumbnail, to_float
+from marsyard.reports.section import Grid, build_grid
+from marsyard.reports.sections import ExploredRequirement
+from marsyard.reports.stored import StoredRun
+from marsyard.reports.verdicts import Verdict
+from marsyard.reports.wording import NOTHING, count, driver_columns, label, number, numbers, percent, split_unit
+
+#: Maximum number of violations, and of the cases nearest to the limit, that are listed for a requirement.
+MAX_VIOLATIONS, MAX_NEAREST = 9, 3
+#: Maximum number of drivers of a case, and of similar violations.
+MAX_DRIVERS, MAX_SIMILAR = 12, 3
+#: A driver is unusual outside the central fraction of 95 % of the campaign's values.
+_USUAL = 0.95
+#: Minimum number of cases for percentiles.
+_MIN_CASES = 20
+
+
+@dataclass(frozen=True)
+class ListedCase:
+    """A case in the list of a requirement.
+
+    - sentence: error, cause and unusual conditions in words
+    - thumbnail: data URI of an image; empty without stored products
+    """
+
+    case: int
+    violates: bool
+    outcome: str
+    sentence: str
+    thumbnail: str
+
+
+@dataclass(frozen=True)
+class RequirementCases:
+    """Violations of a requirement (at most `MAX_VIOLATIONS`), the cases nearest to its limit, and groups by cause.
+
+    `same_as` is an earlier requirement with the same list of cases, which the page does not repeat; may be empty.
+    """
+
+    requirement_id: str
+    n_violations: int
+    violations: Sequence[ListedCase]
+    nearest: Sequence[ListedCase]
+    groups: Grid
+    same_as: str = ""
+
+    @property
+    def title(self) -> str:
+        """Number of violations in words."""
+        text = count(self.n_violations, "violation") if self.n_violations else "no violation"
+        return f"{text}, the same cases as {self.same_as}" if self.same_as else text
+
+
+@dataclass(frozen=True)
+class CaseStatus:
+    """Result of a case for one requirement: `word` is met, violated or not counted; `margin` may be empty."""
+
+    requirement_id: str
+    word: str
+    margin: str
+
+
+@dataclass(frozen=True)
+class CaseDriver:
+    """Value of a condition in a case, and the percentile of this value in the campaign (NaN if unknown)."""
+
+    name: str
+    value: str
+    percentile: float
+
+    @property
+    def percentile_text(self) -> str:
+        """The percentile, rounded to whole numbers."""
+        return NOTHING if math.isnan(self.percentile) else f"{100.0 * self.percentile:.0f}"
+
+
+@dataclass(frozen=True)
+class CaseSummary:
+    """Summary of a case: results by requirement, conditions, previous and next violation, and similar violations."""
+
+    statuses: Sequence[CaseStatus]
+    drivers: Sequence[CaseDriver]
+    previous: int | None
+    following: int | None
+    similar: Sequence[int]
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """A verdict with the margin of each case; the margin has a meaning beyond its sign if it is `graded`."""
+
+    verdict: Verdict
+    margins: Float[np.ndarray, " n"]
+    graded: bool
+
+    @property
+    def violations(self) -> Int[np.ndarray, " v"]:
+        """Rows of the violations, the smallest margin first."""
+        rows = np.flatnonzero(self.margins < 0.0)
+        return rows[np.argsort(self.margins[rows], kind="stable")]
+
+
+class CaseFinder:
+    """Finds the cases of the requirements of a campaign, and summarises single cases."""
+
+    def __init__(self, run: StoredRun, verdicts: Sequence[Verdict]) -> None:
+        self._run = run
+        self._frame = run.all_cases
+        presentation = system_presentation(str(run.recorded("scenario") or ""))
+        self._explain = None if presentation is None else presentation.explain
+        margin_columns = {str(entry.get("id")): entry.get("margin") for entry in run.requirements}
+        self._evaluated = [
+            _Evaluated(verdict, margins, graded=math.isfinite(verdict.bound) or bool(margin_columns[name]))
+            for verdict in verdicts
+            if (name := verdict.requirement_id) in margin_columns
+            and (margins := compute_margins(self._frame, verdict, margin_columns[name])) is not None
+        ]
+        metric = next((item.verdict.metric for item in self._evaluated if math.isfinite(item.verdict.bound)), "")
+        self._drivers = driver_columns(run.frame, metric, MAX_DRIVERS) if "case" in self._frame else []
+        is_violation = np.zeros(len(self._frame), dtype=np.bool_)
+        for item in self._evaluated:
+            is_violation |= item.margins < 0.0
+        #: Numbers of the cases that violate any requirement, in increasing order.
+        self.violating_cases: list[int] = self._frame.loc[is_violation, "case"].tolist() if is_violation.any() else []
+
+    def requirement_cases(self) -> list[RequirementCases]:
+        """List the cases of each requirement."""
+        if "case" not in self._frame:
+            return []
+        lists, first_names = [], dict[object, str]()
+        for item in self._evaluated:
+            entry = self._list_cases(item)
+            cases = [(listed.case, listed.violates) for listed in (*entry.violations, *entry.nearest)]
+            key = entry.n_violations, item.verdict.metric, tuple(cases)
+            same_as = first_names.setdefault(key, entry.requirement_id)
+            lists.append(entry if same_as == entry.requirement_id else replace(entry, same_as=same_as))
+        return lists
+
+    def explored_requirements(self) -> list[ExploredRequirement]:
+        """Return the status of all cases by requirement, for the explorer."""
+        return [
+            ExploredRequirement(
+                item.verdict.requirement_id,
+                item.verdict.metric,
+                item.verdict.bound / item.verdict.scale,
+                np.where(item.margins < 0.0, 1, np.where(np.isposinf(item.margins), 2, 0)),
+            )
+            for item in self._evaluated
+        ]
+
+    def notable_cases(self, max_per_requirement: int) -> list[int]:
+        """Return the worst violations of each requirement, without repetition."""
+        rows = [row for item in self._evaluated for row in item.violations[:max_per_requirement]]
+        return list(dict.fromkeys(int(self._frame["case"].iloc[row]) for row in rows))
+
+    def summary(self, case: int) -> CaseSummary | None:
+        """Summarise a case; None without a row of it."""
+        rows = np.flatnonzero(self._frame["case"] == case) if "case" in self._frame else np.zeros(0, dtype=np.int64)
+        if not rows.size:
+            return None
+        row = int(rows[0])
+        statuses = [
+            CaseStatus(item.verdict.requirement_id, *_describe_margin(item, float(item.margins[row])))
+            for item in self._evaluated
+        ]
+        earlier = [other for other in self.violating_cases if other < case]
+        later = [other for other in self.violating_cases if other > case]
+        previous, following = (earlier[-1] if earlier else None), (later[0] if later else None)
+        return CaseSummary(statuses, self._case_drivers(row), previous, following, self._similar_violations(row))
+
+    def _list_cases(self, item: _Evaluated) -> RequirementCases:
+        violations = item.violations
+        met = np.flatnonzero((item.margins >= 0.0) & np.isfinite(item.margins)) if item.graded else np.zeros(0, int)
+        nearest = met[np.argsort(item.margins[met], kind="stable")][:MAX_NEAREST]
+        listed, near = (
+            [self._listed_case(item, int(row)) for row in rows] for rows in (violations[:MAX_VIOLATIONS], nearest)
+        )
+        return RequirementCases(
+            item.verdict.requirement_id, int(violations.size), listed, near, self._group_causes(item, violations)
+        )
+
+    def _listed_case(self, item: _Evaluated, row: int) -> ListedCase:
+        values = self._row(row)
+        case, violates = int(values["case"]), bool(item.margins[row] < 0.0)
+        cause = self._find_cause(item, values)
+        unusual = self._unusual_driver(row)
+        parts = [self._describe_error(item, values, violates), "" if cause is None else cause.detail, unusual]
+        sentence = "; ".join(part for part in parts if part)
+        image = thumbnail(self._run.products(case)) if case in self._run.showcases else ""
+        return ListedCase(
+            case, violates, str(values.get("outcome", NOTHING)), f"{sentence[:1].upper()}{sentence[1:]}.", image
+        )
+
+    def _row(self, row: int) -> dict[str, Any]:
+        return {str(name): value for name, value in self._frame.iloc[row].items()}
+
+    def _find_cause(self, item: _Evaluated, values: Mapping[str, Any]) -> Cause | None:
+        if self._explain is None or values.get("outcome") in ENGINE_FAILURES:
+            return None
+        return self._explain(values, item.verdict.metric)
+
+    def _describe_error(self, item: _Evaluated, values: Mapping[str, Any], violates: bool) -> str:
+        """Describe the metric of a case relative to its limit, or why it has none."""
+        verdict, outcome = item.verdict, str(values.get("outcome", ""))
+        if outcome in ENGINE_FAILURES:
+            return (
+                f"{outcome}: {str(values.get('error') or '').splitlines()[0] if values.get('error') else 'no message'}"
+            )
+        if math.isnan(verdict.bound):
+            return f"{label(verdict.metric)}: {'no' if violates else 'yes'}"
+        columns = verdict.metric.split(" + ")
+        unit = split_unit(columns[-1])[1]
+        value = verdict.scale * sum(to_float(values.get(column)) for column in columns)
+        words = label(verdict.metric) if len(columns) > 1 else label(verdict.metric).removesuffix(f" ({unit})")
+        if math.isnan(value):
+            return f"no value of {words}"
+        return f"{words} {number(abs(value))} {unit}, limit {verdict.bound:g} {unit}".replace(" ,", ",").rstrip()
+
+    def _percentile(self, column: str, row: int) -> float:
+        values = numbers(self._run.frame, column)
+        finite = values[np.isfinite(values)]
+        value = float(numbers(self._frame.iloc[[row]], column)[0])
+        if finite.size < _MIN_CASES or math.isnan(value):
+            return math.nan
+        # mid-rank, so that a frequent value is not extreme
+        return float(((finite < value).sum() + 0.5 * (finite == value).sum()) / finite.size)
+
+    def _unusual_driver(self, row: int) -> str:
+        """Name the driver with the most unusual value of a case; empty if no value is unusual."""
+        percentiles = [(self._percentile(column, row), column) for column in self._drivers]
+        known = [
+            (abs(percentile - 0.5), percentile, column)
+            for percentile, column in percentiles
+            if percentile == percentile
+        ]
+        if not known or 2.0 * max(known)[0] < _USUAL:
+            return ""
+        _, percentile, column = max(known)
+        unit = split_unit(column)[1]
+        value = number(float(numbers(self._frame.iloc[[row]], column)[0]))
+        fraction, word = (percentile, "lower") if percentile < 0.5 else (1.0 - percentile, "higher")
+        name = label(column).removesuffix(f" ({unit})")
+        return f"{name} is {value} {unit}".rstrip() + f" ({word} in {percent(fraction)} of the cases)"
+
+    def _case_drivers(self, row: int) -> list[CaseDriver]:
+        drivers = []
+        for column in self._drivers:
+            value = float(numbers(self._frame.iloc[[row]], column)[0])
+            if not math.isnan(value):
+                drivers.append(CaseDriver(label(column), number(value), self._percentile(column, row)))
+        return sorted(drivers, key=lambda driver: -abs(np.nan_to_num(driver.percentile - 0.5)))
+
+    def _similar_violations(self, row: int) -> list[int]:
+        """Find the violations nearest to a case in the ranks of its drivers."""
+        if len(self.violating_cases) < 2 or not self._drivers:
+            return []
+        ranks = np.stack([_ranks(numbers(self._frame, column)) for column in self._drivers], axis=1)
+        is_violation = np.isin(self._frame["case"].to_numpy(), self.violating_cases)
+        is_violation[row] = False
+        rows = np.flatnonzero(is_violation)
+        distances = np.nansum((ranks[rows] - ranks[row]) ** 2, axis=1)
+        return self._frame["case"].iloc[rows[np.argsort(distances, kind="stable")][:MAX_SIMILAR]].tolist()
+
+    def _group_causes(self, item: _Evaluated, violations: Int[np.ndarray, " v"]) -> Grid:
+        """Count violations by outcome and cause, the largest group first, with the number of an example."""
+        counts: Counter[tuple[str, str]] = Counter()
+        examples: dict[tuple[str, str], int] = {}
+        for row in violations[:_MAX_GROUPED]:
+            values = self._row(int(row))
+            cause = self._find_cause(item, values)
+            group = str(values.get("outcome", NOTHING)), NOTHING if cause is None else cause.name
+            counts[group] += 1
+            examples.setdefault(group, int(values["case"]))
+        return build_grid(
+            counts.most_common(),
+            {
+                "Outcome": lambda entry: entry[0][0],
+                "Cause": lambda entry: entry[0][1],
+                "Violations": lambda entry: f"{entry[1]:,}",
+                "Example": lambda entry: f"case {examples[entry[0]]}",
+            },
+        )
+
+
+#: Maximum number of violations that are grouped by cause.
+_MAX_GROUPED = 5000
+
+
+def compute_margins(
+    frame: pd.DataFrame, verdict: Verdict, margin_column: str | None = None
+) -> Float[np.ndarray, " n"] | None:
+    """Compute the margin of each row; None if the rows lack a column of the requirement.
+
+    The result equals `marsyard.campaigns.definition.margins.compute_margin` of each row.
+    """
+    columns = verdict.metric.split(" + ") if math.isfinite(verdict.bound) else [verdict.metric]
+    if any(column not in frame for column in columns):
+        return None
+    is_met = rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale)
+    if math.isfinite(verdict.bound):
+        values = np.sum([numbers(frame, column) for column in columns], axis=0)
+        margins = verdict.bound - np.abs(verdict.scale * values)
+    else:
+        graded = numbers(frame, margin_column) if margin_column else np.full(len(frame), np.nan)
+        limited = np.where(is_met, np.maximum(graded, 0.0), np.minimum(graded, -1e-12))
+        margins = np.where(np.isnan(graded), np.where(is_met, 1.0, -1.0), limited)
+    try:
+        is_member, is_unknown = _population_masks(frame, verdict.population)
+    except ValueError:
+        return None
+    margins = np.where(np.isnan(margins) | is_unknown, -np.inf, margins)
+    return np.where(rates.engine_failed(frame), -np.inf, np.where(is_member, margins, np.inf))
+
+
+def _population_masks(frame: pd.DataFrame, population: str) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Return the masks of a population and of its cases with a missing flag, regardless of unfinished cases."""
+    return rates.population_and_unknown_masks(
+        frame, [name for name in population.split(" and ") if name != "completed"]
+    )
+
+
+def _describe_margin(item: _Evaluated, margin: float) -> tuple[str, str]:
+    """Return the word for a margin, and the margin with its unit (empty if it is not graded or infinite)."""
+    word = "not counted" if margin == math.inf else "violated" if margin < 0.0 else "met"
+    if not item.graded or math.isinf(margin):
+        return word, ""
+    unit = split_unit(item.verdict.metric.split(" + ")[-1])[1] if math.isfinite(item.verdict.bound) else ""
+    return word, f"{number(margin)} {unit}".rstrip()
+
+
+def _ranks(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    return np.asarray(pd.Series(values).rank(pct=True).to_numpy(dtype=np.float64))

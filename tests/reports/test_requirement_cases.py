@@ -1,0 +1,214 @@
+"""Tests of the lists of violations by requirement, of their causes, and of the summaries of cases."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import pytest
+
+from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.reports.dimes.presentation import DIMES
+from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.hda.presentation import HDA
+from marsyard.reports.localisation.presentation import LOCALISATION
+from marsyard.reports.presentation import Cause, Presentation, gallery_cases, thumbnail
+from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder, compute_margins
+from marsyard.reports.verdicts import evaluate_requirements
+from marsyard.reports.vtt.presentation import VTT
+
+Rows = Callable[..., pd.DataFrame]
+MakeRun = Callable[..., Path]
+ATTITUDE = {
+    "velocity_error_m_s": 5.2,
+    "attitude_error_common_deg": 0.1,
+    "altitude_error_common": 0.0,
+    "descent_rate_m_s": 75.0,
+    "horizontal_speed_m_s": 20.0,
+}
+LIMITS = {"max_slope_deg": 15.0, "max_roughness_m": 0.2}
+TOUCHDOWN = {"touchdown_slope_deg": 6.0, "touchdown_roughness_m": 0.3, "touchdown_error_m": 1.0}
+AVAILABLE: Mapping[str, Any] = {"id": "A", "metric": "answered", "probability": 0.5, "confidence": 0.5}
+
+
+def _make_finder(make_run: MakeRun, frame: pd.DataFrame, *requirements: Mapping[str, Any]) -> CaseFinder:
+    evaluation = evaluate_run(make_run(frame, requirements))
+    return CaseFinder(evaluation.run, evaluation.verdicts)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"metric": "error_m", "bound": 1.5, "population": "valid"},
+        {"metric": "error_m", "bound": 1.5, "scale": 2.0},
+        {"metric": "error_m + other_m", "bound": 1.0, "population": "valid and flag"},
+        {"metric": "flag", "margin": "margin"},
+        {"metric": "flag", "population": "completed and answered"},
+        {"metric": "answered"},
+    ],
+)
+def test_margins_equal_those_of_the_engine(changes: Mapping[str, Any]) -> None:
+    rng = np.random.default_rng(3)
+    n = 200
+    frame = pd.DataFrame(
+        {
+            "case": np.arange(n),
+            "outcome": rng.choice(["VALID", "REFUSED", "CRASHED", "TIMED_OUT"], n),
+            "answered": rng.random(n) < 0.7,
+            "error_m": np.where(rng.random(n) < 0.2, np.nan, rng.normal(0.0, 1.5, n)),
+            "other_m": rng.normal(0.0, 1.0, n),
+            "flag": pd.Series([(True, False, None)[index] for index in rng.integers(0, 3, n)], dtype=object),
+            "margin": np.where(rng.random(n) < 0.2, np.nan, rng.normal(0.0, 1.0, n)),
+        }
+    )
+    requirement = {"id": "R", "probability": 0.9, "confidence": 0.9, **changes}
+    (verdict,) = evaluate_requirements(frame, [requirement])
+    margins = compute_margins(frame, verdict, changes.get("margin"))
+    assert margins is not None
+    rows: list[Any] = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    expected = [compute_margin(row, Requirement.model_validate(requirement)) for row in rows]
+    np.testing.assert_allclose(margins, expected, atol=1e-11)
+    assert min(expected) < 0.0 < max(expected)
+
+
+def test_violations_are_listed_by_margin_with_the_nearest_cases(
+    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
+) -> None:
+    frame = make_rows(60, error_scale=4.0, n_crashed=1)
+    (entry,) = _make_finder(make_run, frame, velocity).requirement_cases()
+    errors = frame["velocity_error_m_s"]
+    violations = errors[errors > 5.0].sort_values(ascending=False)
+    # the crashed case has no margin and precedes all others
+    assert entry.n_violations == len(violations) + 1
+    assert [listed.case for listed in entry.violations] == [59, *violations.index][:MAX_VIOLATIONS]
+    nearest = errors[errors <= 5.0].sort_values(ascending=False).index[:MAX_NEAREST]
+    assert [listed.case for listed in entry.nearest] == nearest.tolist()
+    assert "the context is lost" in entry.violations[0].sentence
+    worst = entry.violations[1]
+    assert "limit 5 m/s" in worst.sentence
+    assert worst.sentence.startswith("Velocity error ")
+    assert not entry.nearest[0].violates
+
+
+def test_equal_lists_are_not_repeated(make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]) -> None:
+    stricter = {**velocity, "id": "STRICT", "probability": 0.999}
+    first, second, third = _make_finder(
+        make_run, make_rows(60, error_scale=4.0), velocity, stricter, AVAILABLE
+    ).requirement_cases()
+    assert (first.same_as, second.same_as, third.same_as) == ("", "DIMES-VEL", "")
+    assert second.title.endswith("the same cases as DIMES-VEL")
+
+
+def test_violations_are_grouped_by_outcome_and_cause(make_rows: Rows, make_run: MakeRun) -> None:
+    frame = make_rows(80, answer_rate=0.5)
+    (entry,) = _make_finder(make_run, frame, AVAILABLE).requirement_cases()
+    counts = frame.loc[~frame["answered"], "outcome"].value_counts()
+    assert {row[0]: int(row[2]) for row in entry.groups.rows} == counts.to_dict()
+    assert [int(row[2]) for row in entry.groups.rows] == sorted(counts, reverse=True)
+
+
+def test_summary_has_results_percentiles_and_neighbours(
+    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
+) -> None:
+    frame = make_rows(60, error_scale=4.0)
+    frame.loc[30, "off_nadir_max_deg"] = 50.0
+    frame.loc[30, "outcome"] = "VALID"
+    frame.loc[30, "answered"] = True
+    frame.loc[30, "velocity_error_m_s"] = 7.5
+    finder = _make_finder(make_run, frame, velocity, AVAILABLE)
+    summary = finder.summary(30)
+    assert summary is not None
+    assert [(status.requirement_id, status.word) for status in summary.statuses] == [
+        ("DIMES-VEL", "violated"),
+        ("A", "met"),
+    ]
+    assert summary.statuses[0].margin == "−2.500 m/s"
+    driver = summary.drivers[0]
+    assert driver.value == "50.00"
+    assert driver.percentile == pytest.approx(59.5 / 60)
+    cases = finder.violating_cases
+    position = cases.index(30)
+    assert (summary.previous, summary.following) == (cases[position - 1], cases[position + 1])
+    assert 30 not in summary.similar
+    assert set(summary.similar) <= set(cases)
+    assert finder.summary(1000) is None
+
+
+def test_similar_violations_have_the_nearest_conditions(
+    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
+) -> None:
+    frame = make_rows(60)
+    frame["velocity_error_m_s"] = 1.0
+    frame["answered"] = True
+    drivers = ["sun_elevation_deg", "horizontal_speed_m_s", "altitude_1_m", "off_nadir_max_deg"]
+    for case, value in ((10, 1.0), (20, 1.001), (40, 1e3)):
+        for driver in drivers:
+            frame.loc[case, driver] = value
+        frame.loc[case, "velocity_error_m_s"] = 9.0
+    summary = _make_finder(make_run, frame, velocity).summary(10)
+    assert summary is not None
+    assert list(summary.similar) == [20, 40]
+
+
+def test_violations_precede_other_cases_of_the_gallery(
+    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
+) -> None:
+    evaluation = evaluate_run(make_run(make_rows(60, error_scale=4.0), [velocity]))
+    run = replace(evaluation.run, showcases=tuple(range(60)))
+    violations = CaseFinder(run, evaluation.verdicts).notable_cases(2)
+    assert len(violations) == 2
+    assert gallery_cases(run, violations)[:2] == violations
+
+
+def test_thumbnail_shows_the_last_image() -> None:
+    image = np.zeros((100, 200), dtype=np.uint16)
+    image[:, 100:] = 4000
+    data = thumbnail({"image_1": image[:, ::-1], "image_2": image, "map": np.zeros((90, 90)), "text": "a"})
+    head, encoded = data.split(",")
+    assert head == "data:image/jpeg;base64"
+    grey = cv2.imdecode(np.frombuffer(base64.b64decode(encoded), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert grey is not None
+    assert grey[:, :40].mean() < 20.0
+    assert grey[:, 60:].mean() > 235.0
+    assert thumbnail({"heights": np.zeros((100, 100))}) == ""
+
+
+@pytest.mark.parametrize(
+    ("presentation", "row", "metric", "name"),
+    [
+        (DIMES, {**ATTITUDE, "attitude_error_common_deg": 4.0}, "velocity_error_m_s", "attitude error"),
+        (DIMES, {**ATTITUDE, "altitude_error_common": 0.2}, "velocity_error_m_s", "altitude error"),
+        (DIMES, {"velocity_error_m_s": 5.2}, "velocity_error_m_s", "images"),
+        (DIMES, {"velocity_error_m_s": math.nan}, "velocity_error_m_s", None),
+        (DIMES, {}, "answered", None),
+        (HDA, {**LIMITS, "site_slope_deg": 16.0, "site_roughness_m": 0.1}, "site_safe", "slope"),
+        (HDA, {**LIMITS, **TOUCHDOWN}, "touchdown_safe", "roughness"),
+        (HDA, {"site_slope_deg": math.nan}, "site_safe", None),
+        (HDA, {"converged": False, "tracks": 3, "features": 80}, "converged", "few tracks"),
+        (HDA, {"converged": True}, "site_reported", None),
+        (VTT, {"range_error_m": -0.04, "cross_error_m": 0.01, "drift_px": 1.0}, "position_error_m", "range"),
+        (VTT, {"range_error_m": 0.01, "cross_error_m": -0.04, "drift_px": 1.0}, "position_error_m", "direction"),
+        (VTT, {"rover_shadow_on_target": True, "obliquity_max_deg": 70.0}, "answered", "shadow of the mast"),
+        (VTT, {"obliquity_max_deg": 70.0, "slip_max": 0.1}, "no_false_track", "oblique face"),
+        (VTT, {"obliquity_max_deg": 40.0, "slip_max": 0.1}, "answered", "not identified"),
+        (VTT, {}, "handed", None),
+        (LOCALISATION, {"inliers_median": 5.0, "sun_difference_deg": 50.0}, "position_error_m", "few landmarks"),
+        (LOCALISATION, {"inliers_median": 80.0, "sun_difference_deg": 50.0}, "position_error_m", "biased landmarks"),
+        (LOCALISATION, {}, "image_time_max_s", None),
+    ],
+)
+def test_causes_follow_from_the_rows(
+    presentation: Presentation, row: Mapping[str, Any], metric: str, name: str | None
+) -> None:
+    assert presentation.explain is not None
+    cause = presentation.explain(row, metric)
+    assert (None if cause is None else cause.name) == name
+    assert cause is None or (isinstance(cause, Cause) and cause.detail)
