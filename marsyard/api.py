@@ -4,12 +4,15 @@ Example (more in docs/examples/)::
 
     import marsyard
 
+    result = marsyard.run("dimes-smoke", algorithm=MyEstimator(), compare=["dimes"])
+    result.verdicts                                 # one row per requirement, a pandas data frame
+    result.cases                                    # one row per case
+    result.failures("DIMES-VEL")                    # the violations, the worst first
+    result.case(3).replay().figures()               # run a case again and draw its figures
+
     campaign = marsyard.load_campaign("dimes-smoke", {"terrain.samples": 1024})
     marsyard.draw(campaign, 3)                      # the randomly drawn parameter values of case 3
     marsyard.run_case(campaign, 3).row              # run the case in this process
-    folder = marsyard.run_campaign(campaign, "runs/mine", jobs=2)
-    marsyard.results(folder)                        # one row per case, a pandas data frame
-    marsyard.verdicts(folder)                       # the verdicts on the requirements
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
 
     from marsyard.cli.images import RenderedImage
     from marsyard.reports.verdicts import Verdict
+    from marsyard.result import Result
 
 
 def catalogue() -> list[str]:
@@ -62,6 +66,93 @@ def load_campaign(
     """
     overrides = [f"{path}={_format_toml(value)}" for path, value in (changes or {}).items()]
     return loading.load_campaign(str(name_or_path), overrides, cases, seed, algorithms)
+
+
+def create_campaign(
+    name: str,
+    scenario: str,
+    *,
+    cases: int,
+    seed: int = 1,
+    parameters: Mapping[str, Any] | None = None,
+    dispersions: Mapping[str, Mapping[str, Any]] | None = None,
+    requirements: Sequence[str | Mapping[str, Any]] = (),
+    **tables: Any,
+) -> Campaign:
+    """Create and validate a campaign without a file. Raises `marsyard.campaigns.errors.CampaignError`.
+
+    - name, scenario: name of the campaign; name of a scenario (`descent`) or ``module:Class``
+    - cases, seed: number of cases and root seed
+    - parameters: nested tables of the scenario's parameters, as in a campaign file
+    - dispersions: distributions by dotted parameter path: ``{"sun.elevation_deg": {"distribution": "uniform", ...}}``
+    - requirements: ids of included requirements (`DIMES-VEL`), or tables as in a campaign file
+    - tables: further keys of a campaign file, such as `description`, `retain` and `limits`
+    """
+    entries = [{"id": entry} if isinstance(entry, str) else dict(entry) for entry in requirements]
+    values = {"name": name, "scenario": scenario, "cases": cases, "seed": seed, **tables}
+    values |= {"parameters": dict(parameters or {}), "dispersions": dict(dispersions or {}), "requirements": entries}
+    return loading.create_campaign(values, f"campaign '{name}'")
+
+
+def run(
+    campaign: Campaign | str | Path,
+    algorithm: Any = None,
+    *,
+    compare: Sequence[Any] = (),
+    cases: int | None = None,
+    seed: int | None = None,
+    changes: Mapping[str, Any] | None = None,
+    jobs: int = 1,
+    directory: str | Path | None = None,
+) -> Result:
+    """Run a campaign with an algorithm, and return its results. Raises `marsyard.campaigns.errors.CampaignError`.
+
+    - campaign: a name of `catalogue`, the path of a TOML file, or a campaign
+    - algorithm, compare: algorithm under test, and algorithms that run on the same cases. A name; a class, or a
+      function without parameters, that returns an algorithm; a function of the measurements that returns the estimate;
+      or an algorithm itself, of which each case receives a copy. None for the algorithm of the campaign
+    - cases, seed, changes: as in `load_campaign`; only for a campaign that is given by name or path
+    - jobs: number of worker processes
+    - directory: new folder of the results; `runs/NAME-TIME` if None
+    """
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.cli.campaign import default_directory
+    from marsyard.result import open_result
+
+    if isinstance(campaign, Campaign):
+        if cases is not None or seed is not None or changes:
+            raise CampaignError("cases, seed and changes are for a campaign that is given by its name or file")
+        name = campaign.configuration.name
+    else:
+        name = loading.load_campaign(str(campaign)).configuration.name
+    folder = default_directory(name) if directory is None else Path(directory)
+    specs = _name_algorithms([*([] if algorithm is None else [algorithm]), *compare], folder / "algorithms")
+    if compare and algorithm is None:
+        raise CampaignError("compare needs an algorithm under test: the argument 'algorithm'")
+    if isinstance(campaign, Campaign):
+        selected = loading.replace_algorithms(campaign, specs)
+    else:
+        selected = load_campaign(campaign, changes, cases=cases, seed=seed, algorithms=specs)
+    run_campaign(selected, folder, jobs=jobs)
+    return open_result(folder)
+
+
+def open_result(directory: str | Path) -> Result:
+    """Open the results of a stored campaign. Raises CampaignError if the folder contains no campaign."""
+    from marsyard.result import open_result as open_stored
+
+    return open_stored(directory)
+
+
+def _name_algorithms(algorithms: Sequence[Any], folder: Path) -> list[str]:
+    """Return the specifications of algorithms; objects are stored in `folder`. Raises CampaignError."""
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.scenarios.objects import name_object
+
+    try:
+        return [name_object(algorithm, folder) for algorithm in algorithms]
+    except ValueError as error:
+        raise CampaignError(str(error)) from error
 
 
 def draw(campaign: Campaign, case: int) -> dict[str, Any]:

@@ -156,6 +156,16 @@ class CaseFinder:
             lists.append(entry if same_as == entry.requirement_id else replace(entry, same_as=same_as))
         return lists
 
+    @property
+    def requirement_ids(self) -> list[str]:
+        """Requirements that can be evaluated on the rows."""
+        return [item.verdict.requirement_id for item in self._evaluated]
+
+    def violations(self, requirement_id: str) -> list[int]:
+        """Return the numbers of the cases that violate a requirement, the smallest margin first."""
+        rows = [item.violations for item in self._evaluated if item.verdict.requirement_id == requirement_id]
+        return [] if not rows else self._frame["case"].iloc[rows[0]].tolist()
+
     def explored_requirements(self) -> list[ExploredRequirement]:
         """Return the status of all cases by requirement, for the explorer."""
         return [

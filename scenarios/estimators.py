@@ -4,6 +4,7 @@ An algorithm is specified by
 
 - the name of an algorithm of Marsyard (`dimes`), or of an entry point in the group `marsyard.algorithms`;
 - ``module:Class`` or ``module:function``, called without arguments; the module may be in the current folder;
+- ``FILE.pkl:Name``: a stored Python object (`marsyard.scenarios.objects`);
 - ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/custom-algorithms.md);
   ``exec-stream:`` or ``serve-stream:``: a program that receives images one by one;
 - ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline`).

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from marsyard.scenarios.objects import SUFFIX, load_object
+
 #: Former top-level names of the subpackages of `marsyard`.
 _FORMER_PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
 
@@ -28,14 +30,16 @@ def current_module(module: str) -> str:
 
 
 def import_object(path: str) -> Any:
-    """Import the object at ``module:name``. Raises ImportError with the reason.
+    """Import the object at ``module:name``, or a stored object. Raises ImportError with the reason.
 
     The current folder is searched last: a file in it never shadows an installed package.
     """
-    module, _, name = path.partition(":")
+    module, _, name = path.rpartition(":")
     current_folder = str(Path.cwd())
     if current_folder not in sys.path:
         sys.path.append(current_folder)
+    if module.endswith(SUFFIX):
+        return load_object(module)
     try:
         return getattr(importlib.import_module(current_module(module)), name)
     except ImportError:
@@ -46,7 +50,12 @@ def import_object(path: str) -> Any:
 
 def source_files(path: str) -> Iterator[tuple[str, Path]]:
     """Yield names and files of the sources of the package or module that contains ``module:name``."""
-    parts = current_module(path.partition(":")[0]).split(".")
+    module = path.rpartition(":")[0]
+    if module.endswith(SUFFIX):
+        source = Path(module).with_suffix(".py")
+        yield source.name, source if source.is_file() else Path(module)
+        return
+    parts = current_module(module).split(".")
     package = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:

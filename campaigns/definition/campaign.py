@@ -6,6 +6,7 @@ points that it chooses (`marsyard.campaigns.sampling.points`).
 
 from __future__ import annotations
 
+import html
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -52,6 +53,19 @@ class Campaign:
     command: tuple[str, ...] = ()
     confirms: bool = False
     confirmations: Path = Path(CONFIRMATIONS_FILE)
+
+    def _repr_html_(self) -> str:
+        """Table of the campaign's settings for notebooks."""
+        configuration = self.configuration
+        rows = {
+            "scenario": configuration.scenario,
+            "cases": configuration.total_cases,
+            "seed": configuration.seed,
+            "dispersions": ", ".join(configuration.dispersions),
+            "requirements": ", ".join(item.id for item in configuration.requirements),
+        }
+        cells = (f"<tr><th>{name}</th><td>{html.escape(str(value))}</td></tr>" for name, value in rows.items())
+        return f"<div><h4>{html.escape(configuration.name)}</h4><table>{''.join(cells)}</table></div>"
 
     def streams(self, case: int) -> Streams:
         """Create the random streams of a case."""

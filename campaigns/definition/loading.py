@@ -116,6 +116,17 @@ def load_campaign(
     return replace(_validate(str(path), tables, options_by_key), command=tuple(command))
 
 
+def create_campaign(tables: Mapping[str, Any], source: str = "the campaign") -> Campaign:
+    """Create a campaign from tables of the form of a campaign file.
+
+    source: name of the tables in messages
+    Raises ConfigurationError with all problems: key and allowed values.
+    """
+    selected_scenario = find_scenario(tables.get("scenario"))
+    complete = dict(tables) if selected_scenario is None else use_current_names(dict(tables), selected_scenario)
+    return _validate(source, complete, {})
+
+
 def _parse_override(override: str, option: str, selected_scenario: Scenario | None) -> dict[str, Any]:
     """Parse ``KEY=VALUE`` into nested tables of a campaign file; a value that is not TOML is a text."""
     key, separator, value = override.partition("=")
@@ -153,6 +164,37 @@ def _select_algorithms(
             nested_table = {part: nested_table}
         tables = _apply_option(tables, nested_table, option, options_by_key)
     return tables
+
+
+def replace_algorithms(campaign: Campaign, algorithms: Sequence[str]) -> Campaign:
+    """Return a campaign with other algorithms: the first is under test, the others are compared.
+
+    Raises ConfigurationError if the scenario has no selectable algorithms, or rejects them.
+    """
+    if not algorithms:
+        return campaign
+    selected, configuration, source = (
+        campaign.scenario,
+        campaign.configuration,
+        f"campaign '{campaign.configuration.name}'",
+    )
+    if not isinstance(selected, HasAlgorithms):
+        raise ConfigurationError([Problem(source, "", "its scenario has no selectable algorithms")])
+    settings: dict[str, Any] = {"algorithm": algorithms[0], "compared": list(algorithms[1:])}
+    for part in reversed(selected.algorithm_table):
+        settings = {part: settings}
+    paths = {".".join(path) for path in _list_paths(settings)}
+    values = _merge(configuration.parameters, settings)
+    try:
+        parameters = selected.parameters_type.model_validate(values).model_dump(mode="json", round_trip=True)
+    except ValidationError as error:
+        found = validation_problems(error, selected.parameters_type)
+        raise ConfigurationError(
+            [Problem(source, key_text(("parameters", *key)), text) for key, text in found]
+        ) from error
+    dispersions = {path: item for path, item in configuration.dispersions.items() if path not in paths}
+    changed = configuration.model_copy(update={"parameters": parameters, "dispersions": dispersions})
+    return replace(campaign, configuration=changed)
 
 
 def _apply_option(

@@ -177,8 +177,8 @@ class RunLog:
 
 @contextmanager
 def campaign_progress(console: Console) -> Iterator[ProgressObserver]:
-    """Report progress by bars on a terminal, and by text lines otherwise."""
-    if not console.is_terminal:
+    """Report progress by bars on a terminal and in a notebook, and by text lines otherwise."""
+    if not console.is_terminal and not console.is_jupyter:
         yield LineProgress(console)
         return
     progress = BarProgress(console)

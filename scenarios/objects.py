@@ -1,0 +1,113 @@
+"""Algorithms given as Python objects: stored with cloudpickle, and named ``FILE.pkl:Name``.
+
+Worker processes and later replays load the object from the file. An object of an importable class is stored by its
+import path and state; a class or function of a notebook is stored with its code.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+
+#: Ending of a stored object.
+SUFFIX = ".pkl"
+#: Digits of the hash in the name of a stored object.
+_HASH_DIGITS = 12
+
+
+class StoredInstance:
+    """Factory that returns copies of an instance, so that no case changes the algorithm of the next case."""
+
+    def __init__(self, instance: Any) -> None:
+        self.instance = instance
+        self.version = getattr(instance, "version", None)
+        self.options = getattr(instance, "options", None)
+
+    def __call__(self) -> Any:
+        """Return a copy of the instance."""
+        return copy.deepcopy(self.instance)
+
+
+class FunctionEstimator:
+    """Estimator whose method `estimate` is a function of the measurements."""
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self.estimate = function
+        self.__name__ = function.__name__
+
+
+def name_object(value: Any, folder: Path) -> str:
+    """Return the specification of an algorithm that is given as an object; store it in `folder` if necessary.
+
+    - a text is returned unchanged
+    - a class, or a function without parameters, is called for each case
+    - a function of the measurements is the method `estimate` of an estimator
+    - any other object is an algorithm itself; each case receives a copy
+
+    Raises ValueError if the object cannot be stored, for example because it holds an open file.
+    """
+    if isinstance(value, str):
+        return value
+    if inspect.isfunction(value) and _has_required_parameters(value):
+        stored: Any = StoredInstance(FunctionEstimator(value))
+    elif isinstance(value, type) or inspect.isfunction(value):
+        if _is_importable(value):
+            return f"{value.__module__}:{value.__qualname__}"
+        stored = value
+    else:
+        stored = StoredInstance(value)
+    name = "".join(letter if letter.isalnum() else "_" for letter in _object_name(value))
+    source = _read_source(value)
+    try:
+        contents = cloudpickle.dumps(stored)
+        state = cloudpickle.dumps(vars(value)) if not isinstance(value, type) and hasattr(value, "__dict__") else b""
+    except Exception as error:  # objects of users may raise anything
+        raise ValueError(f"the algorithm {name} cannot be stored: {type(error).__name__}: {error}") from error
+    # the bytes of a class of a notebook differ between sessions, its source and the state of an instance do not
+    digest = hashlib.sha256(source.encode() + state if source else contents).hexdigest()[:_HASH_DIGITS]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder.resolve() / f"{name}-{digest}{SUFFIX}"
+    path.write_bytes(contents)
+    path.with_suffix(".py").write_text(source, encoding="utf-8")
+    return f"{path}:{name}"
+
+
+def load_object(path: str) -> Any:
+    """Load a stored class, function or factory. Raises ImportError with the reason."""
+    try:
+        return cloudpickle.loads(Path(path).read_bytes())
+    except Exception as error:  # the modules of the object may raise anything
+        raise ImportError(f"{path}: {type(error).__name__}: {error}") from error
+
+
+def _object_name(value: Any) -> str:
+    return str(getattr(value, "__name__", type(value).__name__)).strip("<>")
+
+
+def _read_source(value: Any) -> str:
+    """Return the source code of a class or function, or of the class of an object; empty if it is not known."""
+    target = value if isinstance(value, type) or inspect.isfunction(value) else type(value)
+    with suppress(OSError, TypeError):
+        return inspect.getsource(target)
+    return ""
+
+
+def _has_required_parameters(function: Callable[..., Any]) -> bool:
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    parameters = inspect.signature(function).parameters.values()
+    return any(item.kind in kinds and item.default is inspect.Parameter.empty for item in parameters)
+
+
+def _is_importable(value: Any) -> bool:
+    """Whether worker processes can import a class or function by module and name."""
+    module = sys.modules.get(value.__module__)
+    is_top_level = "." not in value.__qualname__ and getattr(module, value.__qualname__, None) is value
+    return is_top_level and value.__module__ != "__main__" and getattr(module, "__file__", None) is not None

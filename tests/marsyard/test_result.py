@@ -1,0 +1,197 @@
+"""Tests of the Python interface: algorithms given as objects, campaigns without files, and results."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import marsyard
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.result import Result, open_result
+from marsyard.scenarios.imports import import_object, source_files
+from marsyard.scenarios.objects import name_object
+from tests.reports.conftest import VELOCITY, synthetic_frame, write_run
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
+]
+
+SCENARIO = "tests.campaigns.fake_velocity:FakeVelocityScenario"
+REQUIREMENT = {"id": "V", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.2, "confidence": 0.5}
+MODULE = """
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+
+class MyEstimator:
+    version = "2.0"
+
+    def __init__(self, gain=1.0):
+        self.gain = gain
+
+    def estimate(self, measurements):
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+"""
+
+
+def refuse(_measurements: Any) -> VelocityEstimate:
+    return VelocityEstimate(VelocityOutcome.IMU_MISMATCH, None)
+
+
+def _create_campaign(**changes: Any) -> marsyard.Campaign:
+    values: dict[str, Any] = {"cases": 3, "seed": 9, "requirements": [REQUIREMENT], **changes}
+    return marsyard.create_campaign("notebook", SCENARIO, **values)
+
+
+@pytest.fixture
+def estimator_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Import a module with an estimator, as from the folder of a notebook."""
+    (tmp_path / "my_notebook_module.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    module = __import__("my_notebook_module")
+    yield module
+    del sys.modules["my_notebook_module"]
+
+
+def test_object_has_the_rows_of_its_import_path(estimator_module: Any, tmp_path: Path) -> None:
+    campaign = _create_campaign()
+    results = [
+        marsyard.run(campaign, algorithm, directory=tmp_path / name)
+        for name, algorithm in (
+            ("path", "my_notebook_module:MyEstimator"),
+            ("class", estimator_module.MyEstimator),
+            ("object", estimator_module.MyEstimator()),
+        )
+    ]
+    expected: list[Any] = results[0].evaluation.run.all_cases.to_dict("records")
+    for result in results[1:]:
+        rows: list[Any] = result.evaluation.run.all_cases.to_dict("records")
+        assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 3
+    tested = results[2].evaluation.run.record["algorithms"][0]
+    assert (tested["version"], tested["role"]) == ("2.0", "tested")
+    assert tested["source_hash"]
+
+
+def test_classes_and_functions_of_a_notebook_are_stored_with_their_code(tmp_path: Path) -> None:
+    namespace: dict[str, Any] = {"__name__": "__main__"}
+    exec(MODULE, namespace)  # noqa: S102  (as a notebook does)
+    by_class = name_object(namespace["MyEstimator"], tmp_path)
+    assert by_class.startswith(str(tmp_path))
+    estimate = import_object(by_class)().estimate(None)
+    assert estimate.outcome is namespace["VelocityOutcome"].NO_VALID_TRACK
+    by_function = name_object(refuse, tmp_path)
+    assert import_object(by_function)().estimate(None).outcome is VelocityOutcome.IMU_MISMATCH
+
+
+def test_instances_are_copied_and_their_state_identifies_them(estimator_module: Any, tmp_path: Path) -> None:
+    first, equal, other = (name_object(estimator_module.MyEstimator(gain), tmp_path) for gain in (1.0, 1.0, 2.0))
+    assert first == equal != other
+    factory = import_object(other)
+    algorithm = factory()
+    algorithm.gain = 5.0
+    assert factory().gain == 2.0
+    ((name, path),) = source_files(other)
+    assert name.endswith(".py")
+    assert "class MyEstimator" in path.read_text()
+
+
+def test_objects_that_cannot_be_stored_are_reported(tmp_path: Path) -> None:
+    class HoldsGenerator:
+        def __init__(self) -> None:
+            self.items = (item for item in range(3))
+
+        def estimate(self, _measurements: Any) -> None: ...
+
+    with pytest.raises(CampaignError, match="the algorithm HoldsGenerator cannot be stored: TypeError"):
+        marsyard.run(_create_campaign(), HoldsGenerator(), directory=tmp_path / "run")
+    assert not (tmp_path / "run" / "campaign.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"requirements": ["NO-SUCH"]}, "NO-SUCH"),
+        ({"dispersions": {"no.such": {"distribution": "uniform", "low": 0.0, "high": 1.0}}}, "no.such"),
+        ({"cases": 0}, "cases"),
+    ],
+)
+def test_invalid_campaigns_are_reported_by_key(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(CampaignError, match=message) as caught:
+        _create_campaign(**changes)
+    assert "campaign 'notebook'" in str(caught.value)
+
+
+def test_campaign_has_a_view_for_notebooks() -> None:
+    text = _create_campaign()._repr_html_()
+    assert "<h4>notebook</h4>" in text
+    assert "<td>V</td>" in text
+
+
+def test_arguments_of_a_file_are_rejected_for_a_campaign(tmp_path: Path) -> None:
+    with pytest.raises(CampaignError, match="given by its name or file"):
+        marsyard.run(_create_campaign(), cases=3, directory=tmp_path / "run")
+    with pytest.raises(CampaignError, match="compare needs an algorithm under test"):
+        marsyard.run(_create_campaign(), compare=["dimes"], directory=tmp_path / "run")
+    with pytest.raises(CampaignError, match=r"unknown algorithm 'dimse' \(did you mean"):
+        marsyard.run(_create_campaign(), "dimse", directory=tmp_path / "run")
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Result:
+    """Return the result of a synthetic campaign with violations."""
+    available = {"id": "A", "metric": "answered", "probability": 0.5, "confidence": 0.5}
+    return Result(write_run(tmp_path / "run", synthetic_frame(60, error_scale=4.0), [VELOCITY, available]))
+
+
+def test_result_has_tables_of_cases_verdicts_and_violations(result: Result) -> None:
+    errors = result.cases["velocity_error_m_s"]
+    assert errors.index.name == "case"
+    assert result.verdicts.loc["DIMES-VEL", "failures"] == (errors > 5.0).sum()
+    assert result.verdict == result.verdicts["status"].iloc[0]
+    failures = result.failures("DIMES-VEL")
+    assert failures.index.tolist() == errors[errors > 5.0].sort_values(ascending=False).index.tolist()
+    unanswered = result.cases.index[~result.cases["answered"]]
+    assert set(result.failures().index) == {*failures.index, *unanswered}
+    with pytest.raises(CampaignError, match="unknown requirement 'B'"):
+        result.failures("B")
+
+
+def test_cases_and_figures_are_shown(result: Result) -> None:
+    worst = int(result.failures("DIMES-VEL").index[0])
+    case = result.case(worst)
+    assert case.row["velocity_error_m_s"] == result.cases["velocity_error_m_s"].max()
+    assert case.summary.statuses[0].word == "violated"
+    for name in ("errors", "histogram", "distribution"):
+        assert isinstance(result.figure(name), Figure)
+    assert "violated" in case._repr_html_()
+    assert "DIMES-VEL" in result._repr_html_()
+    for call, message in (
+        (lambda: result.case(60), "no case 60; allowed: 0 to 59"),
+        (lambda: result.figure("pie"), "unknown figure 'pie'"),
+        (lambda: result.figure(metric="nothing"), "no column 'nothing'"),
+    ):
+        with pytest.raises(CampaignError, match=message):
+            call()
+
+
+def test_results_are_compared(result: Result, tmp_path: Path) -> None:
+    other = Result(write_run(tmp_path / "other", synthetic_frame(60, seed=2), [VELOCITY]))
+    differences = result.compare(other)
+    assert len(differences) >= 2
+    assert result.compare(other.directory).equals(differences)
+
+
+def test_replayed_case_has_products_and_figures(tmp_path: Path) -> None:
+    campaign = _create_campaign(retain={"showcase": "none", "products": "none"})
+    result = marsyard.run(campaign, refuse, directory=tmp_path / "run")
+    assert np.all(result.cases["outcome"] == "IMU_MISMATCH")
+    case = result.case(1).replay()
+    assert case.row["outcome"] == "IMU_MISMATCH"
+    assert open_result(tmp_path / "run").case(1).figures(tmp_path / "figures") == []
