@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,8 +46,8 @@ class Case:
 
     result: Result
     number: int
-    row: Mapping[str, Any]
-    summary: CaseSummary
+    row: Mapping[str, Any] = field(repr=False)
+    summary: CaseSummary = field(repr=False)
 
     @property
     def products(self) -> Mapping[str, Any]:
@@ -165,11 +165,12 @@ class Result:
     def compare(self, other: Result | str | Path) -> pd.DataFrame:
         """Compare success rates, availability and errors with another campaign by significance tests.
 
-        One row per metric; p-values are two-sided and corrected for the number of metrics (Holm).
+        One row per metric, with texts; p-values are two-sided and corrected for the number of metrics (Holm).
         """
         second = other.directory if isinstance(other, Result) else Path(other)
         _, differences = comparison.compare_campaigns(read_run(self.directory), read_run(second))
-        return pd.DataFrame(comparison.campaign_diff_data(differences))
+        grid = comparison.campaign_diff_grid(["this campaign", "other campaign"], differences)
+        return pd.DataFrame(grid.rows, columns=list(grid.head)).set_index(grid.head[0])
 
     @property
     def report(self) -> Path:

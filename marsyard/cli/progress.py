@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -178,7 +179,8 @@ class RunLog:
 @contextmanager
 def campaign_progress(console: Console) -> Iterator[ProgressObserver]:
     """Report progress by bars on a terminal and in a notebook, and by text lines otherwise."""
-    if not console.is_terminal and not console.is_jupyter:
+    has_bars = find_spec("ipywidgets") is not None if console.is_jupyter else console.is_terminal
+    if not has_bars:
         yield LineProgress(console)
         return
     progress = BarProgress(console)
