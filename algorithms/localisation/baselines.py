@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
@@ -16,6 +16,8 @@ from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuInc
 
 #: Largest ratio of the descriptor distances of the best and the second-best match (Lowe's ratio test).
 MAX_DISTANCE_RATIO = 0.8
+#: Number of descriptors that are matched together; limits the memory to 40 MB.
+_MATCHED_TOGETHER = 256
 
 
 class InertialEstimator:
@@ -100,17 +102,12 @@ class FeatureEstimator(InertialEstimator):
         keypoints, descriptors = self._sift.detectAndCompute(_to_bytes(scaled.radiance[::-1]), None)
         if descriptors is None or self._descriptors is None or len(keypoints) < self.options.min_matches:
             return None
-        pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, self._descriptors, k=2)
-        good = [
-            first
-            for first, second in (pair for pair in pairs if len(pair) == 2)
-            if first.distance < MAX_DISTANCE_RATIO * second.distance
-        ]
-        if len(good) < self.options.min_matches:
+        indices, map_indices = match_descriptors(descriptors, self._descriptors)
+        if len(indices) < self.options.min_matches:
             return None
-        pixels = np.array([keypoints[match.queryIdx].pt for match in good], dtype=np.float64)
+        pixels = np.array([keypoints[index].pt for index in indices], dtype=np.float64)
         pixels[:, 1] = scaled.camera.size[1] - 1 - pixels[:, 1]
-        points = self._points[[match.trainIdx for match in good]]
+        points = self._points[map_indices]
         _, directions = scaled.camera.rays(pixels)
         # a pinhole camera along -z of the body with axes x, -y, -z
         forward = -directions[:, 2]
@@ -136,6 +133,31 @@ class FeatureEstimator(InertialEstimator):
         if not self._is_valid:
             return PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s, details=details)
         return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s), details=details)
+
+
+def match_descriptors(
+    descriptors: Float32[np.ndarray, "n 128"], map_descriptors: Float32[np.ndarray, "m 128"]
+) -> tuple[Int[np.ndarray, " matches"], Int[np.ndarray, " matches"]]:
+    """Match each descriptor with the nearest one of the map; return the indices of both that pass Lowe's ratio test.
+
+    The result is that of `cv2.BFMatcher`, which takes four times as long as a matrix product. The elements of SIFT
+    descriptors are whole numbers up to 255, so squared distances are exact in single precision.
+    """
+    if len(map_descriptors) < 2:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    squares = np.square(map_descriptors).sum(axis=1)
+    pairs = []
+    for start in range(0, len(descriptors), _MATCHED_TOGETHER):
+        block = descriptors[start : start + _MATCHED_TOGETHER]
+        distances = squares - 2.0 * (block @ map_descriptors.T)
+        rows, nearest = np.arange(len(block)), distances.argmin(axis=1)
+        offset = np.square(block).sum(axis=1)
+        best = np.sqrt(distances[rows, nearest] + offset)
+        distances[rows, nearest] = np.inf
+        is_good = best < MAX_DISTANCE_RATIO * np.sqrt(distances.min(axis=1) + offset)
+        pairs.append(np.column_stack([start + rows, nearest])[is_good])
+    indices = np.concatenate([np.zeros((0, 2), dtype=np.int64), *pairs])
+    return indices[:, 0], indices[:, 1]
 
 
 def _to_bytes(raster: Float[np.ndarray, "rows columns"]) -> np.ndarray:
