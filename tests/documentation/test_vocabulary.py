@@ -52,14 +52,22 @@ PHRASES = {
 }
 
 
-#: Any rejected pattern: most lines have none, and one search is faster than one for each pattern.
-ANY_PHRASE = re.compile("|".join(PHRASES), re.IGNORECASE)
+#: Any rejected pattern, and any rejected word: most files have none, and do not have to be parsed.
+ANY_PHRASE, ANY_WORD = (re.compile("|".join(words), re.IGNORECASE) for words in (PHRASES, NAME_WORDS))
 
 
 def list_python_files() -> list[Path]:
     """List the Python files of packages, benchmarks and tests, by git."""
     result = subprocess.run(["git", "ls-files", *PACKAGES], cwd=ROOT, check=True, stdout=subprocess.PIPE, text=True)
     return [ROOT / name for name in result.stdout.split() if name.endswith(".py")]
+
+
+def read_files(pattern: re.Pattern[str]) -> Iterator[tuple[Path, str]]:
+    """Yield the Python files whose text contains a pattern, with their texts."""
+    for path in list_python_files():
+        text = path.read_text(encoding="utf-8")
+        if pattern.search(text):
+            yield path, text
 
 
 def find_names(tree: ast.AST) -> Iterator[tuple[str, int]]:
@@ -94,8 +102,6 @@ def find_violations(text: str, line: int) -> Iterator[str]:
     """Yield a message for each rejected pattern in a text that starts at a line; quoted code is ignored."""
     for number, text_line in enumerate(text.splitlines()):
         plain = re.sub(r"`[^`]*`", "", text_line)
-        if not ANY_PHRASE.search(plain):
-            continue
         for pattern, replacement in PHRASES.items():
             if re.search(pattern, plain, re.IGNORECASE):
                 yield f"{line + number}: {text_line.strip()[:80]!r}: use {replacement}"
@@ -104,8 +110,8 @@ def find_violations(text: str, line: int) -> Iterator[str]:
 def test_names_use_the_vocabulary() -> None:
     violations = [
         f"{path.relative_to(ROOT)}:{line}: {name} ({word}: use {NAME_WORDS[word]})"
-        for path in list_python_files()
-        for name, line in find_names(ast.parse(path.read_text(encoding="utf-8")))
+        for path, file_text in read_files(ANY_WORD)
+        for name, line in find_names(ast.parse(file_text))
         if not any(re.search(pattern, name) for pattern in ALLOWED_NAMES)
         for word in split_name(name)
         if word in NAME_WORDS
@@ -116,8 +122,8 @@ def test_names_use_the_vocabulary() -> None:
 def test_docstrings_and_comments_use_the_vocabulary() -> None:
     violations = [
         f"{path.relative_to(ROOT)}:{violation}"
-        for path in list_python_files()
-        for text, line in find_prose(path.read_text(encoding="utf-8"))
+        for path, file_text in read_files(ANY_PHRASE)
+        for text, line in find_prose(file_text)
         for violation in find_violations(text, line)
     ]
     assert not violations, "\n".join(violations)
