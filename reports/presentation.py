@@ -197,6 +197,11 @@ def to_float(value: object) -> float:
     return float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else np.nan
 
 
+def is_true(value: object) -> bool:
+    """Whether a value of a row is true; missing values are not."""
+    return isinstance(value, bool | np.bool_) and bool(value)
+
+
 def to_matrix(value: object) -> Float[np.ndarray, "_ _"] | None:
     """Convert a product to a non-empty array of two dimensions; None if it is not one."""
     values = numeric_product(value)

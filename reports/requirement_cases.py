@@ -137,6 +137,8 @@ class CaseFinder:
         ]
         metric = next((item.verdict.metric for item in self._evaluated if math.isfinite(item.verdict.bound)), "")
         self._drivers = driver_columns(run.frame, metric, MAX_DRIVERS) if "case" in self._frame else []
+        values_by_driver = {column: numbers(run.frame, column) for column in self._drivers}
+        self._ordered_values = {name: np.sort(values[np.isfinite(values)]) for name, values in values_by_driver.items()}
         is_violation = np.zeros(len(self._frame), dtype=np.bool_)
         for item in self._evaluated:
             is_violation |= item.margins < 0.0
@@ -233,9 +235,7 @@ class CaseFinder:
         """Describe the metric of a case relative to its limit, or why it has none."""
         verdict, outcome = item.verdict, str(values.get("outcome", ""))
         if outcome in ENGINE_FAILURES:
-            return (
-                f"{outcome}: {str(values.get('error') or '').splitlines()[0] if values.get('error') else 'no message'}"
-            )
+            return f"{outcome}: {str(values.get('error') or 'no message').splitlines()[0]}"
         if math.isnan(verdict.bound):
             return f"{label(verdict.metric)}: {'no' if violates else 'yes'}"
         columns = verdict.metric.split(" + ")
@@ -247,13 +247,14 @@ class CaseFinder:
         return f"{words} {number(abs(value))} {unit}, limit {verdict.bound:g} {unit}".replace(" ,", ",").rstrip()
 
     def _percentile(self, column: str, row: int) -> float:
-        values = numbers(self._run.frame, column)
-        finite = values[np.isfinite(values)]
-        value = float(numbers(self._frame.iloc[[row]], column)[0])
-        if finite.size < _MIN_CASES or math.isnan(value):
+        """Return the percentile of a case's value among all cases; NaN without a value, or for too few cases."""
+        ordered = self._ordered_values[column]
+        value = to_float(self._frame[column].iloc[row]) if column in self._frame else math.nan
+        if ordered.size < _MIN_CASES or math.isnan(value):
             return math.nan
         # mid-rank, so that a frequent value is not extreme
-        return float(((finite < value).sum() + 0.5 * (finite == value).sum()) / finite.size)
+        below, up_to = (np.searchsorted(ordered, value, side) for side in ("left", "right"))
+        return float(0.5 * (below + up_to) / ordered.size)
 
     def _unusual_driver(self, row: int) -> str:
         """Name the driver with the most unusual value of a case; empty if no value is unusual."""
@@ -267,7 +268,7 @@ class CaseFinder:
             return ""
         _, percentile, column = max(known)
         unit = split_unit(column)[1]
-        value = number(float(numbers(self._frame.iloc[[row]], column)[0]))
+        value = number(to_float(self._frame[column].iloc[row]))
         fraction, word = (percentile, "lower") if percentile < 0.5 else (1.0 - percentile, "higher")
         name = label(column).removesuffix(f" ({unit})")
         return f"{name} is {value} {unit}".rstrip() + f" ({word} in {percent(fraction)} of the cases)"
@@ -275,7 +276,7 @@ class CaseFinder:
     def _case_drivers(self, row: int) -> list[CaseDriver]:
         drivers = []
         for column in self._drivers:
-            value = float(numbers(self._frame.iloc[[row]], column)[0])
+            value = to_float(self._frame[column].iloc[row]) if column in self._frame else math.nan
             if not math.isnan(value):
                 drivers.append(CaseDriver(label(column), number(value), self._percentile(column, row)))
         return sorted(drivers, key=lambda driver: -abs(np.nan_to_num(driver.percentile - 0.5)))
@@ -284,19 +285,23 @@ class CaseFinder:
         """Find the violations nearest to a case in the ranks of its drivers."""
         if len(self.violating_cases) < 2 or not self._drivers:
             return []
-        ranks = np.stack([_ranks(numbers(self._frame, column)) for column in self._drivers], axis=1)
-        is_violation = np.isin(self._frame["case"].to_numpy(), self.violating_cases)
-        is_violation[row] = False
-        rows = np.flatnonzero(is_violation)
-        distances = np.nansum((ranks[rows] - ranks[row]) ** 2, axis=1)
-        return self._frame["case"].iloc[rows[np.argsort(distances, kind="stable")][:MAX_SIMILAR]].tolist()
+        is_other_violation = np.isin(self._frame["case"].to_numpy(), self.violating_cases)
+        is_other_violation[row] = False
+        others, this_case = self._frame[is_other_violation], self._frame.iloc[[row]]
+        distances = np.zeros(len(others))
+        for column, ordered in self._ordered_values.items():
+            ranks, rank = (
+                np.searchsorted(ordered, numbers(rows, column)) / len(ordered) for rows in (others, this_case)
+            )
+            distances += (ranks - rank) ** 2
+        return others["case"].iloc[np.argsort(distances, kind="stable")[:MAX_SIMILAR]].tolist()
 
     def _group_causes(self, item: _Evaluated, violations: Int[np.ndarray, " v"]) -> Grid:
         """Count violations by outcome and cause, the largest group first, with the number of an example."""
         counts: Counter[tuple[str, str]] = Counter()
         examples: dict[tuple[str, str], int] = {}
-        for row in violations[:_MAX_GROUPED]:
-            values = self._row(int(row))
+        records: list[Any] = self._frame.iloc[violations[:_MAX_GROUPED]].to_dict("records")
+        for values in records:
             cause = self._find_cause(item, values)
             group = str(values.get("outcome", NOTHING)), NOTHING if cause is None else cause.name
             counts[group] += 1
@@ -356,7 +361,3 @@ def _describe_margin(item: _Evaluated, margin: float) -> tuple[str, str]:
         return word, ""
     unit = split_unit(item.verdict.metric.split(" + ")[-1])[1] if math.isfinite(item.verdict.bound) else ""
     return word, f"{number(margin)} {unit}".rstrip()
-
-
-def _ranks(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    return np.asarray(pd.Series(values).rank(pct=True).to_numpy(dtype=np.float64))

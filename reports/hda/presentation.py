@@ -23,7 +23,7 @@ from marsyard.reports.hda.case_figures import (
 )
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
 from marsyard.reports.hda.paper_tables import TOUCHDOWN, run_times_section
-from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, to_float
+from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, is_true, to_float
 from marsyard.reports.section import draw_images, svg_figure
 from marsyard.reports.section_kinds import CustomBlocks, RateTable, SectionDeclaration
 from marsyard.reports.wording import note_text, number
@@ -125,7 +125,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
         if place == "touchdown" and not math.isnan(distance_m := to_float(row.get("touchdown_error_m"))):
             detail += f", {number(distance_m)} m from the site"
         return Cause("slope" if ratios[0] > ratios[1] else "roughness", detail)
-    if metric in ("converged", "site_reported") and not row.get("converged"):
+    if metric in ("converged", "site_reported") and not is_true(row.get("converged")):
         return Cause(
             "few tracks", f"{to_float(row.get('tracks')):.0f} of {to_float(row.get('features')):.0f} features tracked"
         )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.algorithms.vtt.accuracy import HandOffOutcome
-from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, to_float
+from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, is_true, to_float
 from marsyard.reports.section import svg_figure
 from marsyard.reports.vtt import sections
 from marsyard.reports.vtt.case_figures import (
@@ -106,7 +106,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
         return None
     obliquity_deg, slip = to_float(row.get("obliquity_max_deg")), to_float(row.get("slip_max"))
     causes = {
-        "shadow of the mast": bool(row.get("rover_shadow_on_target")),
+        "shadow of the mast": is_true(row.get("rover_shadow_on_target")),
         "slip": slip > _MAX_SLIP,
         "oblique face": obliquity_deg > _MAX_OBLIQUITY_DEG,
     }
