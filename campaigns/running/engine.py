@@ -23,6 +23,7 @@ from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
+from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import read_confirmations, reserve_confirmation
@@ -49,16 +50,32 @@ class ProgressObserver(Protocol):
 
 @dataclass(frozen=True)
 class _CampaignRun:
-    """A campaign to run, with its folder, the configuration of its workers, and the receiver of its progress."""
+    """A campaign to run, with its folder, the configuration of its workers, and the receiver of its progress.
+
+    shard: part of the campaign that runs; None for all cases
+    """
 
     campaign: Campaign
     directory: Path
     executor: ExecutorConfig
     observer: ProgressObserver
+    shard: Shard | None = None
+
+    @property
+    def cases(self) -> range:
+        """Numbers of the cases to run."""
+        total = self.campaign.configuration.total_cases
+        return range(total) if self.shard is None else self.shard.cases(total)
 
 
-def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
-    """Run a campaign in a new folder.
+def run_campaign(
+    campaign: Campaign,
+    directory: Path,
+    executor: ExecutorConfig,
+    observer: ProgressObserver,
+    shard: Shard | None = None,
+) -> None:
+    """Run a campaign, or a shard of it, in a new folder.
 
     Rows are stored in `cases.sqlite` as soon as cases end; `cases.parquet` is written after the last case.
     Raises CampaignError if the folder contains a campaign or is not writable, or a column of a requirement is missing.
@@ -87,8 +104,17 @@ def run_campaign(campaign: Campaign, directory: Path, executor: ExecutorConfig, 
             algorithms=algorithms,
             evidence=evidence.to_table(),
         )
+        if shard is not None:
+            record.update(directory, {SHARD_KEY: str(shard)})
         with RowStore(directory / ROWS_FILE) as store:
-            _execute(_CampaignRun(campaign, directory, executor, observer), store, ())
+            _execute(_CampaignRun(campaign, directory, executor, observer, shard), store, ())
+
+
+def finish_campaign(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
+    """Run the missing cases of a campaign without checks of its identity; write the table and the showcase."""
+    with folder_lock(directory), RowStore(directory / ROWS_FILE) as store:
+        campaign = load_stored_campaign(directory, record.stored_configuration(directory))
+        _execute(_CampaignRun(campaign, directory, executor, observer), store, ())
 
 
 def resume_campaign(
@@ -119,7 +145,8 @@ def resume_campaign(
                 raise CampaignError(f"--case-time {case_time_s}: {error.errors()[0]['msg'].lower()}") from error
             configuration = configuration.model_copy(update={"limits": limits})
         campaign = load_stored_campaign(directory, configuration)
-        _continue_campaign(_CampaignRun(campaign, directory, executor, observer), "resume", allow_changed, retry)
+        shard = read_shard(record.read(directory))
+        _continue_campaign(_CampaignRun(campaign, directory, executor, observer, shard), "resume", allow_changed, retry)
 
 
 def append_cases(
@@ -179,8 +206,8 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
             raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
         count = store.count()
         retries = store.list_cases_with_outcomes(RETRYABLE[word] for word in retry)
-        is_complete = stored["state"] == "finished" and (directory / TABLE_FILE).is_file()
-        if not retries and is_complete and not store.list_missing_cases(configuration.total_cases):
+        is_complete = stored["state"] in ("finished", SHARD_STATE) and (directory / TABLE_FILE).is_file()
+        if not retries and is_complete and not _list_missing_cases(run, store):
             observer.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
         session = record.describe_session(command, run.executor.describe(), count)
@@ -210,19 +237,27 @@ def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None
 
     try:
         with create_executor(run.executor) as executor:
-            missing = store.list_missing_cases(configuration.total_cases)
+            missing = _list_missing_cases(run, store)
             if missing or retries:
                 with report_compilation(configuration.scenario, run.observer.note) as first_case_ended:
                     _prepare_inputs(run, executor, itertools.chain(*missing, retries))
                     _run_cases(run, store, executor, [*missing, retries], first_case_ended)
             write_table(table, store, numeric_metrics(configuration.requirements))
-            _rerun_for_products(run, store, executor)
+            if run.shard is None:
+                _rerun_for_products(run, store, executor)
     except BaseException:
         # on a full disk the state in the record stays "running"; the released lock shows that no process runs
         with suppress(StoreError):
             record_end("interrupted")
         raise
-    record_end("finished")
+    record_end("finished" if run.shard is None else SHARD_STATE)
+
+
+def _list_missing_cases(run: _CampaignRun, store: RowStore) -> list[range]:
+    """List the cases of the run that have no row, as ranges."""
+    ranges = store.list_missing_cases(run.campaign.configuration.total_cases)
+    limited = [range(max(part.start, run.cases.start), min(part.stop, run.cases.stop)) for part in ranges]
+    return [part for part in limited if part]
 
 
 def _prepare_inputs(run: _CampaignRun, executor: Executor, cases: Iterable[int]) -> None:

@@ -18,7 +18,7 @@ import typer
 from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
-from marsyard.cli.campaign import append, replay, resume, run
+from marsyard.cli.campaign import append, merge, replay, resume, run
 from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
 from marsyard.cli.offline import conformance, dataset, export, score
@@ -148,7 +148,7 @@ def _define_global_options(
 
 #: Commands by help panel; the first word of a function's name is the command's name.
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Run campaigns": (list_campaigns, show, run, resume, append, replay, rare, search, budget, nightly),
+    "Run campaigns": (list_campaigns, show, run, resume, append, merge, replay, rare, search, budget, nightly),
     "Results": (report, confirmations, compare, dashboard),
     "Worlds and images": (render, gallery, dataset),
     "Custom campaigns and algorithms": (new, ingest, conformance, export, score),

@@ -17,6 +17,7 @@ from typer import Argument, Option
 from marsyard.cli import options
 
 if TYPE_CHECKING:
+    from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.campaigns.execution.workers import ExecutorConfig
     from marsyard.campaigns.running.engine import ProgressObserver
 
@@ -48,6 +49,12 @@ class RunOptions:
         ),
     ] = False
     confirmations: options.ConfirmationsOption = options.CONFIRMATIONS
+    shard: Annotated[
+        str | None,
+        Option(
+            metavar="K/N", help="Run only shard K of N, on one of N machines; `marsyard merge` combines the shards."
+        ),
+    ] = None
 
 
 @options.handle_user_errors
@@ -61,6 +68,10 @@ def run(arguments: RunOptions) -> None:
         changes.append(f"limits.case_time_s={arguments.case_time}")
     campaign = load_campaign(arguments.campaign, changes, arguments.cases, arguments.seed, arguments.algorithm or [])
     campaign = replace(campaign, confirmations=arguments.confirmations)
+    if arguments.shard is not None and (arguments.confirm or arguments.until_decided):
+        from marsyard.campaigns.errors import CampaignError
+
+        raise CampaignError("--shard cannot be combined with --confirm or --until-decided")
     if arguments.confirm:
         from marsyard.campaigns.errors import CampaignError
         from marsyard.campaigns.store.confirmations import select_confirmation_seed
@@ -78,8 +89,38 @@ def run(arguments: RunOptions) -> None:
         outcome.print_limits(campaign)
         return
     directory = arguments.out if arguments.out is not None else default_directory(campaign.configuration.name)
+    if arguments.shard is not None:
+        run_shard(campaign, arguments.shard, directory, executor)
+        return
     run_cases = outcome.run_until_decided if arguments.until_decided else run_campaign
     run_and_evaluate(directory, lambda observer: run_cases(campaign, directory, executor, observer))
+
+
+def run_shard(campaign: Campaign, shard_text: str, directory: Path, executor: ExecutorConfig) -> None:
+    """Run a shard of a campaign in a folder, and print how to combine the shards."""
+    from marsyard.campaigns.running.engine import run_campaign
+    from marsyard.campaigns.running.shards import Shard
+    from marsyard.cli.progress import RunLog
+
+    shard = Shard.parse(shard_text)
+    with show_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
+        run_campaign(campaign, directory, executor, log, shard)
+    typer.echo(f"shard {shard}: the rows are in {directory}; to combine all shards: marsyard merge DIR... --out DIR")
+
+
+@options.handle_user_errors
+def merge(
+    directories: Annotated[list[Path], Argument(metavar="DIR...", help="Folders of all shards of a campaign.")],
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the merged campaign.")],
+    jobs: options.JobsOption = None,
+) -> None:
+    """Combine all shards of a campaign (`run --shard`) into one campaign, evaluate it, and write its report."""
+    from marsyard.campaigns.running.engine import finish_campaign
+    from marsyard.campaigns.running.shards import merge_shards
+
+    merge_shards(directories, out)
+    executor = make_executor(jobs, None)
+    run_and_evaluate(out, lambda observer: finish_campaign(out, executor, observer))
 
 
 @options.handle_user_errors

@@ -34,6 +34,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import ProgressObserver, append_cases, run_campaign
 from marsyard.campaigns.running.preparation import estimate_campaign
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
+from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import add_result
 from marsyard.campaigns.store.products import case_directory, save_packed
@@ -82,6 +83,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     if not is_finished:
         state = "killed" if stored["state"] == "running" else stored["state"]
         reason = f"the campaign was {state}; to continue: marsyard resume {directory}"
+        if stored["state"] == SHARD_STATE:
+            reason = f"shard {stored[SHARD_KEY]}; to combine all shards: marsyard merge DIR... --out DIR"
         reason = "the campaign is running" if is_locked(directory) else reason
         lines.insert(0, f"INCOMPLETE: {len(run.all_cases)} of {count(stored['cases'], 'case')}; {reason}")
     for line in lines:

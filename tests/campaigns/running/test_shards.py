@@ -1,0 +1,118 @@
+"""Tests of shards: their rows equal those of one run, and incompatible or incomplete shards are not merged."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.running.engine import finish_campaign, resume_campaign, run_campaign
+from marsyard.campaigns.running.replay import differing_columns
+from marsyard.campaigns.running.shards import Shard, merge_shards
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
+from marsyard.cli.app import app
+from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, read_case_rows, write_campaign
+
+pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+
+
+def _run_shards(path: Path, folder: Path, count: int, overrides: Sequence[str] = ()) -> list[Path]:
+    directories = []
+    for number in range(1, count + 1):
+        directory = folder / f"shard-{number}"
+        campaign = load_campaign(str(path), overrides)
+        run_campaign(campaign, directory, ExecutorConfig(1), RecordingWatch(), Shard(number, count))
+        directories.append(directory)
+    return directories
+
+
+@pytest.fixture(scope="module")
+def shards(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Run the failing campaign in four shards. Tests must not change the folders."""
+    folder = tmp_path_factory.mktemp("shards")
+    return _run_shards(write_campaign(folder, FAILING_CASES), folder, 4)
+
+
+@pytest.mark.parametrize(("total", "count"), [(12, 4), (10, 3), (3, 5), (1000, 7)])
+def test_shards_contain_each_case_once(total: int, count: int) -> None:
+    ranges = [Shard(number, count).cases(total) for number in range(1, count + 1)]
+    assert [case for cases in ranges for case in cases] == list(range(total))
+    assert max(map(len, ranges)) - min(map(len, ranges)) <= 1
+
+
+def test_merged_shards_equal_one_run(
+    shards: list[Path], failing_campaign: Path, tmp_path: Path, watch: RecordingWatch
+) -> None:
+    target = tmp_path / "merged"
+    merge_shards(shards[::-1], target)
+    finish_campaign(target, ExecutorConfig(1), watch)
+    expected, rows = read_case_rows(failing_campaign), read_case_rows(target)
+    assert [row["case"] for row in rows] == list(range(12))
+    assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 12
+    merged, single = record.read(target), record.read(failing_campaign)
+    for key in ("state", "cases", "cases_finished", "cases_crashed", "seed", "configuration", "showcase", "evidence"):
+        assert merged[key] == single[key], key
+    assert "shard" not in merged
+    assert len(merged["sessions"]) == 4
+    # products of the shards' violations, and of the showcase
+    stored = {path.name for path in (target / "cases").iterdir()}
+    assert stored == {path.name for path in (failing_campaign / "cases").iterdir()}
+
+
+def test_interrupted_shard_is_resumed_within_its_cases(
+    shards: list[Path], tmp_path: Path, watch: RecordingWatch
+) -> None:
+    copy = tmp_path / "shard"
+    shutil.copytree(shards[1], copy)
+    with RowStore(copy / ROWS_FILE) as store:
+        store._connection.execute("DELETE FROM cases WHERE case_number = 4")
+    record.update(copy, {"state": "interrupted"})
+    with pytest.raises(CampaignError, match="is not finished"):
+        merge_shards([copy], tmp_path / "merged")
+    resume_campaign(copy, ExecutorConfig(1), watch)
+    with RowStore(copy / ROWS_FILE) as store:
+        assert store.list_missing_cases(12) == [range(3), range(6, 12)]
+    assert record.read(copy)["state"] == "shard"
+
+
+def test_incomplete_or_different_shards_are_rejected(
+    shards: list[Path], failing_campaign: Path, campaign_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    (other,) = _run_shards(campaign_file(FAILING_CASES), tmp_path, 1, ["seed=6"])
+    for directories, message in (
+        (shards[:3], "3 of 12 cases are missing, the first is case 9"),
+        ([*shards, shards[0]], "both contain case 0"),
+        ([shards[0], failing_campaign], "was run without --shard"),
+        ([*shards[:3], other], "differ in the configuration"),
+    ):
+        with pytest.raises(CampaignError, match=message):
+            merge_shards(directories, tmp_path / "merged")
+        assert not (tmp_path / "merged").exists()
+
+
+@pytest.mark.parametrize("text", ["0/4", "5/4", "2", "a/b", "1/0"])
+def test_invalid_shards_are_reported(text: str) -> None:
+    with pytest.raises(CampaignError, match="expected NUMBER/COUNT"):
+        Shard.parse(text)
+
+
+def test_commands_run_and_merge_shards(
+    campaign_file: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path, runner = str(campaign_file("unanswered_cases = [2]")), CliRunner()
+    result = runner.invoke(app, ["run", path, "--shard", "1/1", "--jobs", "1", "--out", "a"])
+    assert result.exit_code == 0, result.output
+    assert "marsyard merge" in result.output
+    result = runner.invoke(app, ["merge", "a", "--out", "all", "--jobs", "1"])
+    assert result.exit_code in (1, 3), result.output
+    assert (tmp_path / "all" / "report.html").is_file()
+    result = runner.invoke(app, ["run", path, "--shard", "1/2", "--confirm", "--out", "b"])
+    assert result.exit_code == 2
