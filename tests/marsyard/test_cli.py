@@ -165,7 +165,7 @@ def test_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: 
     assert (result.status, result.err) == (0, "")
     assert re.search(r"^100,000 cases on 2 workers: about [\d.]+ (min|h)$", result.out, re.MULTILINE)
     assert re.search(r"^  0\.\d+ s per case \(0\.\d+ to \d[\d.]* s in 9 trial cases\)$", result.out, re.MULTILINE)
-    assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ bytes of products$", result.out, re.MULTILINE)
+    assert re.search(r"^disk: [\d.]+ MB of rows, up to [\d.]+ MB of products$", result.out, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["fake.toml"]
 
 
