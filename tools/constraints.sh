@@ -11,9 +11,10 @@ trap 'rm -rf "$scratch"' EXIT
 "$scratch/venv/bin/python" -m pip install -qq --upgrade pip setuptools
 "$scratch/venv/bin/python" -m pip install -qq --no-build-isolation -e '.[bench,dask,dev,docs,geo,notebook,spice,validate]'
 "$scratch/venv/bin/python" - >"$scratch/constraints.txt" <<'PYTHON'
+import re
 from importlib.metadata import distributions
 
-pins = {d.name.lower().replace("_", "-"): d.version for d in distributions() if d.name != "marsyard"}
+pins = {re.sub("[-_.]+", "-", d.name.lower()): d.version for d in distributions() if d.name != "marsyard"}
 for name, version in sorted(pins.items()):
     print(f"{name}=={version}")
 PYTHON

@@ -22,8 +22,8 @@ PRINTING = {
     "terrain stats",
 }
 WRITING = {
-    "run", "resume", "append", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset", "new",
-    "ingest", "export", "score", "compile", "rare", "search", "budget",
+    "run", "resume", "append", "merge", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset",
+    "new", "ingest", "export", "score", "compile", "rare", "search", "budget",
 }  # fmt: skip
 
 

@@ -64,17 +64,12 @@ def test_object_has_the_rows_of_its_import_path(estimator_module: Any, tmp_path:
     campaign = _create_campaign()
     results = [
         marsyard.run(campaign, algorithm, directory=tmp_path / name)
-        for name, algorithm in (
-            ("path", "my_notebook_module:MyEstimator"),
-            ("class", estimator_module.MyEstimator),
-            ("object", estimator_module.MyEstimator()),
-        )
+        for name, algorithm in (("path", "my_notebook_module:MyEstimator"), ("object", estimator_module.MyEstimator()))
     ]
-    expected: list[Any] = results[0].evaluation.run.all_cases.to_dict("records")
-    for result in results[1:]:
-        rows: list[Any] = result.evaluation.run.all_cases.to_dict("records")
-        assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 3
-    tested = results[2].evaluation.run.record["algorithms"][0]
+    expected, rows = (list[Any](result.evaluation.run.all_cases.to_dict("records")) for result in results)
+    assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 3
+    assert name_object(estimator_module.MyEstimator, tmp_path) == "my_notebook_module:MyEstimator"
+    tested = results[1].evaluation.run.record["algorithms"][0]
     assert (tested["version"], tested["role"]) == ("2.0", "tested")
     assert tested["source_hash"]
 
@@ -188,6 +183,7 @@ def test_results_are_compared(result: Result, tmp_path: Path) -> None:
     assert result.compare(other.directory).equals(differences)
 
 
+@pytest.mark.slow
 def test_replayed_case_has_products_and_figures(tmp_path: Path) -> None:
     campaign = _create_campaign(retain={"showcase": "none", "products": "none"})
     result = marsyard.run(campaign, refuse, directory=tmp_path / "run")

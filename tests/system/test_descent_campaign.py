@@ -22,12 +22,12 @@ EXIT_INSUFFICIENT, EXIT_INVALID_INPUT = 3, 2
 CAMPAIGN = """
 name = "small-descents"
 scenario = "descent"
-cases = 5
+cases = 3
 seed = 11
 
 [parameters.terrain]
-samples = 1024
-spacing_m = 3.0
+samples = 512
+spacing_m = 6.0
 
 [parameters.location]
 bank = 2
@@ -86,14 +86,14 @@ def _read_rows(folder: Path) -> pd.DataFrame:
 def test_rows_do_not_depend_on_the_number_of_workers(runs: Path) -> None:
     rows_of_one_worker, rows_of_two_workers = _read_rows(runs / "A"), _read_rows(runs / "B")
     pd.testing.assert_frame_equal(rows_of_one_worker, rows_of_two_workers, check_exact=True)
-    assert rows_of_one_worker["case"].tolist() == [0, 1, 2, 3, 4]
-    assert rows_of_one_worker["image_hash"].nunique() == 5
+    assert rows_of_one_worker["case"].tolist() == [0, 1, 2]
+    assert rows_of_one_worker["image_hash"].nunique() == 3
 
 
 def test_velocities_are_scored_against_truth(runs: Path) -> None:
     rows = _read_rows(runs / "A")
     valid = rows[rows["outcome"] == "VALID"]
-    assert len(valid) >= 4
+    assert len(valid) >= 2
     # The bound is 10 times the expected error. A wrong frame or sign causes errors of tens of metres per second.
     assert (valid["velocity_error_m_s"] < 3.0).all()
     assert valid["velocity_true_x_m_s"].abs().max() > 5.0
@@ -103,12 +103,12 @@ def test_dispersed_values_are_simulated(runs: Path) -> None:
     rows = _read_rows(runs / "A")
     assert set(rows["terrain"]) == {0, 1}
     assert rows["location_east_m"].between(0.0, 3000.0).all()
-    assert rows["location_east_m"].nunique() == 5
-    assert rows["attitude_rate_max_deg_s"].nunique() == 5
+    assert rows["location_east_m"].nunique() == 3
+    assert rows["attitude_rate_max_deg_s"].nunique() == 3
 
 
 def test_replayed_case_equals_the_stored_row(runs: Path) -> None:
-    result = _run_marsyard("replay", "A", "3", "--out", "replayed", cwd=runs)
+    result = _run_marsyard("replay", "A", "2", "--out", "replayed", cwd=runs)
     assert result.exit_code == 0, result.output
     assert any((runs / "replayed").iterdir())
 

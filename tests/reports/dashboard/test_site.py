@@ -199,11 +199,11 @@ def test_failed_requirements_precede_others(
     make_rows: Rows, make_run: MakeRun, tmp_path: Path, velocity: dict[str, Any]
 ) -> None:
     requirements = [
-        {**velocity, "id": "MET", "probability": 0.5},
+        {**velocity, "id": "MET", "probability": 0.1},
         {**velocity, "id": "UNDECIDED", "probability": 0.9999},
-        {**velocity, "id": "FAILED", "bound": 0.5},
+        {**velocity, "id": "FAILED", "bound": 0.1},
     ]
-    make_run(make_rows(300, terrains=100_000), requirements)
+    make_run(make_rows(40, terrains=100_000), requirements)
     entries, _ = read_entries(find_campaigns([tmp_path]))
     rows = requirement_rows(entries, shipped_requirements())
     assert [row.requirement for row in rows[:3]] == ["FAILED", "UNDECIDED", "MET"]
