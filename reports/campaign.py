@@ -16,7 +16,7 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-from marsyard.reports import common_sections, sections
+from marsyard.reports import common_sections, explorer, sections
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences, read_budget
 from marsyard.reports.comparison import comparison_section
@@ -150,8 +150,8 @@ def page_context(
     context["explorer"], random_run = None, subject.run
     if np.isfinite(numbers(random_run.frame, metric)).any():
         data, script = (
-            sections.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images),
-            sections.read_script(),
+            explorer.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images),
+            explorer.read_script(),
         )
         content_hash = sections.script_hash(script)
         context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": content_hash}

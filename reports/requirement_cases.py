@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns.errors import ENGINE_FAILURES
 from marsyard.reports import rates
+from marsyard.reports.explorer import ExploredRequirement
 from marsyard.reports.presentation import Cause, system_presentation, thumbnail, to_float
 from marsyard.reports.section import Grid, build_grid
-from marsyard.reports.sections import ExploredRequirement
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, count, driver_columns, label, number, numbers, percent, split_unit

@@ -13,12 +13,11 @@ import shlex
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from markupsafe import Markup
 from matplotlib.figure import Figure
 from pydantic import BaseModel
@@ -42,7 +41,6 @@ from marsyard.reports.wording import (
     count,
     driver_columns,
     format_fraction,
-    is_varying_number,
     label,
     number,
     numbers,
@@ -352,103 +350,6 @@ def outcome_figures(frame: pd.DataFrame) -> list[SvgFigure]:
 
 def _svg_figures(entries: Sequence[tuple[str, Figure | None, str]]) -> list[SvgFigure]:
     return [svg_figure(figure, key, caption) for key, figure, caption in entries if figure is not None]
-
-
-#: Maximum number of points of the explorer, without violations, and of violations. Maximum number of notable cases of
-#: each kind: largest errors, no answer, crashed.
-MAX_POINTS, MAX_VIOLATIONS, MAX_NOTABLE = 2000, 4000, 150
-_SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
-#: Columns that are not quantities of a case.
-_NOT_EXPLORED = ("case", "image_hash", "gl_backend", "gl_version", "processor_features", "error", "traceback")
-
-
-@dataclass(frozen=True)
-class ExploredRequirement:
-    """A requirement in the explorer: `status` is 0 (met), 1 (violated) or 2 (not counted) for each case."""
-
-    name: str
-    metric: str
-    bound: float
-    status: Int[np.ndarray, " n"]
-
-
-def explorer_data(
-    run: StoredRun, metric: str, requirements: Sequence[ExploredRequirement] = (), with_images: Collection[str] = ()
-) -> dict[str, Any]:
-    """Create the data of the explorer: numeric columns of the points with labels, initial axes, and requirements.
-
-    Columns that a large campaign has not read for a case are missing values of this case.
-    """
-    frame, all_cases = run.frame, run.all_cases
-    components = axis_columns(metric, [str(name) for name in frame.columns])[:2]
-    drivers = driver_columns(frame, metric)
-    first = [*components, metric, *drivers]
-    explored = [
-        str(name) for name in frame.columns if name not in _NOT_EXPLORED and is_varying_number(frame, str(name))
-    ]
-    names = list(dict.fromkeys([*first, *explored]))
-    is_violation = np.zeros(len(all_cases), dtype=np.bool_)
-    for item in requirements:
-        is_violation |= item.status == 1
-    rows = choose_points(all_cases, metric, is_violation)
-    points = all_cases.iloc[rows]
-    cases = points["case"].tolist() if "case" in points else rows.tolist()
-    complete = frame.set_index("case").reindex(cases) if "case" in frame else frame.iloc[rows]
-    outcomes = points["outcome"].astype(str) if "outcome" in points else pd.Series("", index=points.index)
-    distinct_outcomes = list(dict.fromkeys(outcomes))
-
-    def column_values(name: str) -> list[float | None]:
-        values = numbers(points, name) if name in points else numbers(complete, name)
-        return [float(f"{value:.4g}") if math.isfinite(value) else None for value in values]
-
-    metric_index, other = names.index(metric), names.index((drivers or [metric])[0])
-    pairs = [names.index(name) for name in components] if len(components) == 2 else [other, metric_index]
-    return {
-        "labels": [label(name) for name in names],
-        "columns": [column_values(name) for name in names],
-        "metric": metric_index,
-        "parts": [names.index(component) for component in components] if len(components) == 2 else [],
-        "axes": [pairs, [other, metric_index]],
-        "requirements": [
-            {
-                "name": item.name,
-                "column": names.index(item.metric) if item.metric in names else None,
-                "bound": item.bound if math.isfinite(item.bound) else None,
-                "status": item.status[rows].tolist(),
-            }
-            for item in requirements
-        ],
-        "cases": [int(case) for case in cases],
-        "outcomes": [str(outcome) for outcome in distinct_outcomes],
-        "outcome": [distinct_outcomes.index(outcome) for outcome in outcomes],
-        "with_images": sorted(int(case) for case in with_images),
-        "replay": replay_command(run, "CASE"),
-        "shown": len(points),
-        "all": len(all_cases),
-    }
-
-
-def choose_points(
-    frame: pd.DataFrame, metric: str, is_violation: Bool[np.ndarray, " n"] | None = None
-) -> Int[np.ndarray, " points"]:
-    """Select the rows of the explorer: all up to `MAX_POINTS`; else violations, notable cases, and the first others."""
-    if len(frame) <= MAX_POINTS:
-        return np.arange(len(frame))
-    violations = np.zeros(0, dtype=np.int64) if is_violation is None else np.flatnonzero(is_violation)[:MAX_VIOLATIONS]
-    magnitude = np.abs(numbers(frame, metric))
-    finite = np.isfinite(magnitude)
-    is_crashed = engine_failed(frame)
-    worst = np.argsort(-np.where(finite, magnitude, -1.0), kind="stable")
-    notable = [
-        group[:MAX_NOTABLE] for group in (worst, np.flatnonzero(~finite & ~is_crashed), np.flatnonzero(is_crashed))
-    ]
-    others = np.setdiff1d(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS], violations)
-    return np.sort(np.concatenate([violations, others]))
-
-
-def read_script() -> Markup:
-    """Read the explorer's JavaScript, marked as safe for the template."""
-    return Markup(_SCRIPT.read_text(encoding="utf-8"))  # noqa: S704
 
 
 def script_hash(text: str) -> str:

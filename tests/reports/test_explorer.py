@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from marsyard.reports.explorer import MAX_POINTS, ExploredRequirement, choose_points, explorer_data
 from marsyard.reports.presentation import gallery_cases, notable_cases
-from marsyard.reports.sections import MAX_POINTS, ExploredRequirement, choose_points, embed_json, explorer_data
+from marsyard.reports.sections import embed_json
 from marsyard.reports.stored import read_run
 
 Rows = Callable[..., pd.DataFrame]
