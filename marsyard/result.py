@@ -21,6 +21,7 @@ from marsyard.reports.presentation import thumbnail, write_case_figures
 from marsyard.reports.requirement_cases import CaseFinder, CaseSummary
 from marsyard.reports.stored import read_run
 from marsyard.reports.wording import primary_metric
+from marsyard.scenarios.timeline import Timeline
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +54,11 @@ class Case:
     def products(self) -> Mapping[str, Any]:
         """Images and intermediate results by name; empty if they are not stored (then use `replay`)."""
         return self.result.evaluation.run.products(self.number)
+
+    @property
+    def timeline(self) -> Timeline | None:
+        """The case in space and time; None unless it was run by `replay`, or its scenario records none."""
+        return Timeline.from_products(self.products)
 
     def replay(self) -> Case:
         """Run the case again, store its products, and return the case with them.

@@ -12,7 +12,7 @@ from __future__ import annotations
 import base64
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache
 from pathlib import Path
@@ -25,11 +25,13 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from marsyard.reports.rates import population_mask
-from marsyard.reports.section import SectionMaker, SvgFigure
+from marsyard.reports.section import SectionMaker, SvgFigure, svg_figure
 from marsyard.reports.stored import StoredRun
+from marsyard.reports.timeline.figure import draw_timeline
 from marsyard.reports.wording import NOTHING, numbers, primary_metric
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.systems import find_system, systems
+from marsyard.scenarios.timeline import Timeline
 
 Products = Mapping[str, Any]
 
@@ -246,6 +248,13 @@ class ShowcaseView:
     legend: str
 
 
+#: Caption of the perspective view of a case with a timeline.
+_SPACE_CAPTION = (
+    "The case in space: visible ground, true and estimated path, and the cameras at the times of images. "
+    "`marsyard replay` with `--rerun` exports a view with a time line."
+)
+
+
 def showcase_views(run: StoredRun, violations: Sequence[int] = ()) -> list[ShowcaseView]:
     """Create the views of the gallery's cases; cases that no system can draw are omitted."""
     return [view for case in gallery_cases(run, violations) if (view := showcase_view(run, case)) is not None]
@@ -305,6 +314,10 @@ def showcase_view(run: StoredRun, case: int) -> ShowcaseView | None:
     if kind is None:
         return None
     view = kind.view(products, f"case{case}")
+    timeline = Timeline.from_products(products)
+    if timeline is not None:
+        figure = svg_figure(draw_timeline(timeline), f"case{case}space", _SPACE_CAPTION)
+        view = replace(view, figures=[*view.figures, figure])
     rows = run.all_cases
     outcomes = rows.loc[rows["case"] == case, "outcome"] if {"case", "outcome"} <= {*rows} else pd.Series(dtype=object)
     outcome = str(outcomes.iloc[0]) if len(outcomes) else NOTHING
@@ -316,5 +329,6 @@ def write_case_figures(directory: Path, products: Mapping[str, Any]) -> list[Pat
 
     Raises OSError if they cannot be written.
     """
-    kind = find_case_kind(products)
-    return [] if kind is None else kind.write(directory, products)
+    kind, timeline = find_case_kind(products), Timeline.from_products(products)
+    paths = [] if kind is None else kind.write(directory, products)
+    return paths if timeline is None else [*paths, *save_figures(directory, {"space": draw_timeline(timeline)})]

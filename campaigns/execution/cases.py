@@ -26,6 +26,7 @@ from marsyard.campaigns.store.products import PackedProducts, ProductSelection, 
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
 from marsyard.scenarios.systems import scenario
+from marsyard.scenarios.timeline import recording_timelines
 from marsyard.sim.cache import CacheWarning
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
@@ -81,7 +82,7 @@ def run_case(configuration: str, selection: ProductSelection, points: Mapping[in
     try:
         campaign = _load_campaign(configuration)
         wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
-        with conditions_recorded_by(record):
+        with conditions_recorded_by(record), recording_timelines(selection.timelines):
             point = points.get(case)
             parameters = campaign.parameters(case) if point is None else campaign.parameters_at(point)
             result = campaign.scenario.run(parameters, campaign.streams(case if point is None else point.stream))

@@ -26,7 +26,7 @@ from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.products import ALL_PRODUCTS, PackedProducts
+from marsyard.campaigns.store.products import REPLAYED_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
 from marsyard.scenarios import conformance as suite
@@ -88,7 +88,7 @@ def replay_in_executor(
     """Run one case again in an executor, and compare it with its stored row, which contains the point of a study."""
     text = None if stored is None else stored.get(POINT_COLUMN)
     points = {case: Point.read(text)} if isinstance(text, str) else {}
-    ((completed,),) = run_cases(executor, configuration, [case], selection=ALL_PRODUCTS, points=points)
+    ((completed,),) = run_cases(executor, configuration, [case], selection=REPLAYED_PRODUCTS, points=points)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 

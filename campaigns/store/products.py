@@ -159,10 +159,12 @@ class ProductSelection:
 
     - every: step between the numbers of selected cases; 0 to select none by number
     - requirements: a case that fails any of these requirements is selected
+    - timelines: whether the products contain the timeline of the case (`marsyard.scenarios.timeline`)
     """
 
     every: int = 0
     requirements: tuple[Requirement, ...] = ()
+    timelines: bool = False
 
     def selects(self, row: Mapping[str, Any]) -> bool:
         """Whether the case with this row is selected."""
@@ -172,6 +174,7 @@ class ProductSelection:
 
 
 ALL_PRODUCTS = ProductSelection(every=1)
+REPLAYED_PRODUCTS = ProductSelection(every=1, timelines=True)
 
 
 def create_product_selection(configuration: CampaignConfiguration) -> ProductSelection:

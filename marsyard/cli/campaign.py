@@ -1,4 +1,4 @@
-"""Commands `marsyard run`, `resume`, `append` and `replay`: run or continue campaigns, and run single cases again."""
+"""Commands `marsyard run`, `resume`, `append` and `merge`: run or continue campaigns."""
 
 from __future__ import annotations
 
@@ -188,64 +188,6 @@ def append(
     outcome.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
     run_and_evaluate(directory, lambda log: append_cases(directory, cases, executor, log, allow_changed=allow_changed))
-
-
-@options.handle_user_errors
-def replay(
-    directory: options.DirectoryArgument,
-    case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
-    out: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder of images and results; by default DIR/cases/CASE.")
-    ] = None,
-    save_stages: Annotated[
-        bool,
-        Option(
-            "--save-stages",
-            help="Also write each intermediate result as a file of its own to stages/ (.npy, .png or .json).",
-        ),
-    ] = False,
-) -> None:
-    """Run one case again, write and plot its intermediate results, and compare its row with the stored one."""
-    from marsyard.campaigns.running.replay import replay as rerun_case
-    from marsyard.campaigns.store.products import (
-        case_directory,
-        pack_products,
-        replace_files,
-        unpack_products,
-        write_packed,
-    )
-    from marsyard.cli.showing import write_stages
-    from marsyard.reports.presentation import write_case_figures
-
-    rerun = rerun_case(directory, case)
-    target = out if out is not None else case_directory(directory, case)
-    if (rerun.failed or rerun.products is None) and (target / "products.json").exists():
-        output_lines = [f"{target} keeps its previous products: this run of the case produced none"]
-    else:  # replace the products, stages and figures together or not at all
-        packed = rerun.products or pack_products({})
-        products = unpack_products(packed)
-        with replace_files(target) as folder:
-            write_packed(folder, packed, rerun.row)
-            stages = write_stages(folder / "stages", products) if save_stages else 0
-            figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
-        stage_lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
-        output_lines = [f"products: {target}", *stage_lines, *(f"figure: {figure}" for figure in figures)]
-    typer.echo(f"case {case}: {rerun.row['outcome']}")
-    for line in (rerun.row["error"] and (rerun.row["traceback"] or rerun.row["error"]), rerun.note):
-        if line:
-            typer.echo(line)
-    typer.echo("\n".join(output_lines))
-    if rerun.changed:
-        typer.echo(f"changed since the campaign was run: {'; '.join(rerun.changed)}")
-    if rerun.stored is None:
-        typer.echo("the campaign has no stored row of this case to compare with")
-    elif rerun.differing:
-        typer.echo(f"the row differs from the stored one in: {', '.join(rerun.differing)}")
-        for column in rerun.differing:
-            typer.echo(f"  {column}: {rerun.stored.get(column)!r} stored, {rerun.row.get(column)!r} now")
-        raise typer.Exit(options.Exit.FAILED)
-    else:
-        typer.echo("the row equals the stored one")
 
 
 def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:

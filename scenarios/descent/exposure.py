@@ -112,11 +112,7 @@ def take_exposures(
     clouds = draw_clouds(p.faults, first_ground_m, streams.generator("clouds"))
     # a disc at the camera casts the vehicle's shadow
     scene = replace(scene, caster_diameter_m=p.lander.caster_diameter_m, clouds=clouds)
-    # the camera is at the body's origin; its alignment error is a pure rotation, unknown to the lander
-    alignment_deg = 0.0 if p.exact_instruments else p.camera.alignment_error_deg
-    tilt = np.radians(alignment_deg) * streams.generator("camera alignment").standard_normal(3)
-    mounting = RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
-    shield = None
+    mounting, shield = draw_mounting(p, streams), None
     if p.faults.heat_shield_deg:
         angle = float(np.radians(p.faults.heat_shield_deg))
         shield = HeatShield.draw(states[0], angle, streams.generator("heat shield"))
@@ -129,6 +125,13 @@ def take_exposures(
         if shield is not None:
             radiance = shield.paint_over(radiance, frame, world.sun, state.time_s)
         yield detector.expose(radiance * np.float32(world.brightness), noise, motion), frame
+
+
+def draw_mounting(p: DescentScenarioParameters, streams: Streams) -> RigidTransform:
+    """Draw the camera's pose in the body: at its origin, rotated by an alignment error unknown to the lander."""
+    alignment_deg = 0.0 if p.exact_instruments else p.camera.alignment_error_deg
+    tilt = np.radians(alignment_deg) * streams.generator("camera alignment").standard_normal(3)
+    return RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,13 @@ from marsyard.scenarios.descent.score import (
     instrument_errors,
     propagate_to_firing,
 )
+from marsyard.scenarios.descent.timeline import descent_timeline
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
+from marsyard.scenarios.timeline import timeline_products
 from marsyard.scenarios.velocity import (
     Horizontal,
     Span,
@@ -217,5 +219,9 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
     is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
     indices = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.images))
     images = [descent.images[index] for index in indices]
-    products = {**velocity_products(images, estimate, truth), **stream_products(estimate, descent.truth)}
+    products = {
+        **velocity_products(images, estimate, truth),
+        **stream_products(estimate, descent.truth),
+        **timeline_products(lambda: descent_timeline(descent, estimate)),
+    }
     return algorithm_result(algorithm_run, velocity is not None, row, products)

@@ -22,8 +22,10 @@ from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.fieldtest.imaging import RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, Triple, simulate_run
+from marsyard.scenarios.fieldtest.timeline import triple_timeline
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredFlight, compute_scores
+from marsyard.scenarios.timeline import timeline_products
 from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -115,7 +117,10 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
                 truths: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
                 flight = ScoredFlight(measurements=measurements, answer=estimate, **truths)
                 row |= compute_scores(p.scores, flight, {*row, *conditions})
-            products = velocity_products(images, estimate, truth)
+            products = {
+                **velocity_products(images, estimate, truth),
+                **timeline_products(lambda: triple_timeline(run, ground, case.states, images, estimate)),
+            }
             return algorithm_result(algorithm_run, velocity is not None, row, products)
 
         return case_result(p.algorithms, evaluate, conditions)

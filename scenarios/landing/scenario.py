@@ -24,10 +24,13 @@ from marsyard.scenarios.landing.score import (
     motion_row,
     outcome_row,
     products,
+    simulate_touchdown,
     site_row,
     times_row,
 )
+from marsyard.scenarios.landing.timeline import landing_timeline
 from marsyard.scenarios.parts.scores import ScoredLanding, compute_scores
+from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -89,10 +92,11 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
             # without an answer the helicopter lands at the a-priori site; NO_STRUCTURE stands for any failure
             answer = algorithm_run.answer
             estimate = answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
+            touchdown = simulate_touchdown(p, estimate, flight, truth, streams)
             row = {
                 **({} if answer is None else outcome_row(answer)),
                 **site_row(estimate, flight, truth),
-                **landing_row(p, estimate, flight, truth, streams),
+                **landing_row(touchdown, estimate, flight, truth),
                 **motion_row(estimate.details, flight, case.pair),
                 **map_row(p, estimate, flight, truth),
                 **times_row(estimate.details),
@@ -108,6 +112,10 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 )
                 row |= compute_scores(p.scores, scored_case, {*row, *shared})
             is_converged = answer is not None and estimate.outcome.converged
-            return algorithm_result(algorithm_run, is_converged, row, products(case, estimate))
+            case_products = {
+                **products(case, estimate),
+                **timeline_products(lambda: landing_timeline(case, estimate, touchdown)),
+            }
+            return algorithm_result(algorithm_run, is_converged, row, case_products)
 
         return case_result(p.algorithms, evaluate, shared)

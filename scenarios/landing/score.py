@@ -16,7 +16,7 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import contrast_columns, ground_columns, optics_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.helicopter import horizontal_distance_m, land
+from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
 from marsyard.scenarios.landing.images import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
@@ -115,10 +115,22 @@ def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> d
     return {f"{name}_safe": bool(footprint.safe[0]), **dict(zip(columns, values, strict=True))}
 
 
-def landing_row(
+def simulate_touchdown(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth, streams: Streams
+) -> Touchdown | None:
+    """Simulate the helicopter's landing at the reported site; None without a site, a helicopter or ground contact."""
+    relief = truth.relief
+    if flight.transit is None or estimate.site_world is None:
+        return None
+    ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
+    unit = RangingUnit.draw(p.laser, streams.generator("laser"))
+    return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
+
+
+def landing_row(
+    touchdown: Touchdown | None, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
 ) -> dict[str, Scalar]:
-    """Simulate the helicopter's landing; compute the columns of the touchdown and of the ground under it.
+    """Compute the columns of the touchdown and of the ground under it.
 
     `touchdown_error_gps_m` is the distance from the receiver's averaged solutions to the site's coordinates, as
     measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which excludes
@@ -127,14 +139,10 @@ def landing_row(
     is the number of averaged solutions; `gps_deviation_north_m` and `gps_deviation_east_m` are the means of the
     standard deviations that the receiver reports. `landing_after_s` is the time from the second image to touchdown.
     `landing_turns` and `landing_moved_m` are the number of iterations of flight and filter and the change of the path
-    in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a site or a helicopter there is no landing:
-    numbers are NaN, and `touchdown_safe` is missing.
+    in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a touchdown, numbers are NaN, and
+    `touchdown_safe` is missing.
     """
-    site, relief, touchdown = estimate.site_world, truth.relief, None
-    if flight.transit is not None and site is not None:
-        ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
-        unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-        touchdown = land(flight.transit, site, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
+    site = estimate.site_world
     if touchdown is None or site is None:
         columns = (*(f"touchdown_{column}" for column in GROUND_COLUMNS), *TOUCHDOWN_COLUMNS)
         return {"landed": False, **dict.fromkeys(columns, NAN)}

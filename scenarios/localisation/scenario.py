@@ -26,9 +26,11 @@ from marsyard.scenarios.localisation.map_product import MapTruth, make_map
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements, StreamAnswers, feed
 from marsyard.scenarios.localisation.task import LOCALISATION
+from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.scenarios.parts.named import PartKind
+from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.sensor import ClockParameters, Detector, Imu
@@ -89,6 +91,7 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             answers = algorithm_run.answer
             row = {**algorithm_run.row, **({} if answers is None else score.answer_row(descent, answers))}
             products = {} if answers is None else score.products(descent, answers)
+            products = {**products, **timeline_products(lambda: localisation_timeline(descent, answers))}
             is_answered = answers is not None and answers.outcome is PositionOutcome.VALID
             return algorithm_result(algorithm_run, is_answered, row, products)
 

@@ -45,7 +45,9 @@ from marsyard.scenarios.rover.run import (
     track_target,
 )
 from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, designate_point, evaluate_visibility
+from marsyard.scenarios.rover.timeline import run_timeline
 from marsyard.scenarios.rover.world import terrain_parameters
+from marsyard.scenarios.timeline import timeline_products
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
@@ -355,5 +357,5 @@ def _evaluate(
         row |= {**score.update_columns(run, p.score.stored_updates), **score.run_conditions(p, run)}
         row |= image_columns(p.backend, digest)
     row |= compute_scores(p.scores, score.create_scored_run(run), {*row, *shared})
-    products = score.products(p, run) if is_tested else {}
+    products = {**score.products(p, run), **timeline_products(lambda: run_timeline(p, run))} if is_tested else {}
     return CaseResult(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, products)

@@ -16,13 +16,11 @@ from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.images import GroundTruth
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.landing.score import landing_row, site_populations, site_row, stage_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
-from marsyard.sim.streams import Streams
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 SITE_REPORTED, NO_SITE_REPORTED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
@@ -90,8 +88,7 @@ def test_safe_site_or_no_site_is_a_correct_answer(
 
 
 def test_flight_without_landing_has_no_touchdown_score() -> None:
-    parameters, streams = LandingScenarioParameters(), Streams(1, "landing", 0)
-    row = landing_row(parameters, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3), streams)
+    row = landing_row(None, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3))
     assert row["landed"] is False
     assert "touchdown_safe" not in row
     # A campaign with touchdown requirements accepts a first case without a landing.

@@ -1,0 +1,155 @@
+"""Command `marsyard replay`: run one case again, and export it in space and time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from marsyard.cli import options
+
+if TYPE_CHECKING:
+    from marsyard.scenarios.timeline import Timeline
+
+
+@options.handle_user_errors
+def replay(
+    directory: options.DirectoryArgument,
+    case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
+    out: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder of images and results; by default DIR/cases/CASE.")
+    ] = None,
+    save_stages: Annotated[
+        bool,
+        Option(
+            "--save-stages",
+            help="Also write each intermediate result as a file of its own to stages/ (.npy, .png or .json).",
+        ),
+    ] = False,
+    rerun: Annotated[
+        Path | None, Option(metavar="FILE", help="Also write the case in space and time for the Rerun viewer (.rrd).")
+    ] = None,
+    glb: Annotated[
+        Path | None, Option(metavar="FILE", help="Also write ground, paths and cameras as a glTF scene (.glb).")
+    ] = None,
+    rosbag: Annotated[
+        Path | None,
+        Option(metavar="DIR", help="Also write images, poses and inertial data as a ROS 2 bag into a new folder."),
+    ] = None,
+) -> None:
+    """Run one case again, write and plot its intermediate results, and compare its row with the stored one."""
+    from marsyard.campaigns.running.replay import replay as rerun_case
+    from marsyard.campaigns.store.products import (
+        case_directory,
+        pack_products,
+        replace_files,
+        unpack_products,
+        write_packed,
+    )
+    from marsyard.cli.showing import write_stages
+    from marsyard.reports.presentation import write_case_figures
+
+    exports = _requested_exports(rerun, glb, rosbag)
+    result = rerun_case(directory, case)
+    target = out if out is not None else case_directory(directory, case)
+    if (result.failed or result.products is None) and (target / "products.json").exists():
+        output_lines = [f"{target} keeps its previous products: this run of the case produced none"]
+    else:  # replace the products, stages and figures together or not at all
+        packed = result.products or pack_products({})
+        products = unpack_products(packed)
+        with replace_files(target) as folder:
+            write_packed(folder, packed, result.row)
+            stages = write_stages(folder / "stages", products) if save_stages else 0
+            figures = [target / path.relative_to(folder) for path in write_case_figures(folder, products)]
+        stage_lines = [f"stages: {stages} files in {target / 'stages'}"] if save_stages else []
+        output_lines = [f"products: {target}", *stage_lines, *(f"figure: {figure}" for figure in figures)]
+    typer.echo(f"case {case}: {result.row['outcome']}")
+    for line in (result.row["error"] and (result.row["traceback"] or result.row["error"]), result.note):
+        if line:
+            typer.echo(line)
+    typer.echo("\n".join(output_lines))
+    if exports:
+        _write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
+    if result.changed:
+        typer.echo(f"changed since the campaign was run: {'; '.join(result.changed)}")
+    if result.stored is None:
+        typer.echo("the campaign has no stored row of this case to compare with")
+    elif result.differing:
+        typer.echo(f"the row differs from the stored one in: {', '.join(result.differing)}")
+        for column in result.differing:
+            typer.echo(f"  {column}: {result.stored.get(column)!r} stored, {result.row.get(column)!r} now")
+        raise typer.Exit(options.Exit.FAILED)
+    else:
+        typer.echo("the row equals the stored one")
+
+
+@dataclass(frozen=True)
+class _Export:
+    """An export of a timeline: option, target, and function that writes it; `name` is the title of the recording."""
+
+    option: str
+    target: Path
+    write: Callable[[Path, Timeline, str], None]
+
+
+def _requested_exports(rerun: Path | None, glb: Path | None, rosbag: Path | None) -> list[_Export]:
+    """Check the options of exports before the case runs. Raises CampaignError for a missing package or a wrong path."""
+    from marsyard.campaigns.errors import CampaignError
+
+    exports = []
+    for option, target, package, suffix, write in (
+        ("--rerun", rerun, "rerun", ".rrd", _write_rerun),
+        ("--glb", glb, "trimesh", ".glb", _write_glb),
+        ("--rosbag", rosbag, "rosbags", "", _write_ros_bag),
+    ):
+        if target is None:
+            continue
+        if find_spec(package) is None:
+            raise CampaignError(f"{option} needs the package {package}: pip install 'marsyard[view]'")
+        if suffix and target.suffix != suffix:
+            raise CampaignError(f"{option} {target}: allowed: a file with the suffix {suffix}")
+        if not suffix and target.exists():
+            raise CampaignError(f"{option} {target} exists; allowed: a new folder")
+        if not target.parent.is_dir():
+            raise CampaignError(f"{option} {target}: the folder {target.parent} does not exist")
+        exports.append(_Export(option, target, write))
+    return exports
+
+
+def _write_exports(exports: list[_Export], products: Mapping[str, Any], case: int) -> None:
+    """Write the timeline of a case. Raises CampaignError without one, and StoreError if a file cannot be written."""
+    from marsyard.campaigns.errors import CampaignError, report_write_errors
+    from marsyard.scenarios.timeline import Timeline
+
+    timeline = Timeline.from_products(products)
+    if timeline is None:
+        names = ", ".join(export.option for export in exports)
+        reason = "its scenario records none, or the case did not finish"
+        raise CampaignError(f"{names}: case {case} has no timeline: {reason}")
+    for export in exports:
+        with report_write_errors(export.target):
+            export.write(export.target, timeline, f"case {case}")
+        typer.echo(f"{export.option.removeprefix('--')}: {export.target}")
+
+
+def _write_rerun(target: Path, timeline: Timeline, name: str) -> None:
+    from marsyard.reports.timeline.rerun_file import write_rerun
+
+    write_rerun(target, timeline, name)
+
+
+def _write_glb(target: Path, timeline: Timeline, _name: str) -> None:
+    from marsyard.reports.timeline.glb import write_glb
+
+    write_glb(target, timeline)
+
+
+def _write_ros_bag(target: Path, timeline: Timeline, _name: str) -> None:
+    from marsyard.reports.timeline.ros_bag import write_ros_bag
+
+    write_ros_bag(target, timeline)

@@ -1,0 +1,1 @@
+"""Exports and figures of the timeline of a case (`marsyard.scenarios.timeline`)."""

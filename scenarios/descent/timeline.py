@@ -1,0 +1,41 @@
+"""Timeline of a descent."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.descent.exposure import camera_optics, draw_mounting
+from marsyard.scenarios.timeline import Timeline, surface_from_above
+from marsyard.scenarios.velocity_timeline import STEP_S, VelocityCase
+
+if TYPE_CHECKING:
+    from marsyard.scenarios.descent.scenario import Descent
+
+#: Half width of the shown ground divided by the altitude of the first image.
+_HALF_WIDTH_RATIO = 0.8
+
+
+def descent_timeline(descent: Descent, estimate: VelocityEstimate | None) -> Timeline:
+    """Create the timeline of a descent from its first image to the thrusters' firing."""
+    p, world, states = descent.p, descent.world, descent.states
+    first = states[0]
+    east, north, up = (float(value) for value in first.position_m)
+    half_width_m = _HALF_WIDTH_RATIO * (up - float(world.surface.height(east, north)))
+    case = VelocityCase(
+        patch=surface_from_above(world.scene, (east, north), half_width_m, p.render.backend),
+        surface=world.surface,
+        motion=descent.flight.motion.motion(np.arange(first.time_s, descent.flight.firing_s, STEP_S)),
+        states=states,
+        images=descent.images,
+        bits=p.detector.bits,
+        camera=camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed),
+        mounting=draw_mounting(p, descent.streams),
+        increments=descent.measurements.increments,
+    )
+    start = states[-2] if len(states) > 1 else first
+    if estimate is not None and estimate.span_s is not None and estimate.span_s[0] in descent.measurements.tags_s:
+        start = states[descent.measurements.tags_s.index(estimate.span_s[0])]
+    return case.timeline(estimate, start)

@@ -1,0 +1,136 @@
+"""Timeline of a descent with localisation on a map."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from marsyard.algorithms.localisation.details import LocalisationDetails
+from marsyard.scenarios.localisation.instruments import true_camera
+from marsyard.scenarios.localisation.score import compute_errors
+from marsyard.scenarios.localisation.stream import StreamAnswers
+from marsyard.scenarios.timeline import (
+    CameraPose,
+    Ellipsoids,
+    InertialData,
+    Path,
+    Points,
+    Series,
+    SurfacePatch,
+    TimedImage,
+    Timeline,
+    grey_values,
+    surface_from_above,
+)
+
+if TYPE_CHECKING:
+    from marsyard.scenarios.localisation.scenario import LocalisedDescent
+
+#: Half width of the shown ground divided by the altitude at the start.
+_HALF_WIDTH_RATIO = 1.2
+#: Time between the poses of the true path, s, and maximum side of the shown map, pixels.
+_STEP_S, _MAP_PX = 0.1, 384
+
+
+def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers | None) -> Timeline:
+    """Create the timeline of a descent: images with landmarks, estimates with covariance, map and ground."""
+    flight, surface = descent.flight, descent.world.surface
+    first, last_s = descent.states[0], descent.states[-1].time_s
+    motion = flight.motion(np.arange(first.time_s, last_s, _STEP_S))
+    altitudes = motion.positions_m[:, 2] - surface.height(*motion.positions_m.T[:2])
+    centre = (float(first.position_m[0]), float(first.position_m[1]))
+    half_width_m = _HALF_WIDTH_RATIO * descent.p.flight.altitude_start_m
+    initial = descent.measurements.initial
+    return Timeline(
+        surfaces={
+            "ground": surface_from_above(descent.world.scene, centre, half_width_m, descent.p.render.backend),
+            "map": _map_surface(descent),
+        },
+        paths={"true": Path.from_motion(motion), **_estimated_path(answers)},
+        images=_images(descent, answers),
+        points={"initial position": Points(np.array([initial.time_s]), np.asarray(initial.position_m)[None])},
+        ellipsoids=_covariances(answers),
+        series={
+            "altitude, m": Series(motion.times_s, np.asarray(altitudes)),
+            **({} if answers is None else _error_series(descent, answers)),
+        },
+        inertial=InertialData.from_increments(descent.measurements.increments),
+    )
+
+
+def _estimated_path(answers: StreamAnswers | None) -> dict[str, Path]:
+    """Return the path through the reported states; empty without one."""
+    reported = [
+        (answer.time_s, answer.position_m, answer.world_from_body.as_quat())
+        for answer in (() if answers is None else answers.estimates)
+        if answer.position_m is not None and answer.world_from_body is not None
+    ]
+    if not reported:
+        return {}
+    times, positions, quaternions = (np.array(values, dtype=np.float64) for values in zip(*reported, strict=True))
+    return {"estimated": Path(times, positions, quaternions)}
+
+
+def _covariances(answers: StreamAnswers | None) -> dict[str, Ellipsoids]:
+    """Return the reported positions with their covariances; empty without one."""
+    reported = [
+        (answer.time_s, answer.position_m, answer.covariance[:3, :3])
+        for answer in (() if answers is None else answers.estimates)
+        if answer.position_m is not None and answer.covariance is not None
+    ]
+    if not reported:
+        return {}
+    times, centres, covariances = (np.array(values, dtype=np.float64) for values in zip(*reported, strict=True))
+    return {"estimated position": Ellipsoids(times, centres, covariances)}
+
+
+def _error_series(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, Series]:
+    """Return horizontal error and its standard deviation at the reported states, and the inliers of each image."""
+    errors = [error for error in compute_errors(descent, answers) if error is not None]
+    times = np.array([error.time_s for error in errors], dtype=np.float64)
+    series = {
+        "horizontal error, m": np.array([error.horizontal_m for error in errors], dtype=np.float64),
+        "3 sigma of the horizontal error, m": np.array([3.0 * np.hypot(*error.sd_m[:2]) for error in errors]),
+    }
+    counted = [
+        (answer.time_s, float(answer.details.inliers))
+        for answer in answers.estimates
+        if isinstance(answer.details, LocalisationDetails) and answer.details.inliers is not None
+    ]
+    named = {name: Series(times, values) for name, values in series.items() if len(values)}
+    if counted:
+        named["landmarks used"] = Series(*np.array(counted, dtype=np.float64).T)
+    return named
+
+
+def _images(descent: LocalisedDescent, answers: StreamAnswers | None) -> list[TimedImage]:
+    """Return the delivered images at the true times of their exposures, with the landmarks that were matched."""
+    camera = true_camera(descent.p.camera)
+    delivered, images = descent.images, []
+    # lost images are not delivered: time tags determine the exposure of each image
+    times_s = np.array([state.time_s for state in descent.states])
+    for number, image in enumerate(delivered):
+        state = descent.states[int(np.argmin(np.abs(times_s - image.time_s)))]
+        details = None if answers is None else answers.estimates[number].details
+        marks = {}
+        if isinstance(details, LocalisationDetails) and details.measured_px is not None and details.used is not None:
+            marks = {
+                "landmarks used": details.measured_px[details.used],
+                "landmarks rejected": details.measured_px[~details.used],
+            }
+        pose = CameraPose.from_camera(camera, state.world_from_body)
+        images.append(TimedImage("descent camera", state.time_s, image.counts, descent.p.detector.bits, pose, marks))
+    return images
+
+
+def _map_surface(descent: LocalisedDescent) -> SurfacePatch:
+    """Return the map product with reduced resolution, at its own coordinates."""
+    product = descent.measurements.map_product
+    stride = -(-max(product.appearance.shape) // _MAP_PX)
+    appearance, elevation = product.appearance[::stride, ::stride], product.elevation_m[::stride, ::stride]
+    rows, columns = np.indices(appearance.shape) * stride
+    east, north = (product.origin_m[axis] + product.pixel_m * index for axis, index in ((0, columns), (1, rows)))
+    points = np.stack([east, north, elevation], axis=-1).astype(np.float32)
+    # row 0 of the map is the southernmost
+    return SurfacePatch(points[::-1], grey_values(appearance)[::-1])

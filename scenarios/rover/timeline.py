@@ -1,0 +1,98 @@
+"""Timeline of a rover run."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import RigidTransform
+
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.run import Run
+from marsyard.scenarios.rover.score import update_quantities
+from marsyard.scenarios.rover.stops import Stop
+from marsyard.scenarios.timeline import CameraPose, Path, Points, Series, TimedImage, Timeline, surface_from_above
+from marsyard.scenarios.views import Viewpoint, site_scene
+from marsyard.sim.render import Scene
+
+#: Margin of the shown ground around the run and the target, m.
+_MARGIN_M = 2.0
+#: Quantities of the updates that are no values over time.
+_NO_SERIES = ("leg", "time_s")
+
+
+def run_timeline(p: RoverScenarioParameters, run: Run) -> Timeline:
+    """Create the timeline of a run: images and answers at the stops, true and estimated path."""
+    stops, target_m = run.stops, run.target.point_world
+    true_path, positions = _true_path(stops), np.array([stop.stance.world_from_rover.translation for stop in stops])
+    horizontal = np.concatenate([positions.reshape(-1, 3), true_path.positions_m, target_m[None]])[:, :2]
+    low, high = horizontal.min(axis=0), horizontal.max(axis=0)
+    centre, half_width_m = 0.5 * (low + high), 0.5 * float((high - low).max()) + _MARGIN_M
+
+    def create_scene(east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
+        return site_scene(run.world.ground, Viewpoint(east_m, north_m, height_m, pixel_rad), run.world.scene(0.0).sun)
+
+    tracked = [stop for stop in stops if stop.reported_position_rover is not None]
+    quantities = update_quantities(run)
+    return Timeline(
+        surfaces={"ground": surface_from_above(create_scene, (centre[0], centre[1]), half_width_m, p.backend)},
+        paths={
+            "true": true_path,
+            "estimated": Path.from_poses([stop.time_s for stop in stops], [stop.estimated_pose for stop in stops]),
+        },
+        images=[image for stop in stops for image in _images(run, stop, p.vtt.template_px)],
+        points={
+            "target": Points.permanent(target_m),
+            "tracked target": Points(
+                np.array([stop.time_s for stop in tracked], dtype=np.float64),
+                # the reported position, seen from the true rover
+                np.array([_reported_m(stop) for stop in tracked], dtype=np.float64).reshape(-1, 3),
+            ),
+        },
+        series={
+            name.replace("_", " "): Series(quantities["time_s"], values)
+            for name, values in quantities.items()
+            if name not in _NO_SERIES and np.isfinite(values).any()
+        },
+    )
+
+
+def _reported_m(stop: Stop) -> np.ndarray:
+    """Return the reported target position, world, from the true pose of the rover."""
+    return np.asarray(stop.stance.world_from_rover.apply(np.array(stop.reported_position_rover)))
+
+
+def _true_path(stops: list[Stop]) -> Path:
+    """Return the true poses of the rover; the poses between two stops have equal time steps."""
+    times: list[float] = []
+    poses: list[RigidTransform] = []
+    for number, stop in enumerate(stops):
+        stances = [stance for drive in stop.drives for stance in drive.stances]
+        start_s = stops[number - 1].time_s if number else 0.0
+        times += np.linspace(start_s, stop.time_s, len(stances) + 1)[:-1].tolist()
+        poses += [stance.world_from_rover for stance in stances]
+        times.append(stop.time_s)
+        poses.append(stop.stance.world_from_rover)
+    return Path.from_poses(times, poses)
+
+
+def _images(run: Run, stop: Stop, template_px: float) -> list[TimedImage]:
+    """Return the subframes of a stop; the tracked template and the search window are marked in the left one."""
+    images = []
+    details, rig = stop.details, run.rig
+    for name, camera, image in (("left", rig.left, stop.images.left), ("right", rig.right, stop.images.right)):
+        corner = np.array(image.corner, dtype=np.float64)
+        subframe = camera.crop(*image.corner, image.counts.shape[::-1])
+        point_px = np.asarray(
+            camera.project(np.asarray(stop.world_from_head.inv().apply(run.target.point_world.copy())))[0]
+        )
+        marks, boxes = {"target": (point_px - corner).reshape(1, 2)}, {}
+        if name == "left":
+            tracked_px = stop.reported_px(rig.calibrated) - corner
+            marks["tracked target"] = tracked_px.reshape(1, 2)
+            boxes["template"] = np.array([[*(tracked_px - 0.5 * template_px), template_px, template_px]])
+            if details is not None and details.window is not None and details.window_corner is not None:
+                upper_left = np.asarray(details.window_corner, dtype=np.float64) - corner
+                boxes["search window"] = np.array([[*upper_left, *details.window.shape[::-1]]], dtype=np.float64)
+        pose = CameraPose.from_camera(subframe, stop.world_from_head)
+        bits = run.camera.detectors[0].parameters.bits
+        images.append(TimedImage(f"{name} camera", stop.time_s, image.counts, bits, pose, marks, boxes))
+    return images
