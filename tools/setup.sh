@@ -3,6 +3,7 @@
 # If nothing has changed, it returns immediately.
 #
 #   PYTHON=/path/to/python   the interpreter to build .venv with; otherwise the first Python >= 3.11 on the PATH
+#   tools/setup.sh --browser installs only the browser for the slow tests (`make validate`)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -97,7 +98,7 @@ install_gl_libraries() {
 # The tests build an example in C.
 install_compiler() { command -v cc >/dev/null || need gcc libc6-dev || true; }
 
-# The tests of pages use Debian's browser; no other browser is downloaded.
+# The slow tests of pages use Debian's browser; no other browser is downloaded.
 install_browser() { command -v chromium >/dev/null || need chromium || true; }
 
 # --- the environment --------------------------------------------------------------------------------------------------
@@ -138,6 +139,11 @@ check_rendering() {
     [ -n "$works" ] || fail "no GL backend renders an image: $either"
 }
 
+if [ "${1:-}" = --browser ]; then
+    install_browser
+    exit 0
+fi
+
 # One set-up at a time in one folder.
 if command -v flock >/dev/null; then
     exec 9<"$PWD"
@@ -156,7 +162,6 @@ else
     make_venv "$python"
 fi
 install_compiler
-install_browser
 install_packages
 check_rendering
 rm -f "$unfinished"

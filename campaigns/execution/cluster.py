@@ -2,9 +2,12 @@
 
 Dask workers do not run cases themselves. For each thread, a Dask worker starts and monitors one worker process, which
 runs the batches with the same limits as on one machine (`marsyard.campaigns.execution.workers`). A case that hangs,
-exhausts memory or kills its process therefore affects only that process. If a Dask worker itself is lost, Dask sends
-its batches to other workers. If a batch was lost with several workers (Dask's `allowed-failures`, by default 3), it is
-divided into single cases; a case that is lost again in this way counts as crashed.
+exhausts memory or kills its process therefore affects only that process.
+
+If a Dask worker itself is lost, Dask sends its batches to other workers. If a batch was lost with several workers
+(Dask's `allowed-failures`, by default 3), it is divided into single cases; a case that is lost again in this way counts
+as crashed. Workers may join and leave at any time. If the scheduler is restarted at the same address, the executor
+connects again and submits all unfinished batches again.
 """
 
 from __future__ import annotations
@@ -12,11 +15,12 @@ from __future__ import annotations
 import multiprocessing.process
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import AbstractContextManager, ExitStack
-from dataclasses import replace
+from contextlib import AbstractContextManager, ExitStack, suppress
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, TypeVar
 
 from marsyard.campaigns.definition.identity import hash_code, read_versions
@@ -27,19 +31,43 @@ from marsyard.campaigns.execution.workers import Batches, LocalExecutor
 Result = TypeVar("Result")
 #: Prefix of the address of a new cluster on this machine.
 _LOCAL_PREFIX = "local:"
-#: Seconds to wait for a scheduler, and for the first worker.
-_TIMEOUT_S = 30
+#: Seconds to wait for a scheduler at the start, for a scheduler that is restarted, and for a cluster without workers:
+#: a batch system may start them only after submission.
+_TIMEOUT_S, _RESTART_S, _NO_WORKERS_S = 30, 600, 3600
+#: Time between two requests for the list of workers, and between two checks for finished batches, s.
+_REFRESH_S, _POLL_S = 10.0, 0.02
 #: Batches queued at each Dask worker, so that no worker waits for the network.
 _QUEUED_BATCHES = 2
+#: Maximum number of times that the cluster may abandon a single case.
+_MAX_ABANDONED = 5
 #: Worker process of each thread of a Dask worker (attribute `workers`).
 _thread_state = threading.local()
+
+
+@dataclass(frozen=True)
+class _Identity:
+    """Hash of the source code, and versions of the packages, by which workers are compared with this program."""
+
+    code: str
+    versions: tuple[tuple[str, str], ...]
+
+    def check(self, worker: str, other: _Identity) -> None:
+        """Raise CampaignError if a worker has another identity."""
+        if other.code != self.code:
+            raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
+        theirs = dict(other.versions)
+        differing = [
+            f"{name} {theirs.get(name)} (here {mine})" for name, mine in self.versions if mine != theirs.get(name)
+        ]
+        if differing:
+            raise CampaignError(f"worker {worker} has different versions: {', '.join(differing)}")
 
 
 class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
     """Executor on the workers of a Dask cluster, as a context.
 
     address: address of a scheduler (`tcp://host:8786`), or `local:N` for a cluster of N workers on this machine
-    Raises CampaignError if Dask is missing, the cluster cannot be reached, or its workers run other code.
+    Raises CampaignError if Dask is missing, or no scheduler responds.
     """
 
     def __init__(self, address: str) -> None:
@@ -47,90 +75,181 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
             import distributed
         except ImportError as error:
             raise CampaignError("a cluster needs Dask: pip install 'marsyard[dask]'") from error
-        self._distributed = distributed
+        self._distributed, self._address = distributed, address
         with ExitStack() as stack:
+            self._cluster: Any = None
             try:
-                cluster: Any = None
-                if not address.startswith(_LOCAL_PREFIX):
+                if address.startswith(_LOCAL_PREFIX):
+                    self._cluster = _start_local_cluster(address)
+                    stack.callback(self._cluster.close)
+                else:
                     # Check the address first. Dask does not close a client with an invalid address; its later garbage
                     # collection can block the next client for 10 s.
                     distributed.comm.get_address_host_port(address)
-                else:
-                    cluster = _start_local_cluster(address)
-                    stack.callback(cluster.close)
-                self._client = distributed.Client(cluster or address, timeout=_TIMEOUT_S, set_as_default=False)
-                stack.callback(self._client.close)
+                self._client = self._connect()
             except (OSError, ValueError, ImportError) as error:
                 raise CampaignError(f"--cluster {address}: no scheduler responds: {error}") from error
-            try:
-                self._client.wait_for_workers(1, timeout=_TIMEOUT_S)
-                identities = self._client.run(_identify_code)
-            except TimeoutError as error:
-                raise CampaignError(f"--cluster {address}: the scheduler has no workers") from error
-            local_code, local_versions = _identify_code()
-            for worker, (code, versions) in identities.items():
-                if code != local_code:
-                    raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
-                differing = sorted(name for name in local_versions if local_versions[name] != versions.get(name))
-                if differing:
-                    pairs = (f"{name} {versions.get(name)} (here {local_versions[name]})" for name in differing)
-                    raise CampaignError(f"worker {worker} has different versions: {', '.join(pairs)}")
+            stack.callback(self._disconnect)
             self._stack = stack.pop_all()
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    def _connect(self) -> Any:
+        return self._distributed.Client(self._cluster or self._address, timeout=_TIMEOUT_S, set_as_default=False)
+
+    def _disconnect(self) -> None:
+        with suppress(OSError, TimeoutError):
+            self._client.close()
+
     def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
-        """Run work as described in `Executor.run`."""
+        """Run work as described in `Executor.run`. Raises CampaignError if a worker runs other code."""
+        queue = _BatchQueue(self, work)
+        try:
+            yield from queue.results()
+        finally:
+            queue.cancel()
+
+    def submit(self, work: Work[Any], executors: int) -> Any:
+        """Submit a batch; return its future. `executors` share the memory of a machine."""
+        return self._client.submit(_run_batch_isolated, work, executors, _identify_code(), pure=False)
+
+    def cancel(self, futures: Sequence[Any]) -> None:
+        """Cancel futures; without a scheduler there are none."""
+        if self.is_connected:
+            self._client.cancel(futures)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the scheduler is connected."""
+        return bool(self._client.status == "running")
+
+    def reconnect(self) -> None:
+        """Wait for the scheduler and connect again. Raises CampaignError if it does not respond in time."""
+        self._disconnect()
+        deadline_s = time.monotonic() + _RESTART_S
+        while True:
+            try:
+                self._client = self._connect()
+            except (OSError, ValueError) as error:
+                if time.monotonic() > deadline_s:
+                    hint = "the finished cases are stored, `marsyard resume` continues"
+                    raise CampaignError(f"--cluster {self._address}: the scheduler is lost: {error}; {hint}") from error
+                time.sleep(1.0)
+            else:
+                return
+
+    def count_threads(self) -> tuple[int, int]:
+        """Return the number of threads of all workers, and the largest number of threads on one machine."""
         machines: Counter[str] = Counter()
         for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
             machines[worker["host"]] += worker["nthreads"]
-        # each thread starts one executor; the executors of a machine share its memory
-        executors_per_machine = max(machines.values(), default=1)
-        threads = sum(self._client.nthreads().values())
-        batches = Batches(work.items, work.total, threads)
-        pending = self._distributed.as_completed(loop=self._client.loop)
-        batches_by_future: dict[Any, Sequence[int]] = {}
+        return machines.total(), max(machines.values(), default=1)
 
-        def submit_batch(batch: Sequence[int]) -> None:
-            if batch:
-                batch_work = replace(work, items=tuple(batch), total=len(batch))
-                future = self._client.submit(_run_batch_isolated, batch_work, executors_per_machine, pure=False)
-                batches_by_future[future] = batch
-                pending.add(future)
+    def create_queue(self) -> Any:
+        """Create an iterator over futures in the order in which they finish."""
+        return self._distributed.as_completed(loop=self._client.loop)
 
-        try:
-            for _ in range(_QUEUED_BATCHES * threads):
-                submit_batch(batches.next())
-            while batches_by_future:
-                future = next(pending)
-                batch = batches_by_future.pop(future)
-                results = self._collect(future, batch, batches)
-                if results is None:
-                    for item in batch:
-                        submit_batch((item,))
-                else:
-                    submit_batch(batches.next())
+    def is_lost_with_workers(self, error: BaseException) -> bool:
+        """Whether a batch was lost with several workers in succession."""
+        return isinstance(error, self._distributed.scheduler.KilledWorker)
+
+
+class _BatchQueue:
+    """The batches of one piece of work on a cluster: twice as many as there are threads are queued."""
+
+    def __init__(self, cluster: ClusterExecutor, work: Work[Any]) -> None:
+        self._cluster, self._work = cluster, work
+        self._batches = Batches(work.items, work.total, 1)
+        self._repeated: deque[Sequence[int]] = deque()
+        self._abandoned: Counter[int] = Counter()
+        self._futures: dict[Any, Sequence[int]] = {}
+        self._completed = cluster.create_queue()
+        self._threads, self._executors = 0, 1
+        self._refreshed_s = self._with_workers_s = time.monotonic()
+        self._refresh()
+
+    def results(self) -> Iterator[list[TaskResult[Any]]]:
+        """Yield the results of batches as they finish."""
+        self._fill()
+        while self._futures:
+            future = self._next_future()
+            if future is not None:
+                batch = self._futures.pop(future)
+                results = self._collect(future, batch)
                 future.release()
                 if results:
                     yield results
-        finally:
-            self._client.cancel(list(batches_by_future))
+            self._fill()
 
-    def _collect(self, future: Any, batch: Sequence[int], batches: Batches) -> list[TaskResult[Any]] | None:
-        """Return the results of a batch; None if it was lost with its workers and must be divided into cases."""
-        error = future.exception() if future.status != "cancelled" else CancelledError("the cluster abandoned it")
+    def cancel(self) -> None:
+        """Cancel all queued batches."""
+        self._cluster.cancel(list(self._futures))
+
+    def _fill(self) -> None:
+        """Submit batches until the queue is full; lost batches first."""
+        while len(self._futures) < _QUEUED_BATCHES * max(self._threads, 1):
+            batch = self._repeated.popleft() if self._repeated else self._batches.next()
+            if not batch:
+                return
+            future = self._cluster.submit(replace(self._work, items=tuple(batch), total=len(batch)), self._executors)
+            self._futures[future] = batch
+            self._completed.add(future)
+
+    def _next_future(self) -> Any:
+        """Wait for a finished future; None if the queue changed instead: new workers, or a restarted scheduler."""
+        while not self._completed.has_ready():
+            if not self._cluster.is_connected:
+                self._submit_again()
+                return None
+            if time.monotonic() - self._refreshed_s > _REFRESH_S:
+                self._refresh()
+                return None
+            time.sleep(_POLL_S)
+        return next(self._completed)
+
+    def _refresh(self) -> None:
+        """Update the number of workers. Raises CampaignError if there are none for a long time."""
+        self._refreshed_s = time.monotonic()
+        self._threads, self._executors = self._cluster.count_threads()
+        self._batches.workers = max(self._threads, 1)
+        if self._threads:
+            self._with_workers_s = self._refreshed_s
+        elif self._refreshed_s - self._with_workers_s > _NO_WORKERS_S:
+            raise CampaignError(f"the cluster has had no workers for {_NO_WORKERS_S / 60:.0f} minutes")
+
+    def _submit_again(self) -> None:
+        """Connect to the restarted scheduler; all unfinished batches are submitted again."""
+        self._cluster.reconnect()
+        self._completed = self._cluster.create_queue()
+        self._repeated.extend(self._futures.values())
+        self._futures.clear()
+        self._refresh()
+
+    def _collect(self, future: Any, batch: Sequence[int]) -> list[TaskResult[Any]]:
+        """Return the results of a batch; empty if it was lost and is queued again."""
+        error = CancelledError() if future.status == "cancelled" else future.exception()
         if error is None:
             seconds, results = future.result()
-            batches.record_time(len(batch), seconds)
+            self._batches.record_time(len(batch), seconds)
             return list(results)
         if isinstance(error, CampaignError):
             raise error
+        is_abandoned, is_lost = isinstance(error, CancelledError), self._cluster.is_lost_with_workers(error)
+        if is_abandoned and self._count_abandoned(batch) <= _MAX_ABANDONED:
+            self._repeated.append(batch)
+            return []
         if len(batch) > 1:
-            return None
-        if isinstance(error, (self._distributed.scheduler.KilledWorker, CancelledError)):
+            self._repeated.extend((item,) for item in batch)
+            return []
+        if is_abandoned or is_lost:
             error = WorkerExitError(CRASHED, "its Dask workers died in succession", "")
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
+
+    def _count_abandoned(self, batch: Sequence[int]) -> int:
+        """Count and return how often the cluster has abandoned a batch: its scheduler restarted, for example."""
+        self._abandoned.update(batch)
+        return max(self._abandoned[item] for item in batch)
 
 
 def _start_local_cluster(address: str) -> Any:
@@ -145,16 +264,25 @@ def _start_local_cluster(address: str) -> Any:
     return LocalCluster(**worker_options, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
 
 
-def _identify_code() -> tuple[str, dict[str, str]]:
-    """Return the hash of the code and the versions of the packages in this process."""
-    return hash_code(()), read_versions()
+@cache
+def _identify_code() -> _Identity:
+    """Return the identity of the code in this process."""
+    return _Identity(hash_code(()), tuple(sorted(read_versions().items())))
 
 
-def _run_batch_isolated(work: Work[Result], executors: int) -> tuple[float, list[TaskResult[Result]]]:
-    """Run a batch in the worker process of this Dask thread; return the duration in seconds and the results."""
+def _run_batch_isolated(
+    work: Work[Result], executors: int, identity: _Identity
+) -> tuple[float, list[TaskResult[Result]]]:
+    """Run a batch in the worker process of this Dask thread; return the duration in seconds and the results.
+
+    identity: that of the program that submits the batch. Raises CampaignError if this worker has another one.
+    """
     start_s = time.perf_counter()
     workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
     if workers is None:
+        import distributed
+
+        identity.check(distributed.get_worker().address, _identify_code())
         # Dask's workers are daemons of `multiprocessing`, which must not have children. The kernel ends the children
         # together with the thread that started them.
         multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]

@@ -69,12 +69,19 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
-#: Target duration of a batch: sending a batch takes 3 ms, and a worker that dies loses at most one batch.
+#: Minimum target duration of a batch, s: a worker that dies loses at most one batch.
 _BATCH_S = 1.0
+#: Time that sending a batch takes, s, and the maximum fraction of its time that the program spends with this.
+_SENDING_S, _MAX_SENDING = 0.005, 0.5
 #: Maximum number of items in a batch.
 MAX_BATCH = 1000
 #: Weight of the latest batch in the exponential mean of the time per item.
 _LATEST_WEIGHT = 0.3
+
+
+def batch_duration_s(workers: int) -> float:
+    """Return the target duration of a batch: longer for many workers, so that sending batches is not the bottleneck."""
+    return max(_BATCH_S, _SENDING_S / _MAX_SENDING * workers)
 
 
 class Batches:
@@ -88,13 +95,13 @@ class Batches:
     def __init__(self, items: Iterable[int], total: int | None, workers: int) -> None:
         self._source = iter(items)
         self._remaining = math.inf if total is None else total
-        self._workers = workers
+        self.workers = workers
         self._size = 1
         self._item_s = math.nan
 
     def next(self) -> list[int]:
         """Return the next batch; empty if no items remain."""
-        size = max(1, int(min(self._size, self._remaining / (2 * self._workers))))
+        size = max(1, int(min(self._size, self._remaining / (2 * self.workers))))
         batch = list(itertools.islice(self._source, size))
         self._remaining -= len(batch)
         return batch
@@ -103,7 +110,7 @@ class Batches:
         """Update the time per item from a finished batch; a batch is at most twice as large as the previous one."""
         latest, mean = seconds / items, self._item_s
         self._item_s = latest if math.isnan(mean) else mean + _LATEST_WEIGHT * (latest - mean)
-        target_size = MAX_BATCH if self._item_s <= 0.0 else int(_BATCH_S / self._item_s)
+        target_size = MAX_BATCH if self._item_s <= 0.0 else int(batch_duration_s(self.workers) / self._item_s)
         self._size = max(1, min(target_size, 2 * self._size, MAX_BATCH))
 
 

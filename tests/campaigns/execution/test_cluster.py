@@ -6,7 +6,14 @@ The address `local:N` starts a cluster of N workers on this machine.
 from __future__ import annotations
 
 import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +28,7 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import read_rows
-from tests.campaigns.fake_campaign import RecordingWatch
+from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, RecordingWatch, run
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -80,3 +87,86 @@ def test_invalid_address_does_not_delay_next_connection(monkeypatch: pytest.Monk
     monkeypatch.setattr("distributed.utils.get_loop_factory", collect_and_get_loop_factory)
     with pytest.raises(CampaignError, match="no scheduler responds"):
         ClusterExecutor("tcp://127.0.0.1:1")
+
+
+class _Cluster:
+    """A scheduler and workers as processes of their own, as a batch system starts them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+        self._scheduler = self._start("scheduler", "--host", self.address, "--no-dashboard")
+        self._workers: list[subprocess.Popen[bytes]] = []
+
+    def add_workers(self, number: int) -> None:
+        options = ("--nthreads", "1", "--no-dashboard", "--memory-limit", "0", "--local-directory", str(self._folder))
+        self._workers += [self._start("worker", self.address, *options) for _ in range(number)]
+
+    def kill_workers(self, number: int) -> None:
+        for process in self._workers[:number]:
+            self._kill(process)
+        del self._workers[:number]
+
+    def restart_scheduler(self) -> None:
+        self._kill(self._scheduler)
+        self._scheduler = self._start("scheduler", "--host", self.address, "--no-dashboard")
+
+    def close(self) -> None:
+        for process in [self._scheduler, *self._workers]:
+            self._kill(process)
+
+    def _start(self, *arguments: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "distributed.cli.dask_" + arguments[0], *arguments[1:]]
+        return subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    @staticmethod
+    def _kill(process: subprocess.Popen[bytes]) -> None:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+class _ActionAtRows(RecordingWatch):
+    """Runs actions in a thread of its own as soon as a number of rows is stored."""
+
+    def __init__(self, actions: dict[int, Callable[[], None]]) -> None:
+        super().__init__()
+        self._actions = actions
+        self.threads: list[threading.Thread] = []
+
+    def step(self) -> None:
+        super().step()
+        for number in [number for number in self._actions if number <= self.steps["cases"]]:
+            thread = threading.Thread(target=self._actions.pop(number))
+            thread.start()
+            self.threads.append(thread)
+
+
+@pytest.mark.slow
+def test_lost_workers_and_a_restarted_scheduler_lose_nothing(
+    campaign_file: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Three of eight workers are killed, then the scheduler; five workers join the new scheduler."""
+    keys = TOP_LEVEL_KEYS.replace("cases = 12", "cases = 240")
+    path, cluster = campaign_file("sleep_s = 0.2", top_level_keys=keys), _Cluster(tmp_path / "dask")
+
+    def restart() -> None:
+        cluster.restart_scheduler()
+        cluster.kill_workers(5)  # Dask's workers end without their scheduler
+        cluster.add_workers(5)
+
+    watch = _ActionAtRows({30: lambda: cluster.kill_workers(3), 100: restart})
+    try:
+        cluster.add_workers(8)
+        run_campaign(load_campaign(str(path)), tmp_path / "cluster", ExecutorConfig(cluster=cluster.address), watch)
+        for thread in watch.threads:
+            thread.join()
+    finally:
+        cluster.close()
+    assert len(watch.threads) == 2
+    run(path, tmp_path / "machine", RecordingWatch(), "sleep_s=0", jobs=1)
+    rows = [read_rows(tmp_path / name / "cases.parquet") for name in ("cluster", "machine")]
+    assert [len(table) for table in rows] == [240, 240]
+    assert [differing_columns(*pair) for pair in zip(*rows, strict=True)] == [()] * 240
