@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,19 +54,31 @@ class PlannedCampaign(Parameters):
         return load_campaign(name, self.override, self.cases, night_seed(seed, night), self.algorithms)
 
 
+class PlannedCheck(Parameters):
+    """A program to run each night after the campaigns, in the folder of the plan: speed benchmarks, for example."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][\w.-]*$", description="name on the page, and of its log file")]
+    command: Annotated[tuple[str, ...], Field(strict=False, min_length=1, description="program and its arguments")]
+    time_limit_s: Annotated[float, Field(gt=0.0)] = 3600.0
+
+
 class Plan(Parameters):
-    """Plan of the campaigns to run each night, read from a TOML file."""
+    """Plan of the campaigns and checks to run each night, read from a TOML file."""
 
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(
         default=0, description="seed from which the root seed of each night is derived: each night draws new cases"
     )
     campaigns: Annotated[tuple[PlannedCampaign, ...], Field(strict=False, min_length=1)]
+    checks: Annotated[tuple[PlannedCheck, ...], Field(strict=False)] = ()
 
     @model_validator(mode="after")
     def _check_names(self) -> Plan:
         names = [entry.campaign for entry in self.campaigns]
         if len(set(names)) < len(names):
             raise ValueError("the plan contains a campaign twice; copy it to a second file with another name")
+        names += [check.name for check in self.checks]
+        if len(set(names)) < len(names):
+            raise ValueError("the name of a check is used twice")
         return self
 
 
@@ -123,6 +136,31 @@ def run_scheduled_campaign(run: NightlyRun, entry: PlannedCampaign, folder: Path
             traceback.print_exc()
         result = NightCampaign(entry.campaign, "", "", NOT_RUN, Exit.FAILED, f"{type(error).__name__}: {error}")
     run.history.add(run.number, result, night_metrics)
+
+
+def run_check(run: NightlyRun, check: PlannedCheck, folder: Path) -> None:
+    """Run a check, store its output next to the campaigns, and store its verdict: PASS for the exit code 0."""
+    log = run.out / RUNS / f"night-{run.number:05d}-{check.name}.log"
+    try:
+        with log.open("wb") as output:
+            # the plan's author chooses the command, as in a crontab
+            finished = subprocess.run(  # noqa: S603
+                check.command,
+                cwd=folder,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                timeout=check.time_limit_s,
+                check=False,
+            )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        result = NightCampaign(check.name, "", "", NOT_RUN, Exit.FAILED, str(error))
+    else:
+        lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        is_met = finished.returncode == 0
+        sentence = f"exit code {finished.returncode}: {lines[-1] if lines else 'no output'}; log: {RUNS}/{log.name}"
+        verdict, status = ("PASS", Exit.MET) if is_met else ("FAIL", Exit.FAILED)
+        result = NightCampaign(check.name, "", "", verdict, status, sentence)
+    run.history.add(run.number, result, [])
 
 
 def publish_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> None:

@@ -173,8 +173,8 @@ def nightly(
 ) -> None:
     """Run the planned campaigns, compare each metric with previous nightly runs, write nightly.md and the dashboard.
 
-    Exit status: 1 if a requirement failed, a case crashed, a metric regressed or a campaign could not be run; otherwise
-    3 if a requirement is undecided; otherwise 0.
+    Exit status: 1 if a requirement or a check failed, a case crashed, a metric regressed or a campaign could not be
+    run; otherwise 3 if a requirement is undecided; otherwise 0.
     """
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import folder_lock, git_commit
@@ -195,6 +195,8 @@ def nightly(
                 run = plans.NightlyRun(history, night, out, executor, plan_definition)
                 for entry in plan_definition.campaigns:
                     plans.run_scheduled_campaign(run, entry, path.parent, observer)
+                for check in plan_definition.checks:
+                    plans.run_check(run, check, path.parent)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
             plans.publish_page(history, night, out, ())

@@ -74,6 +74,30 @@ def test_invalid_campaign_does_not_stop_the_nightly_run(nightly: Nightly, tmp_pa
     assert "| fake |" in report
 
 
+def test_checks_run_after_the_campaigns(nightly: Nightly, tmp_path: Path) -> None:
+    commands = {
+        "speed": [sys.executable, "-c", "import os; print('slow', os.getcwd()); raise SystemExit(1)"],
+        "versions": [sys.executable, "-c", "print('up to date')"],
+        "absent": [str(tmp_path / "absent")],
+        "hanging": [sys.executable, "-c", "import time; time.sleep(60)"],
+    }
+    limits = dict.fromkeys(commands, 60.0) | {"hanging": 0.1}
+    checks = "".join(
+        f"[[checks]]\nname = {json.dumps(name)}\ncommand = {json.dumps(command)}\ntime_limit_s = {limits[name]}\n"
+        for name, command in commands.items()
+    )
+    (tmp_path / "plan.toml").write_text(f'[[campaigns]]\ncampaign = "unknown-campaign"\n{checks}')
+    status, report = nightly()
+    assert status == 1
+    assert f"| speed | FAIL | exit code 1: slow {tmp_path}; log: runs/night-00001-speed.log |" in report.replace(
+        "\\", ""
+    )
+    assert "| versions | PASS | exit code 0: up to date" in report
+    assert "| absent | NOT RUN |" in report
+    assert "| hanging | NOT RUN |" in report
+    assert (tmp_path / "out" / "runs" / "night-00001-versions.log").read_text() == "up to date\n"
+
+
 @pytest.mark.slow
 def test_killed_run_is_shown_and_not_compared(
     nightly: Nightly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -127,6 +151,8 @@ def test_campaigns_of_the_shipped_plan_load() -> None:
         ("not toml", "not valid TOML"),
         ('[[campaigns]]\ncampaign = "a"\ncase = 3\n', "campaigns[0].case"),
         ('[[campaigns]]\ncampaign = "a"\n[[campaigns]]\ncampaign = "a"\n', "twice"),
+        ('[[campaigns]]\ncampaign = "a"\n[[checks]]\nname = "a"\ncommand = ["x"]\n', "used twice"),
+        ('[[campaigns]]\ncampaign = "a"\n[[checks]]\nname = "a/b"\ncommand = ["x"]\n', "checks[0].name"),
     ],
 )
 def test_invalid_plans_are_rejected(tmp_path: Path, text: str, message: str) -> None:
