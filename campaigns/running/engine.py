@@ -359,7 +359,7 @@ def _rerun_for_products(run: _CampaignRun, store: RowStore, executor: Executor) 
     run.observer.begin("showcase", len(cases))
     products = ProductStore(run.directory, configuration.retain.budget_gb)
     for case in cases:
-        rerun = replay_in_executor(executor, configuration, case, store.row(case))
+        rerun = replay_in_executor(executor, configuration, case, store.row(case), timeline=case == showcase)
         if rerun.differing:
             record.update(run.directory, {"showcase_differs": list(rerun.differing)})
             run.observer.note(f"case {case}, run again, differs from its stored row in: {', '.join(rerun.differing)}")

@@ -26,7 +26,7 @@ from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.products import REPLAYED_PRODUCTS, PackedProducts
+from marsyard.campaigns.store.products import ALL_PRODUCTS, REPLAYED_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
 from marsyard.scenarios import conformance as suite
@@ -84,11 +84,17 @@ def replay_in_executor(
     case: int,
     stored: Row | None,
     changed: tuple[str, ...] = (),
+    *,
+    timeline: bool = True,
 ) -> Replay:
-    """Run one case again in an executor, and compare it with its stored row, which contains the point of a study."""
+    """Run one case again in an executor, and compare it with its stored row, which contains the point of a study.
+
+    timeline: whether the products contain the timeline of the case
+    """
     text = None if stored is None else stored.get(POINT_COLUMN)
     points = {case: Point.read(text)} if isinstance(text, str) else {}
-    ((completed,),) = run_cases(executor, configuration, [case], selection=REPLAYED_PRODUCTS, points=points)
+    selection = REPLAYED_PRODUCTS if timeline else ALL_PRODUCTS
+    ((completed,),) = run_cases(executor, configuration, [case], selection=selection, points=points)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 
