@@ -9,6 +9,7 @@ topic                       type                      contents
 /camera/NAME/pose           geometry_msgs/PoseStamped true pose of the optical frame (x right, y down, z forward)
 /imu                        sensor_msgs/Imu           measured rates and specific forces, body axes
 /pose/NAME                  geometry_msgs/PoseStamped poses of the path NAME: `true`, `estimated`
+/tf                         tf2_msgs/TFMessage        true poses of `body` and of the optical frames in `world`
 =========================== ========================= ======================================================
 
 Positions are in the frame `world` (east, north, up). Time 0 of the bag is the first time of the case; its time on the
@@ -74,6 +75,8 @@ class _BagWriter:
                 track.times_s, track.positions_m, track.quaternions_xyzw, strict=True
             ):
                 yield self._pose(f"/pose/{_topic_name(name)}", float(time_s), position, quaternion)
+                if name == "true":
+                    yield self._transform(_BODY, float(time_s), position, quaternion)
         if self._timeline.inertial is not None:
             data = self._timeline.inertial
             rows = zip(data.times_s, data.rates_rad_s, data.specific_forces_m_s2, strict=True)
@@ -130,7 +133,9 @@ class _BagWriter:
                 ),
             ),
         )
-        yield self._pose(f"{topic}/pose", image.time_s, image.pose.position_m, image.pose.quaternion_xyzw)
+        pose = image.time_s, image.pose.position_m, image.pose.quaternion_xyzw
+        yield self._pose(f"{topic}/pose", *pose)
+        yield self._transform(header.frame_id, *pose)
 
     def _pose(self, topic: str, time_s: float, position: np.ndarray, quaternion: np.ndarray) -> tuple[int, str, Any]:
         stamp, header = self._header(time_s, _WORLD)
@@ -138,6 +143,20 @@ class _BagWriter:
             position=self._type("geometry_msgs/msg/Point")(*position.tolist()), orientation=self._quaternion(quaternion)
         )
         return stamp, topic, self._type("geometry_msgs/msg/PoseStamped")(header=header, pose=pose)
+
+    def _transform(
+        self, frame: str, time_s: float, position: np.ndarray, quaternion: np.ndarray
+    ) -> tuple[int, str, Any]:
+        """Return the pose of a frame in the world as a transform for `/tf`."""
+        stamp, header = self._header(time_s, _WORLD)
+        transform = self._type("geometry_msgs/msg/Transform")(
+            translation=self._type("geometry_msgs/msg/Vector3")(*position.tolist()),
+            rotation=self._quaternion(quaternion),
+        )
+        stamped = self._type("geometry_msgs/msg/TransformStamped")(
+            header=header, child_frame_id=frame, transform=transform
+        )
+        return stamp, "/tf", self._type("tf2_msgs/msg/TFMessage")(transforms=[stamped])
 
     def _quaternion(self, xyzw: np.ndarray) -> Any:
         return self._type("geometry_msgs/msg/Quaternion")(*xyzw.tolist())

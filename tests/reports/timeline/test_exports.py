@@ -116,7 +116,7 @@ def test_ros_bag_is_read_back(tmp_path: Path) -> None:
             messages.setdefault(connection.topic, []).append((stamp_ns, message))
     assert sorted(messages) == [
         "/camera/descent_camera/camera_info", "/camera/descent_camera/image_raw", "/camera/descent_camera/pose",
-        "/imu", "/pose/estimated", "/pose/true",
+        "/imu", "/pose/estimated", "/pose/true", "/tf",
     ]  # fmt: skip
     (first_ns, image), (second_ns, _) = messages["/camera/descent_camera/image_raw"]
     assert (first_ns, second_ns) == (10**9, 2 * 10**9)  # the first time of the case is -1 s
@@ -129,6 +129,8 @@ def test_ros_bag_is_read_back(tmp_path: Path) -> None:
     assert info.distortion_model == "plumb_bob"
     pose = messages["/pose/true"][2][1].pose
     assert (pose.position.x, pose.position.y, pose.position.z) == (*CENTRE_M, 80.0)
+    frames = {item.child_frame_id for _, message in messages["/tf"] for item in message.transforms}
+    assert frames == {"body", "descent_camera_optical"}
     imu = messages["/imu"][0][1]
     assert (imu.angular_velocity.x, imu.linear_acceleration.z) == (0.1, 3.7)
     assert "start_s: '-1.0'" in (tmp_path / "bag" / "metadata.yaml").read_text()
