@@ -45,9 +45,18 @@ def recording_timelines(is_recording: bool = True) -> Iterator[None]:
         _is_recording.reset(token)
 
 
-def timeline_products(create: Callable[[], Timeline]) -> dict[str, Any]:
-    """Return the timeline as a product; empty, without a call of `create`, unless timelines are recorded."""
-    return {PRODUCT: create().to_products()} if _is_recording.get() else {}
+def timeline_products(create: Callable[[], Timeline], *, is_tested: bool = True) -> dict[str, Any]:
+    """Return the timeline as a product; empty, without a call of `create`, unless timelines are recorded.
+
+    is_tested: whether the products are those of the algorithm under test; other products are not stored
+    An exception of `create` does not affect the case: its text is stored instead of the timeline.
+    """
+    if not _is_recording.get() or not is_tested:
+        return {}
+    try:
+        return {PRODUCT: create().to_products()}
+    except Exception as error:  # an unusual answer must not change the result of the case
+        return {PRODUCT: f"{type(error).__name__}: {error}"}
 
 
 @dataclass(frozen=True)
@@ -92,6 +101,7 @@ class CameraPose:
     - focal_px, centre_px: focal lengths and image centre, (columns, rows); the centre of the upper left pixel is (0, 0)
     - distortion: O in camera axes and R of a CAHVOR camera (6 numbers), followed by E and the linearity of a CAHVORE
       camera (10 numbers); empty without distortion
+    - corner_rays: unit directions of the image's outer corners in camera axes, clockwise from the upper left one
     """
 
     position_m: Float64[np.ndarray, "3"]
@@ -99,6 +109,7 @@ class CameraPose:
     focal_px: Float64[np.ndarray, "2"]
     centre_px: Float64[np.ndarray, "2"]
     distortion: Float64[np.ndarray, "_"]
+    corner_rays: Float64[np.ndarray, "4 3"]
 
     @classmethod
     def from_camera(cls, camera: CameraModel, world_from_body: RigidTransform) -> CameraPose:
@@ -116,6 +127,7 @@ class CameraPose:
             np.array(camera.focal_lengths, dtype=np.float64),
             np.array(camera.image_centre, dtype=np.float64),
             distortion,
+            camera.corner_rays()[1] @ axes,
         )
 
 
@@ -178,10 +190,10 @@ class InertialData:
     specific_forces_m_s2: Float64[np.ndarray, "n 3"]
 
     @classmethod
-    def from_increments(cls, increments: ImuIncrements) -> InertialData:
-        """Divide increments by the nominal period."""
+    def from_increments(cls, increments: ImuIncrements, offset_s: float = 0.0) -> InertialData:
+        """Divide increments by the nominal period; subtract an offset from their time tags."""
         return cls(
-            np.asarray(increments.times_s[1:], dtype=np.float64),
+            np.asarray(increments.times_s[1:], dtype=np.float64) - offset_s,
             np.asarray(increments.delta_angles_rad / increments.period_s, dtype=np.float64),
             np.asarray(increments.delta_velocities_m_s / increments.period_s, dtype=np.float64),
         )
@@ -214,13 +226,18 @@ class Timeline:
 
     @classmethod
     def from_products(cls, products: Mapping[str, Any]) -> Timeline | None:
-        """Read the timeline of a case from its products; None without one."""
+        """Read the timeline of a case from its products; None without one, or for one of another version."""
         stored = products.get(PRODUCT)
         if not isinstance(stored, Mapping):
             return None
-        tables = {name: {key: part(**values) for key, values in stored[name].items()} for name, part in _TABLES.items()}
-        images = [TimedImage(**{**image, "pose": CameraPose(**image["pose"])}) for image in stored["images"]]
-        inertial = None if stored["inertial"] is None else InertialData(**stored["inertial"])
+        try:
+            tables = {
+                name: {key: part(**values) for key, values in stored[name].items()} for name, part in _TABLES.items()
+            }
+            images = [TimedImage(**{**image, "pose": CameraPose(**image["pose"])}) for image in stored["images"]]
+            inertial = None if stored["inertial"] is None else InertialData(**stored["inertial"])
+        except (LookupError, TypeError, AttributeError):
+            return None
         return cls(**tables, images=images, inertial=inertial)
 
 

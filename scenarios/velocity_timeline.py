@@ -41,6 +41,7 @@ class VelocityCase:
     - states, images: true states at the images, and the delivered images
     - camera: true camera of the delivered images in body axes
     - mounting: rotation of the camera in the body
+    - triple: indices of the images that DIMES received; None if there are too few
     - increments: measured inertial increments; None without an inertial unit of the vision system
     """
 
@@ -52,6 +53,7 @@ class VelocityCase:
     bits: int
     camera: CameraModel
     mounting: RigidTransform
+    triple: tuple[int, int, int] | None = (0, 1, 2)
     increments: ImuIncrements | None = None
 
     def timeline(self, estimate: VelocityEstimate | None, start: State | None) -> Timeline:
@@ -98,16 +100,18 @@ class VelocityCase:
             images.append(TimedImage("descent camera", state.time_s, counts, self.bits, pose, marks))
         return images
 
-    @staticmethod
-    def _marks(details: DimesDetails, number: int, size: tuple[int, int]) -> dict[str, Float64[np.ndarray, "_ 2"]]:
+    def _marks(
+        self, details: DimesDetails, number: int, size: tuple[int, int]
+    ) -> dict[str, Float64[np.ndarray, "_ 2"]]:
         """Return the pixels of templates and matches in an image; those of DIMES are in binned images."""
+        triple = self.triple or ()
         marks: dict[str, list[Float64[np.ndarray, "2"]]] = {"templates": [], "matches": [], "rejected": []}
         for track in details.tracks:
             size_px = np.array(details.pairs[track.pair].views[0].size)
             scale = np.array(size) / size_px
             for image, pixel, name in (
-                (track.pair, track.template_pixel, "templates"),
-                (track.pair + 1, track.match_pixel, "matches"),
+                (triple[track.pair], track.template_pixel, "templates"),
+                (triple[track.pair + 1], track.match_pixel, "matches"),
             ):
                 if image == number:
                     marks[name if track.valid else "rejected"].append((np.asarray(pixel) + 0.5) * scale - 0.5)
@@ -119,7 +123,7 @@ class VelocityCase:
         points = {}
         for is_valid, name in names.items():
             tracks = [track for track in details.tracks if track.valid is is_valid]
-            states = [self.states[track.pair] for track in tracks]
+            states = [self.states[(self.triple or ())[track.pair]] for track in tracks]
             horizontal = [state.position_m[:2] + track.ground_m for state, track in zip(states, tracks, strict=True)]
             positions = np.array([[*point, float(self.surface.height(*point))] for point in horizontal]).reshape(-1, 3)
             points[name] = Points(np.array([state.time_s for state in states], dtype=np.float64), positions)

@@ -19,7 +19,7 @@ from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any, TypeVar
 
@@ -40,27 +40,23 @@ _REFRESH_S, _POLL_S = 10.0, 0.02
 _QUEUED_BATCHES = 2
 #: Maximum number of times that the cluster may abandon a single case.
 _MAX_ABANDONED = 5
-#: Worker process of each thread of a Dask worker (attribute `workers`).
+#: Executor of each thread of a Dask worker (`workers`), and with how many executors it shares the memory (`executors`).
 _thread_state = threading.local()
 
 
-@dataclass(frozen=True)
-class _Identity:
-    """Hash of the source code, and versions of the packages, by which workers are compared with this program."""
+#: Hash of the source code, and versions of the packages: plain types, which any worker can read.
+Identity = tuple[str, tuple[tuple[str, str], ...]]
 
-    code: str
-    versions: tuple[tuple[str, str], ...]
 
-    def check(self, worker: str, other: _Identity) -> None:
-        """Raise CampaignError if a worker has another identity."""
-        if other.code != self.code:
-            raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
-        theirs = dict(other.versions)
-        differing = [
-            f"{name} {theirs.get(name)} (here {mine})" for name, mine in self.versions if mine != theirs.get(name)
-        ]
-        if differing:
-            raise CampaignError(f"worker {worker} has different versions: {', '.join(differing)}")
+def check_identity(worker: str, theirs: Identity, ours: Identity) -> None:
+    """Compare the code of a worker with that of the client. Raises CampaignError if they differ."""
+    if theirs[0] != ours[0]:
+        raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
+    their_versions = dict(theirs[1])
+    differing = [(name, version) for name, version in ours[1] if version != their_versions.get(name)]
+    if differing:
+        pairs = (f"{name} {their_versions.get(name)} (here {version})" for name, version in differing)
+        raise CampaignError(f"worker {worker} has different versions: {', '.join(pairs)}")
 
 
 class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
@@ -76,6 +72,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
         except ImportError as error:
             raise CampaignError("a cluster needs Dask: pip install 'marsyard[dask]'") from error
         self._distributed, self._address = distributed, address
+        self._checked: set[str] = set()
         with ExitStack() as stack:
             self._cluster: Any = None
             try:
@@ -112,7 +109,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
 
     def submit(self, work: Work[Any], executors: int) -> Any:
         """Submit a batch; return its future. `executors` share the memory of a machine."""
-        return self._client.submit(_run_batch_isolated, work, executors, _identify_code(), pure=False)
+        return self._client.submit(_run_batch_isolated, work, executors, identify_code(), pure=False)
 
     def cancel(self, futures: Sequence[Any]) -> None:
         """Cancel futures; without a scheduler there are none."""
@@ -140,11 +137,29 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
                 return
 
     def count_threads(self) -> tuple[int, int]:
-        """Return the number of threads of all workers, and the largest number of threads on one machine."""
+        """Return the number of threads of all workers, and the largest number of threads on one machine.
+
+        Raises CampaignError if a new worker does not run the same code.
+        """
+        workers = self._client.scheduler_info(n_workers=-1)["workers"]
+        self._check_workers([address for address in workers if address not in self._checked])
         machines: Counter[str] = Counter()
-        for worker in self._client.scheduler_info(n_workers=-1)["workers"].values():
+        for worker in workers.values():
             machines[worker["host"]] += worker["nthreads"]
         return machines.total(), max(machines.values(), default=1)
+
+    def _check_workers(self, addresses: list[str]) -> None:
+        """Compare the code of workers with that of the client; a worker that has left is omitted."""
+        if not addresses:
+            return
+        identities = self._client.run(identify_code, workers=addresses, on_error="return")
+        for address, identity in identities.items():
+            if isinstance(identity, OSError):
+                continue
+            if isinstance(identity, BaseException):
+                raise CampaignError(f"worker {address} cannot run Marsyard: {identity!r}")
+            check_identity(address, identity, identify_code())
+            self._checked.add(address)
 
     def create_queue(self) -> Any:
         """Create an iterator over futures in the order in which they finish."""
@@ -164,6 +179,8 @@ class _BatchQueue:
         self._repeated: deque[Sequence[int]] = deque()
         self._abandoned: Counter[int] = Counter()
         self._futures: dict[Any, Sequence[int]] = {}
+        if not cluster.is_connected:
+            cluster.reconnect()
         self._completed = cluster.create_queue()
         self._threads, self._executors = 0, 1
         self._refreshed_s = self._with_workers_s = time.monotonic()
@@ -188,6 +205,8 @@ class _BatchQueue:
 
     def _fill(self) -> None:
         """Submit batches until the queue is full; lost batches first."""
+        if not self._cluster.is_connected:
+            self._submit_again()
         while len(self._futures) < _QUEUED_BATCHES * max(self._threads, 1):
             batch = self._repeated.popleft() if self._repeated else self._batches.next()
             if not batch:
@@ -227,24 +246,34 @@ class _BatchQueue:
         self._refresh()
 
     def _collect(self, future: Any, batch: Sequence[int]) -> list[TaskResult[Any]]:
-        """Return the results of a batch; empty if it was lost and is queued again."""
-        error = CancelledError() if future.status == "cancelled" else future.exception()
-        if error is None:
-            seconds, results = future.result()
+        """Return the results of a batch; empty if it was lost and is queued again.
+
+        Raises CampaignError if the cluster cannot run batches.
+        """
+        try:
+            if future.status == "cancelled":
+                raise CancelledError
+            # the results are fetched from the worker, which or whose scheduler can be lost at this moment
+            seconds, results = future.result(timeout=_TIMEOUT_S)
+        except CampaignError:
+            raise
+        except (CancelledError, OSError, TimeoutError):
+            is_abandoned = True
+        except Exception as error:
+            if not self._cluster.is_lost_with_workers(error):
+                hint = "the finished cases are stored, `marsyard resume` continues"
+                raise CampaignError(f"the cluster cannot run a batch: {error!r}; {hint}") from error
+            is_abandoned = False
+        else:
             self._batches.record_time(len(batch), seconds)
             return list(results)
-        if isinstance(error, CampaignError):
-            raise error
-        is_abandoned, is_lost = isinstance(error, CancelledError), self._cluster.is_lost_with_workers(error)
         if is_abandoned and self._count_abandoned(batch) <= _MAX_ABANDONED:
             self._repeated.append(batch)
-            return []
-        if len(batch) > 1:
+        elif len(batch) > 1:
             self._repeated.extend((item,) for item in batch)
-            return []
-        if is_abandoned or is_lost:
-            error = WorkerExitError(CRASHED, "its Dask workers died in succession", "")
-        return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
+        else:
+            return [TaskResult(batch[0], None, WorkerExitError(CRASHED, "its Dask workers died in succession", ""))]
+        return []
 
     def _count_abandoned(self, batch: Sequence[int]) -> int:
         """Count and return how often the cluster has abandoned a batch: its scheduler restarted, for example."""
@@ -265,27 +294,36 @@ def _start_local_cluster(address: str) -> Any:
 
 
 @cache
-def _identify_code() -> _Identity:
+def identify_code() -> Identity:
     """Return the identity of the code in this process."""
-    return _Identity(hash_code(()), tuple(sorted(read_versions().items())))
+    return hash_code(()), tuple(sorted(read_versions().items()))
 
 
 def _run_batch_isolated(
-    work: Work[Result], executors: int, identity: _Identity
+    work: Work[Result], executors: int, identity: Identity
 ) -> tuple[float, list[TaskResult[Result]]]:
     """Run a batch in the worker process of this Dask thread; return the duration in seconds and the results.
 
     identity: that of the program that submits the batch. Raises CampaignError if this worker has another one.
     """
-    start_s = time.perf_counter()
-    workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
-    if workers is None:
-        import distributed
+    import distributed
 
-        identity.check(distributed.get_worker().address, _identify_code())
-        # Dask's workers are daemons of `multiprocessing`, which must not have children. The kernel ends the children
-        # together with the thread that started them.
-        multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-        workers = _thread_state.workers = LocalExecutor(1, executors)
-    results = [result for batch in workers.run(work) for result in batch]
+    check_identity(distributed.get_worker().address, identify_code(), identity)
+    start_s = time.perf_counter()
+    results = [result for batch in _local_executor(executors).run(work) for result in batch]
     return time.perf_counter() - start_s, results
+
+
+def _local_executor(executors: int) -> LocalExecutor:
+    """Return the executor of this Dask thread; a new one if more executors share the memory of the machine now."""
+    workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
+    if workers is not None and executors <= _thread_state.executors:
+        return workers
+    if workers is not None:
+        workers.stop(kill=False)
+    # Dask's workers are daemons of `multiprocessing`, which must not have children. The kernel ends the children
+    # together with the thread that started them.
+    multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
+    workers = LocalExecutor(1, executors)
+    _thread_state.workers, _thread_state.executors = workers, executors
+    return workers

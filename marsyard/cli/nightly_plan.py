@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import signal
 import subprocess
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -76,8 +79,7 @@ class Plan(Parameters):
         names = [entry.campaign for entry in self.campaigns]
         if len(set(names)) < len(names):
             raise ValueError("the plan contains a campaign twice; copy it to a second file with another name")
-        names += [check.name for check in self.checks]
-        if len(set(names)) < len(names):
+        if len({check.name for check in self.checks}) < len(self.checks):
             raise ValueError("the name of a check is used twice")
         return self
 
@@ -140,26 +142,31 @@ def run_scheduled_campaign(run: NightlyRun, entry: PlannedCampaign, folder: Path
 
 def run_check(run: NightlyRun, check: PlannedCheck, folder: Path) -> None:
     """Run a check, store its output next to the campaigns, and store its verdict: PASS for the exit code 0."""
-    log = run.out / RUNS / f"night-{run.number:05d}-{check.name}.log"
+    log, name = run.out / RUNS / f"night-{run.number:05d}-{check.name}.log", f"check: {check.name}"
     try:
         with log.open("wb") as output:
-            # the plan's author chooses the command, as in a crontab
-            finished = subprocess.run(  # noqa: S603
+            # the plan's author chooses the command, as in a crontab; its session contains all its processes
+            process = subprocess.Popen(  # noqa: S603
                 check.command,
                 cwd=folder,
+                stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                timeout=check.time_limit_s,
-                check=False,
+                start_new_session=True,
             )
+            try:
+                code = process.wait(check.time_limit_s)
+            finally:
+                with suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
     except (OSError, subprocess.TimeoutExpired) as error:
-        result = NightCampaign(check.name, "", "", NOT_RUN, Exit.FAILED, str(error))
+        result = NightCampaign(name, "", "", NOT_RUN, Exit.FAILED, str(error))
     else:
         lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        is_met = finished.returncode == 0
-        sentence = f"exit code {finished.returncode}: {lines[-1] if lines else 'no output'}; log: {RUNS}/{log.name}"
-        verdict, status = ("PASS", Exit.MET) if is_met else ("FAIL", Exit.FAILED)
-        result = NightCampaign(check.name, "", "", verdict, status, sentence)
+        sentence = f"exit code {code}: {lines[-1] if lines else 'no output'}; log: {RUNS}/{log.name}"
+        verdict, status = ("PASS", Exit.MET) if code == 0 else ("FAIL", Exit.FAILED)
+        result = NightCampaign(name, "", "", verdict, status, sentence)
     run.history.add(run.number, result, [])
 
 

@@ -73,8 +73,6 @@ def replay(
         if line:
             typer.echo(line)
     typer.echo("\n".join(output_lines))
-    if exports:
-        _write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
     if result.changed:
         typer.echo(f"changed since the campaign was run: {'; '.join(result.changed)}")
     if result.stored is None:
@@ -83,9 +81,12 @@ def replay(
         typer.echo(f"the row differs from the stored one in: {', '.join(result.differing)}")
         for column in result.differing:
             typer.echo(f"  {column}: {result.stored.get(column)!r} stored, {result.row.get(column)!r} now")
-        raise typer.Exit(options.Exit.FAILED)
     else:
         typer.echo("the row equals the stored one")
+    if exports:
+        _write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
+    if result.stored is not None and result.differing:
+        raise typer.Exit(options.Exit.FAILED)
 
 
 @dataclass(frozen=True)
@@ -124,12 +125,12 @@ def _requested_exports(rerun: Path | None, glb: Path | None, rosbag: Path | None
 def _write_exports(exports: list[_Export], products: Mapping[str, Any], case: int) -> None:
     """Write the timeline of a case. Raises CampaignError without one, and StoreError if a file cannot be written."""
     from marsyard.campaigns.errors import CampaignError, report_write_errors
-    from marsyard.scenarios.timeline import Timeline
+    from marsyard.scenarios.timeline import PRODUCT, Timeline
 
     timeline = Timeline.from_products(products)
     if timeline is None:
         names = ", ".join(export.option for export in exports)
-        reason = "its scenario records none, or the case did not finish"
+        reason = products.get(PRODUCT, "its scenario records none, or the case did not finish")
         raise CampaignError(f"{names}: case {case} has no timeline: {reason}")
     for export in exports:
         with report_write_errors(export.target):

@@ -17,8 +17,8 @@ from marsyard.scenarios.timeline import SurfacePatch, Timeline
 _MAX_CELLS, _MAX_CAMERAS = 96, 12
 #: Viewing direction, deg.
 _AZIMUTH_DEG, _ELEVATION_DEG = -60.0, 28.0
-#: Margin around the drawn part of the ground, divided by the extent of the case.
-_MARGIN = 0.25
+#: Margin around the drawn part of the ground, divided by the extent of the case; minimum extent, m.
+_MARGIN, _MIN_EXTENT_M = 0.25, 1.0
 #: Tint of the ground, RGB.
 _TINT = np.array([1.0, 0.82, 0.66])
 
@@ -69,8 +69,8 @@ def _extent(timeline: Timeline) -> tuple[np.ndarray, np.ndarray]:
     ground = timeline.surfaces["ground"].points_m.reshape(-1, 3)
     low, high = positions.min(axis=0), positions.max(axis=0)
     # at least as wide as high, so that the ground below a descent is visible
-    margin = _MARGIN * (high - low).max()
-    centre, half = 0.5 * (low + high)[:2], 0.5 * (high - low).max() + margin
+    extent = max(float((high - low).max()), _MIN_EXTENT_M)
+    centre, half = 0.5 * (low + high)[:2], (0.5 + _MARGIN) * extent
     low[:2], high[:2] = centre - half, centre + half
     is_inside = ((ground[:, :2] >= low[:2]) & (ground[:, :2] <= high[:2])).all(axis=1)
     if is_inside.any():

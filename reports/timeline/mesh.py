@@ -50,11 +50,8 @@ def ground_width_m(timeline: Timeline) -> float:
 
 def camera_outlines(image: TimedImage, width_m: float) -> Float64[np.ndarray, "8 2 3"]:
     """Return the edges of a camera's field of view: from the camera to the corners, and between the corners."""
-    rows, columns = image.counts.shape
     pose = image.pose
-    corners = np.array([(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)])
-    rays = np.column_stack([(corners - pose.centre_px) / pose.focal_px, np.ones(4)])
-    rays *= _OUTLINE_RATIO * width_m / np.linalg.norm(rays, axis=1).max()
+    rays = _OUTLINE_RATIO * width_m * pose.corner_rays
     ends = pose.position_m + Rotation.from_quat(pose.quaternion_xyzw).apply(rays)
     starts = np.broadcast_to(pose.position_m, ends.shape)
     return np.concatenate([np.stack([starts, ends], axis=1), np.stack([ends, np.roll(ends, -1, axis=0)], axis=1)])

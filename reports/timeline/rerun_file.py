@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.reports.timeline.mesh import colour, ground_width_m, triangulate, vertex_colours
@@ -28,6 +29,7 @@ def write_rerun(path: Path, timeline: Timeline, name: str) -> None:
 
     name: title of the recording
     """
+    path.write_bytes(b"")  # OSError if the file cannot be written; the recording would raise another exception
     recording = rr.RecordingStream("marsyard", recording_id=name)
     recording.save(path)
     recording.send_recording_name(name)
@@ -85,7 +87,7 @@ def _log_image(recording: rr.RecordingStream, image: TimedImage, width_m: float)
     recording.log(entity, rr.Transform3D(translation=pose.position_m, quaternion=pose.quaternion_xyzw))
     # the centre of Rerun's upper left pixel is (0.5, 0.5)
     pinhole = rr.Pinhole(
-        focal_length=pose.focal_px,
+        focal_length=_pinhole_focal_px(image),
         principal_point=pose.centre_px + 0.5,
         resolution=(columns, rows),
         camera_xyz=rr.ViewCoordinates.RDF,
@@ -104,6 +106,14 @@ def _log_image(recording: rr.RecordingStream, image: TimedImage, width_m: float)
         finite = boxes[np.isfinite(boxes).all(axis=1)]
         rectangles = rr.Boxes2D(mins=finite[:, :2] + 0.5, sizes=finite[:, 2:], colors=[colour(name)])
         recording.log(f"{entity}/{rr.escape_entity_path_part(name)}", rectangles)
+
+
+def _pinhole_focal_px(image: TimedImage) -> Float64[np.ndarray, "2"]:
+    """Return the focal lengths of a pinhole camera with the field of view of the image's corners."""
+    rows, columns = image.counts.shape
+    corners = np.array([(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)])
+    slopes = image.pose.corner_rays[:, :2] / image.pose.corner_rays[:, 2:]
+    return np.asarray(np.mean((corners - image.pose.centre_px) / slopes, axis=0))
 
 
 def _log_ellipsoids(recording: rr.RecordingStream, entity: str, ellipsoids: Ellipsoids) -> None:

@@ -54,7 +54,7 @@ class _BagWriter:
         times += [float(path.times_s.min()) for path in timeline.paths.values() if path.times_s.size]
         if timeline.inertial is not None:
             times.append(float(timeline.inertial.times_s[0]))
-        self._start_s = min(times)
+        self._start_s = min(times, default=0.0)
 
     def write(self, directory: Path) -> None:
         """Write all messages; they are sorted by time."""

@@ -222,6 +222,6 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
     products = {
         **velocity_products(images, estimate, truth),
         **stream_products(estimate, descent.truth),
-        **timeline_products(lambda: descent_timeline(descent, estimate)),
+        **timeline_products(lambda: descent_timeline(descent, estimate), is_tested=algorithm == p.algorithm),
     }
     return algorithm_result(algorithm_run, velocity is not None, row, products)

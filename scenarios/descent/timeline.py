@@ -33,9 +33,14 @@ def descent_timeline(descent: Descent, estimate: VelocityEstimate | None) -> Tim
         bits=p.detector.bits,
         camera=camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed),
         mounting=draw_mounting(p, descent.streams),
+        triple=p.triple_indices,
         increments=descent.measurements.increments,
     )
-    start = states[-2] if len(states) > 1 else first
-    if estimate is not None and estimate.span_s is not None and estimate.span_s[0] in descent.measurements.tags_s:
-        start = states[descent.measurements.tags_s.index(estimate.span_s[0])]
+    start = None
+    if estimate is not None:
+        # as in `true_velocity`: tags between two images are interpolated
+        tags_s = descent.measurements.tags_s
+        start_tag_s = tags_s[-2] if estimate.span_s is None else estimate.span_s[0]
+        start_s = float(np.interp(start_tag_s, tags_s, [state.time_s for state in states]))
+        start = descent.flight.motion.state(start_s)
     return case.timeline(estimate, start)

@@ -119,7 +119,10 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
                 row |= compute_scores(p.scores, flight, {*row, *conditions})
             products = {
                 **velocity_products(images, estimate, truth),
-                **timeline_products(lambda: triple_timeline(run, ground, case.states, images, estimate)),
+                **timeline_products(
+                    lambda: triple_timeline(run, ground, case.states, images, estimate),
+                    is_tested=algorithm == p.algorithm,
+                ),
             }
             return algorithm_result(algorithm_run, velocity is not None, row, products)
 

@@ -114,7 +114,9 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
             is_converged = answer is not None and estimate.outcome.converged
             case_products = {
                 **products(case, estimate),
-                **timeline_products(lambda: landing_timeline(case, estimate, touchdown)),
+                **timeline_products(
+                    lambda: landing_timeline(case, estimate, touchdown), is_tested=algorithm == p.algorithm
+                ),
             }
             return algorithm_result(algorithm_run, is_converged, row, case_products)
 

@@ -90,8 +90,12 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             )
             answers = algorithm_run.answer
             row = {**algorithm_run.row, **({} if answers is None else score.answer_row(descent, answers))}
-            products = {} if answers is None else score.products(descent, answers)
-            products = {**products, **timeline_products(lambda: localisation_timeline(descent, answers))}
+            products = {
+                **({} if answers is None else score.products(descent, answers)),
+                **timeline_products(
+                    lambda: localisation_timeline(descent, answers), is_tested=algorithm == p.algorithm
+                ),
+            }
             is_answered = answers is not None and answers.outcome is PositionOutcome.VALID
             return algorithm_result(algorithm_run, is_answered, row, products)
 
@@ -118,6 +122,7 @@ class LocalisedDescent:
     """A simulated descent, its map and its measurements, which all algorithms of a case use.
 
     - states: true states at the images
+    - image_states: true states at the delivered images
     - inertial_start_s: true time of the first inertial boundary and of the initial state
     - imu_offset_s: time tags of the inertial unit minus true times, without jitter
     """
@@ -126,6 +131,7 @@ class LocalisedDescent:
     world: LocalisationWorld
     flight: LanderFlight
     states: tuple[State, ...]
+    image_states: tuple[State, ...]
     map_truth: MapTruth
     inertial_start_s: float
     imu_offset_s: float
@@ -162,13 +168,13 @@ class LocalisedDescent:
                 f"{flight.end_s:.4g} s"
             )
         states = tuple(flight.motion(times).state(row) for row in range(times.size))
-        images = _take_images(p, world, states, streams)
+        images, image_states = _take_images(p, world, states, streams)
         altitudes = _measure_altitudes(p, world, flight, float(times[-1]), streams)
         tags_s = [altitude.time_s for altitude in altitudes] + [image.time_s for image in images]
         span_s = _inertial_span(flight, float(times[-1]), tags_s)
         increments, initial, offset_s = _measure_inertially(p, flight, span_s, gravity, streams)
         measurements = LocalisationMeasurements(initial, map_product, increments, tuple(altitudes), tuple(images))
-        return cls(p, world, flight, states, map_truth, span_s[0], offset_s, measurements)
+        return cls(p, world, flight, states, tuple(image_states), map_truth, span_s[0], offset_s, measurements)
 
 
 def _map_terrain(p: LocalisationScenarioParameters) -> int:
@@ -191,8 +197,8 @@ def _create_world(p: LocalisationScenarioParameters, number: int) -> Localisatio
 
 def _take_images(
     p: LocalisationScenarioParameters, world: LocalisationWorld, states: Sequence[State], streams: Streams
-) -> list[DetectorImage]:
-    """Render and expose the images; lost images are omitted."""
+) -> tuple[list[DetectorImage], list[State]]:
+    """Render and expose the images; return the delivered images and the true states at their exposures."""
     optics = camera_optics(true_camera(p.camera))
     calibrated = (
         optics.camera if p.exact_instruments else draw_calibrated_camera(p.camera, streams.generator("calibration"))
@@ -213,6 +219,7 @@ def _take_images(
         shield = HeatShield.draw(states[0], angle, streams.generator("heat shield"))
     noise, losses = streams.generator("detector noise"), streams.generator("lost images")
     images: list[DetectorImage] = []
+    delivered_states: list[State] = []
     for number, (state, tag) in enumerate(zip(states, tags, strict=True), start=1):
         frame, motion = render_state(p.render.backend, scene, optics, state)
         height = float(state.position_m[2] - world.surface.height(*state.position_m[:2]))
@@ -227,7 +234,8 @@ def _take_images(
             counts = np.zeros_like(counts)
         if losses.random() >= p.faults.lost_images:
             images.append(DetectorImage(counts, float(tag), calibrated, detector.calibration))
-    return images
+            delivered_states.append(state)
+    return images, delivered_states
 
 
 def _inertial_span(flight: LanderFlight, last_s: float, tags_s: Sequence[float]) -> tuple[float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from jaxtyping import Float64
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.scenarios.localisation.instruments import true_camera
@@ -34,10 +35,15 @@ _STEP_S, _MAP_PX = 0.1, 384
 
 
 def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers | None) -> Timeline:
-    """Create the timeline of a descent: images with landmarks, estimates with covariance, map and ground."""
+    """Create the timeline of a descent: images with landmarks, estimates with covariance, map and ground.
+
+    Estimates are relative to the map. Here they are in the world: the displacement of the map is subtracted, so that
+    their distance from the true path is the error. Their time tags are those of the inertial unit; its offset is
+    subtracted.
+    """
     flight, surface = descent.flight, descent.world.surface
     first, last_s = descent.states[0], descent.states[-1].time_s
-    motion = flight.motion(np.arange(first.time_s, last_s, _STEP_S))
+    motion = flight.motion(np.append(np.arange(first.time_s, last_s, _STEP_S), last_s))
     altitudes = motion.positions_m[:, 2] - surface.height(*motion.positions_m.T[:2])
     centre = (float(first.position_m[0]), float(first.position_m[1]))
     half_width_m = _HALF_WIDTH_RATIO * descent.p.flight.altitude_start_m
@@ -47,19 +53,28 @@ def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers | No
             "ground": surface_from_above(descent.world.scene, centre, half_width_m, descent.p.render.backend),
             "map": _map_surface(descent),
         },
-        paths={"true": Path.from_motion(motion), **_estimated_path(answers)},
+        paths={"true": Path.from_motion(motion), **_estimated_path(descent, answers)},
         images=_images(descent, answers),
-        points={"initial position": Points(np.array([initial.time_s]), np.asarray(initial.position_m)[None])},
-        ellipsoids=_covariances(answers),
+        points={
+            "initial position": Points(
+                np.array([initial.time_s - descent.imu_offset_s]), _to_world(descent, initial.position_m[None])
+            )
+        },
+        ellipsoids=_covariances(descent, answers),
         series={
             "altitude, m": Series(motion.times_s, np.asarray(altitudes)),
             **({} if answers is None else _error_series(descent, answers)),
         },
-        inertial=InertialData.from_increments(descent.measurements.increments),
+        inertial=InertialData.from_increments(descent.measurements.increments, descent.imu_offset_s),
     )
 
 
-def _estimated_path(answers: StreamAnswers | None) -> dict[str, Path]:
+def _to_world(descent: LocalisedDescent, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Subtract the displacement of the map from positions on the map."""
+    return np.column_stack([descent.map_truth.world_position(positions_m[:, :2]), positions_m[:, 2]])
+
+
+def _estimated_path(descent: LocalisedDescent, answers: StreamAnswers | None) -> dict[str, Path]:
     """Return the path through the reported states; empty without one."""
     reported = [
         (answer.time_s, answer.position_m, answer.world_from_body.as_quat())
@@ -69,10 +84,10 @@ def _estimated_path(answers: StreamAnswers | None) -> dict[str, Path]:
     if not reported:
         return {}
     times, positions, quaternions = (np.array(values, dtype=np.float64) for values in zip(*reported, strict=True))
-    return {"estimated": Path(times, positions, quaternions)}
+    return {"estimated": Path(times - descent.imu_offset_s, _to_world(descent, positions), quaternions)}
 
 
-def _covariances(answers: StreamAnswers | None) -> dict[str, Ellipsoids]:
+def _covariances(descent: LocalisedDescent, answers: StreamAnswers | None) -> dict[str, Ellipsoids]:
     """Return the reported positions with their covariances; empty without one."""
     reported = [
         (answer.time_s, answer.position_m, answer.covariance[:3, :3])
@@ -82,19 +97,19 @@ def _covariances(answers: StreamAnswers | None) -> dict[str, Ellipsoids]:
     if not reported:
         return {}
     times, centres, covariances = (np.array(values, dtype=np.float64) for values in zip(*reported, strict=True))
-    return {"estimated position": Ellipsoids(times, centres, covariances)}
+    return {"estimated position": Ellipsoids(times - descent.imu_offset_s, _to_world(descent, centres), covariances)}
 
 
 def _error_series(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, Series]:
     """Return horizontal error and its standard deviation at the reported states, and the inliers of each image."""
     errors = [error for error in compute_errors(descent, answers) if error is not None]
-    times = np.array([error.time_s for error in errors], dtype=np.float64)
+    times = np.array([error.time_s for error in errors], dtype=np.float64) - descent.imu_offset_s
     series = {
         "horizontal error, m": np.array([error.horizontal_m for error in errors], dtype=np.float64),
         "3 sigma of the horizontal error, m": np.array([3.0 * np.hypot(*error.sd_m[:2]) for error in errors]),
     }
     counted = [
-        (answer.time_s, float(answer.details.inliers))
+        (answer.time_s - descent.imu_offset_s, float(answer.details.inliers))
         for answer in answers.estimates
         if isinstance(answer.details, LocalisationDetails) and answer.details.inliers is not None
     ]
@@ -106,14 +121,13 @@ def _error_series(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str
 
 def _images(descent: LocalisedDescent, answers: StreamAnswers | None) -> list[TimedImage]:
     """Return the delivered images at the true times of their exposures, with the landmarks that were matched."""
-    camera = true_camera(descent.p.camera)
-    delivered, images = descent.images, []
-    # lost images are not delivered: time tags determine the exposure of each image
-    times_s = np.array([state.time_s for state in descent.states])
-    for number, image in enumerate(delivered):
-        state = descent.states[int(np.argmin(np.abs(times_s - image.time_s)))]
-        details = None if answers is None else answers.estimates[number].details
-        marks = {}
+    camera, images = true_camera(descent.p.camera), []
+    # an estimator receives the images in the order of their time tags; the last estimate belongs to no image
+    estimates = () if answers is None else answers.estimates[:-1]
+    by_tag = np.argsort([image.time_s for image in descent.images], kind="stable")
+    details_of = {int(index): estimate.details for index, estimate in zip(by_tag, estimates, strict=False)}
+    for number, (image, state) in enumerate(zip(descent.images, descent.image_states, strict=True)):
+        details, marks = details_of.get(number), {}
         if isinstance(details, LocalisationDetails) and details.measured_px is not None and details.used is not None:
             marks = {
                 "landmarks used": details.measured_px[details.used],
@@ -125,12 +139,13 @@ def _images(descent: LocalisedDescent, answers: StreamAnswers | None) -> list[Ti
 
 
 def _map_surface(descent: LocalisedDescent) -> SurfacePatch:
-    """Return the map product with reduced resolution, at its own coordinates."""
+    """Return the map product with reduced resolution, without the displacement of the whole map."""
     product = descent.measurements.map_product
     stride = -(-max(product.appearance.shape) // _MAP_PX)
     appearance, elevation = product.appearance[::stride, ::stride], product.elevation_m[::stride, ::stride]
     rows, columns = np.indices(appearance.shape) * stride
     east, north = (product.origin_m[axis] + product.pixel_m * index for axis, index in ((0, columns), (1, rows)))
-    points = np.stack([east, north, elevation], axis=-1).astype(np.float32)
+    shift_east, shift_north = descent.map_truth.shift_m
+    points = np.stack([east - shift_east, north - shift_north, elevation], axis=-1).astype(np.float32)
     # row 0 of the map is the southernmost
     return SurfacePatch(points[::-1], grey_values(appearance)[::-1])

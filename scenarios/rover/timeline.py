@@ -90,7 +90,7 @@ def _images(run: Run, stop: Stop, template_px: float) -> list[TimedImage]:
             marks["tracked target"] = tracked_px.reshape(1, 2)
             boxes["template"] = np.array([[*(tracked_px - 0.5 * template_px), template_px, template_px]])
             if details is not None and details.window is not None and details.window_corner is not None:
-                upper_left = np.asarray(details.window_corner, dtype=np.float64) - corner
+                upper_left = np.asarray(details.window_corner, dtype=np.float64) - corner - 0.5  # of a pixel's centre
                 boxes["search window"] = np.array([[*upper_left, *details.window.shape[::-1]]], dtype=np.float64)
         pose = CameraPose.from_camera(subframe, stop.world_from_head)
         bits = run.camera.detectors[0].parameters.bits

@@ -89,12 +89,12 @@ def test_checks_run_after_the_campaigns(nightly: Nightly, tmp_path: Path) -> Non
     (tmp_path / "plan.toml").write_text(f'[[campaigns]]\ncampaign = "unknown-campaign"\n{checks}')
     status, report = nightly()
     assert status == 1
-    assert f"| speed | FAIL | exit code 1: slow {tmp_path}; log: runs/night-00001-speed.log |" in report.replace(
+    assert f"| check: speed | FAIL | exit code 1: slow {tmp_path}; log: runs/night-00001-speed.log |" in report.replace(
         "\\", ""
     )
-    assert "| versions | PASS | exit code 0: up to date" in report
-    assert "| absent | NOT RUN |" in report
-    assert "| hanging | NOT RUN |" in report
+    assert "| check: versions | PASS | exit code 0: up to date" in report
+    assert "| check: absent | NOT RUN |" in report
+    assert "| check: hanging | NOT RUN |" in report
     assert (tmp_path / "out" / "runs" / "night-00001-versions.log").read_text() == "up to date\n"
 
 
@@ -151,7 +151,7 @@ def test_campaigns_of_the_shipped_plan_load() -> None:
         ("not toml", "not valid TOML"),
         ('[[campaigns]]\ncampaign = "a"\ncase = 3\n', "campaigns[0].case"),
         ('[[campaigns]]\ncampaign = "a"\n[[campaigns]]\ncampaign = "a"\n', "twice"),
-        ('[[campaigns]]\ncampaign = "a"\n[[checks]]\nname = "a"\ncommand = ["x"]\n', "used twice"),
+        ('[[campaigns]]\ncampaign = "a"\n' + 2 * '[[checks]]\nname = "a"\ncommand = ["x"]\n', "used twice"),
         ('[[campaigns]]\ncampaign = "a"\n[[checks]]\nname = "a/b"\ncommand = ["x"]\n', "checks[0].name"),
     ],
 )

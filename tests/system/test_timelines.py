@@ -29,6 +29,8 @@ CAMPAIGNS = {
 }  # fmt: skip
 #: Maximum size of a Rerun file, bytes.
 MAX_BYTES = 60e6
+#: Maximum error of a template's pixel by lens distortion and relief, pixels.
+MAX_TEMPLATE_ERROR_PX = 12.0
 #: Maximum distortion of the mast cameras near the target, pixels.
 MAX_DISTORTION_PX = 3.0
 
@@ -62,6 +64,23 @@ def test_timeline_of_a_case(name: str, tmp_path: Path) -> None:
     run_rerun("verify", path)
     assert "/world/surfaces/ground" in run_rerun("print", "-vv", path)
     assert path.stat().st_size <= MAX_BYTES
+
+
+def test_templates_on_the_ground_are_at_their_pixels() -> None:
+    """DIMES receives images 1, 3 and 5 of five. With exact instruments, its templates are at their pixels."""
+    campaign = load_campaign("dimes-smoke", ("terrain.samples=512", "exact_instruments=true", "images=5"))
+    parameters = campaign.parameters(1)
+    with recording_timelines():
+        timeline = Timeline.from_products(campaign.scenario.run(parameters, campaign.streams(1)).products)
+    assert timeline is not None
+    points = timeline.points["valid templates"]
+    assert len(points.times_s) >= 2
+    for time_s, position_m in zip(points.times_s, points.positions_m, strict=True):
+        (image,) = [item for item in timeline.images if item.time_s == time_s]
+        pixels, _ = _project(position_m[None], image)
+        assert np.abs(image.marks["templates"] - pixels).max(axis=1).min() < MAX_TEMPLATE_ERROR_PX
+    n_marks = [sum(len(pixels) for pixels in image.marks.values()) for image in timeline.images]
+    assert [count > 0 for count in n_marks[:4]] == [True, False, True, False]
 
 
 def _compared_row(result: CaseResult) -> dict[str, object]:

@@ -170,3 +170,13 @@ def test_lost_workers_and_a_restarted_scheduler_lose_nothing(
     rows = [read_rows(tmp_path / name / "cases.parquet") for name in ("cluster", "machine")]
     assert [len(table) for table in rows] == [240, 240]
     assert [differing_columns(*pair) for pair in zip(*rows, strict=True)] == [()] * 240
+
+
+@pytest.mark.slow
+def test_worker_with_other_code_stops_the_campaign(
+    campaign_file: Callable[..., Path], tmp_path: Path, watch: RecordingWatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The client imitates another version; the rows of other workers are stored."""
+    monkeypatch.setattr("marsyard.campaigns.execution.cluster.identify_code", lambda: ("another hash", ()))
+    with pytest.raises(CampaignError, match="runs a different Marsyard source code"):
+        run_campaign(load_campaign(str(campaign_file())), tmp_path / "run", ExecutorConfig(cluster="local:1"), watch)

@@ -16,7 +16,15 @@ from marsyard.campaigns.store.products import pack_products, unpack_products
 from marsyard.reports.timeline.figure import draw_timeline
 from marsyard.reports.timeline.glb import write_glb
 from marsyard.reports.timeline.mesh import camera_outlines, triangulate
-from marsyard.scenarios.timeline import PRODUCT, CameraPose, SurfacePatch, Timeline
+from marsyard.scenarios.timeline import (
+    PRODUCT,
+    CameraPose,
+    SurfacePatch,
+    Timeline,
+    recording_timelines,
+    timeline_products,
+)
+from marsyard.scenarios.timeline import Path as TimelinePath
 from marsyard.sim.camera import Cahvore
 from tests.reports.timeline.timeline_example import CENTRE_M, make_camera, make_image, make_timeline
 
@@ -134,6 +142,36 @@ def test_ros_bag_is_read_back(tmp_path: Path) -> None:
     imu = messages["/imu"][0][1]
     assert (imu.angular_velocity.x, imu.linear_acceleration.z) == (0.1, 3.7)
     assert "start_s: '-1.0'" in (tmp_path / "bag" / "metadata.yaml").read_text()
+
+
+def test_case_that_ended_at_its_start_is_exported(tmp_path: Path) -> None:
+    """A rover whose mast cannot point at the target has no path, no images and no values."""
+    from marsyard.reports.timeline.ros_bag import write_ros_bag
+
+    full = make_timeline()
+    empty = TimelinePath(np.empty(0), np.empty((0, 3)), np.empty((0, 4)))
+    points = {"target": full.points["target"]}
+    timeline = Timeline({"ground": full.surfaces["ground"]}, {"true": empty, "estimated": empty}, [], points)
+    assert len(draw_timeline(timeline).axes) == 1
+    write_glb(tmp_path / "case.glb", timeline)
+    write_ros_bag(tmp_path / "bag", timeline)
+
+
+def test_timeline_of_another_version_is_ignored() -> None:
+    stored = make_timeline().to_products()
+    assert Timeline.from_products({PRODUCT: {**stored, "paths": {"true": {"times_s": np.zeros(1)}}}}) is None
+    assert Timeline.from_products({PRODUCT: {"surfaces": {}}}) is None
+
+
+def test_exception_of_a_timeline_does_not_affect_the_case() -> None:
+    def fail() -> Timeline:
+        raise IndexError("no such image")
+
+    with recording_timelines():
+        products = timeline_products(fail)
+        assert timeline_products(fail, is_tested=False) == {}
+    assert products == {PRODUCT: "IndexError: no such image"}
+    assert Timeline.from_products(products) is None
 
 
 @pytest.mark.slow
