@@ -13,10 +13,10 @@ from typing import Any, Protocol
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
 from marsyard.campaigns.definition.evidence import classify_evidence, freeze_algorithm
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
-from marsyard.campaigns.definition.loading import NUMBERS, find_unknown_columns
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
