@@ -24,6 +24,7 @@ from marsyard.campaigns.studies.interval import (
 )
 from marsyard.campaigns.studies.rare import MIN_EFFECTIVE_VIOLATIONS, RareSettings
 from marsyard.campaigns.studies.subset import NEW_STREAM, Evaluated, SubsetResult, subset_simulation
+from marsyard.sim.streams import Blend
 
 #: Cases per level and replicates of `marsyard rare`, and confidence of its interval.
 SAMPLES, REPLICATES, CONFIDENCE = 200, 6, 0.9
@@ -36,20 +37,18 @@ LOWEST_LEVEL = 1e-9
 PROBABILITIES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 #: Minimum number of studies with an interval of importance sampling, for which its coverage is measured.
 MIN_STUDIES = 100
-#: Function of coordinates and stream numbers that returns margins.
-LimitState = Callable[[np.ndarray, np.ndarray], np.ndarray]
+#: Function of the coordinates and random streams of cases that returns their margins.
+LimitState = Callable[[np.ndarray, Sequence[Blend]], np.ndarray]
 
 
 def linear_margin(dimension: int, probability: float, noise_fraction: float = 0.0) -> LimitState:
-    """Return a linear limit state; a fraction of the variance of its load is noise, which the stream number determines.
-
-    Like the noise of a rendered case, the noise is not a coordinate: a simulation can only keep it or draw it again.
-    """
+    """Return a linear limit state; a fraction of the variance of its load is noise of the random streams."""
     beta = float(norm.isf(probability))
 
-    def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
+    def margins(coordinates: np.ndarray, blends: Sequence[Blend]) -> np.ndarray:
         load = math.sqrt(1.0 - noise_fraction) * coordinates.sum(axis=1) / math.sqrt(dimension)
-        return np.asarray(beta - load - math.sqrt(noise_fraction) * stream_noise(streams))
+        noise = math.sqrt(noise_fraction) * blended_noise(blends) if noise_fraction else 0.0
+        return np.asarray(beta - load - noise)
 
     return margins
 
@@ -63,7 +62,14 @@ def stream_noise(streams: np.ndarray) -> np.ndarray:
     return np.asarray(norm.ppf(((state >> np.uint64(11)).astype(np.float64) + 0.5) / 2.0**53))
 
 
-def four_branch_margin(coordinates: np.ndarray, _streams: np.ndarray) -> np.ndarray:
+def blended_noise(blends: Sequence[Blend]) -> np.ndarray:
+    """Return one standard normal number per case: the weighted sum over the components of its streams."""
+    components = np.array([component for blend in blends for component in blend])
+    starts = np.cumsum([0, *(len(blend) for blend in blends[:-1])])
+    return np.asarray(np.add.reduceat(components[:, 1] * stream_noise(components[:, 0].astype(np.int64)), starts))
+
+
+def four_branch_margin(coordinates: np.ndarray, _blends: Sequence[Blend]) -> np.ndarray:
     """Series system with four branches (Waarts 2000), a usual test of reliability methods."""
     x, y = coordinates.T
     curved_branch = 3.0 + 0.1 * (x - y) ** 2
@@ -83,10 +89,12 @@ def run_subset(margins: LimitState, dimension: int, seed: int, samples: int = SA
     try:
         proposals = next(process)
         while True:
-            numbers = first_stream + cases + np.arange(len(proposals.streams))
-            streams = np.where(proposals.streams == NEW_STREAM, numbers, proposals.streams)
-            cases += len(streams)
-            proposals = process.send(Evaluated(streams, margins(proposals.coordinates, streams)))
+            blends = [
+                tuple((number if old == NEW_STREAM else old, weight) for old, weight in blend)
+                for number, blend in enumerate(proposals.blends, start=first_stream + cases)
+            ]
+            cases += len(blends)
+            proposals = process.send(Evaluated(blends, margins(proposals.coordinates, blends)))
     except StopIteration as stop:
         return stop.value, cases
 
@@ -101,8 +109,8 @@ def run_importance(
     count = RareSettings.importance_cases
     coordinates, weights = density.draw(count, np.random.default_rng((seed, dimension)))
     # streams that no subset simulation uses
-    streams = 10**12 + seed * count + np.arange(count)
-    violation_weights = (weights * (margins(coordinates, streams) < 0.0)).tolist()
+    blends: list[Blend] = [((10**12 + seed * count + number, 1.0),) for number in range(count)]
+    violation_weights = (weights * (margins(coordinates, blends) < 0.0)).tolist()
     if effective_number(violation_weights) < MIN_EFFECTIVE_VIOLATIONS:
         return None
     return weighted_interval(violation_weights, CONFIDENCE)
@@ -114,11 +122,12 @@ def limit_states() -> Iterator[tuple[str, LimitState, int, float]]:
         for probability in PROBABILITIES:
             name = f"probability {probability:g}, linear, {dimension} variables"
             yield name, linear_margin(dimension, probability), dimension, probability
-    for probability in (1e-3, 1e-4):
-        name = f"probability {probability:g}, linear with noise (30 % of the variance), 20 variables"
-        yield name, linear_margin(20, probability, 0.3), 20, probability
+    for noise_fraction in (0.3, 0.95):
+        for probability in (1e-3, 1e-4):
+            name = f"probability {probability:g}, linear with noise ({noise_fraction:.0%} of variance), 20 variables"
+            yield name.replace("%", " %"), linear_margin(20, probability, noise_fraction), 20, probability
     rng, n = np.random.default_rng(0), 500_000
-    violation_rates = [np.mean(four_branch_margin(rng.standard_normal((n, 2)), np.empty(0)) < 0.0) for _ in range(40)]
+    violation_rates = [np.mean(four_branch_margin(rng.standard_normal((n, 2)), ()) < 0.0) for _ in range(40)]
     probability = float(np.mean(violation_rates))
     yield f"probability {probability:.3g}, four regions, 2 variables", four_branch_margin, 2, probability
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,10 @@ class Campaign:
     def streams(self, case: int) -> Streams:
         """Create the random streams of a case."""
         return Streams(seed=self.configuration.seed, campaign=self.configuration.name, case=case)
+
+    def streams_at(self, point: Point) -> Streams:
+        """Create the random streams of a case at a point of a study."""
+        return replace(self.streams(point.stream), blend=point.blend)
 
     def draws(self, case: int) -> dict[str, Any]:
         """Compute the sampled values of a case by parameter path, in the order of the file.

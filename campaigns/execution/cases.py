@@ -85,7 +85,8 @@ def run_case(configuration: str, selection: ProductSelection, points: Mapping[in
         with conditions_recorded_by(record), recording_timelines(selection.timelines):
             point = points.get(case)
             parameters = campaign.parameters(case) if point is None else campaign.parameters_at(point)
-            result = campaign.scenario.run(parameters, campaign.streams(case if point is None else point.stream))
+            streams = campaign.streams(case) if point is None else campaign.streams_at(point)
+            result = campaign.scenario.run(parameters, streams)
         row = _build_finished_row(case, result, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW, Correlation, correlate_uniform
+from marsyard.sim.streams import Blend
 
 #: Column of stored rows that contains the point of the case, as text.
 POINT_COLUMN = "standard_point"
@@ -29,26 +30,31 @@ class Point:
     - stream: number of the random streams of the case (`marsyard.sim.streams`)
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have (`marsyard.scenarios.error_sources`)
+    - blend: components of blended random streams, of which `stream` is the newest; empty for one component
     """
 
     coordinates: tuple[float, ...]
     stream: int
     nominal: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
+    blend: Blend = ()
 
     @classmethod
     def read(cls, text: str) -> Self:
         """Read a point from its text. Raises ValueError for any other text."""
         try:
-            coordinates, stream, nominal, removed = json.loads(text)
-            return cls(tuple(map(float, coordinates)), int(stream), tuple(map(str, nominal)), tuple(map(str, removed)))
+            coordinates, stream, nominal, removed, *blends = json.loads(text)
+            blend = tuple((int(number), float(weight)) for number, weight in (blends[0] if blends else ()))
+            names = tuple(map(str, nominal)), tuple(map(str, removed))
+            return cls(tuple(map(float, coordinates)), int(stream), *names, blend)
         except (TypeError, ValueError) as error:
             raise ValueError(f"not a point of a study: {text!r:.100}") from error
 
     @property
     def text(self) -> str:
         """The point as text, without loss of precision."""
-        return json.dumps([self.coordinates, self.stream, self.nominal, self.removed])
+        blend = [self.blend] if self.blend else []
+        return json.dumps([self.coordinates, self.stream, self.nominal, self.removed, *blend])
 
 
 def transform_to_uniform(

@@ -44,6 +44,7 @@ from marsyard.campaigns.studies.subset import (
     Evaluated,
     Proposals,
     SubsetResult,
+    new_blend,
     subset_simulation,
 )
 from marsyard.sim.streams import Streams
@@ -299,20 +300,23 @@ class _Study:
 
     def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
         """Evaluate several groups of proposed cases together."""
-        streams = np.concatenate([group.streams for group in proposals])
         coordinates = np.concatenate([group.coordinates for group in proposals])
+        blends = [blend for group in proposals for blend in group.blends]
         first = self._runner.n_cases
         candidates = [
-            Candidate(tuple(point.tolist()), None if stream == NEW_STREAM else int(stream))
-            for point, stream in zip(coordinates, streams, strict=True)
+            Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
+            for point, blend in zip(coordinates, blends, strict=True)
         ]
         rows = self._runner.run(candidates)
         margins = np.array([compute_margin(row, self._requirement) for row in rows])
         self._violations += int(np.sum(margins < 0.0))
-        streams = np.where(streams == NEW_STREAM, first + np.arange(len(streams)), streams)
-        ends = np.cumsum([len(group.streams) for group in proposals])
+        numbered = [
+            tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
+            for case, blend in enumerate(blends, start=first)
+        ]
+        ends = np.cumsum([len(group.blends) for group in proposals])
         for start, end in zip([0, *ends[:-1]], ends, strict=True):
-            yield Evaluated(streams[start:end], margins[start:end])
+            yield Evaluated(numbered[start:end], margins[start:end])
 
     def _run_importance(self, results: Sequence[SubsetResult]) -> list[float]:
         """Sample cases around the violations of the replicates, from a fitted density.
@@ -329,7 +333,7 @@ class _Study:
         violation_weights: list[float] = []
         for first in range(0, case_count, _IMPORTANCE_BATCH):
             batch = slice(first, first + _IMPORTANCE_BATCH)
-            proposal = Proposals(coordinates[batch], np.full(len(coordinates[batch]), NEW_STREAM))
+            proposal = Proposals(coordinates[batch], [new_blend()] * len(coordinates[batch]))
             (evaluated,) = self._evaluate([proposal])
             violation_weights += (weights[batch] * (evaluated.margins < 0.0)).tolist()
         return violation_weights

@@ -33,7 +33,9 @@ from marsyard.campaigns.store.confirmations import read_confirmations
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
+from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.sim.kernel_cache import mark_ready
+from marsyard.sim.streams import Blend
 
 #: A study is stopped with an error if none of this number of first cases has finished.
 _MAX_FIRST_CRASHES = 20
@@ -75,12 +77,20 @@ class Candidate:
     - stream: number of the case's random streams; None for new streams
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have
+    - blend: components of the random streams, the last with the number `NEW_STREAM`; empty for one component
     """
 
     coordinates: tuple[float, ...]
     stream: int | None = None
     nominal: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
+    blend: Blend = ()
+
+    def point(self, case: int) -> Point:
+        """Return the point of the candidate as a case; new streams have the number of the case."""
+        stream = case if self.stream is None else self.stream
+        blend = tuple((case if number == NEW_STREAM else number, weight) for number, weight in self.blend)
+        return Point(self.coordinates, stream, self.nominal, self.removed, blend)
 
 
 class PointRunner:
@@ -116,10 +126,7 @@ class PointRunner:
         limit = self._campaign.configuration.total_cases
         if first + len(candidates) > limit:
             raise CaseLimitError(f"the study needs more than {limit} cases")
-        points = {
-            case: Point(item.coordinates, case if item.stream is None else item.stream, item.nominal, item.removed)
-            for case, item in enumerate(candidates, start=first)
-        }
+        points = {case: item.point(case) for case, item in enumerate(candidates, start=first)}
         rows = {case: row for case in points if (row := self._store.row(case)) is not None}
         for case, row in rows.items():
             if row.get(POINT_COLUMN) != points[case].text:

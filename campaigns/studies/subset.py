@@ -4,8 +4,8 @@ Au & Beck 2001, Probabilistic Engineering Mechanics 16, 263-277. A violation is 
 the cases with a margin of at most its threshold, a quantile of the previous level's margins. Cases of a level are drawn
 by Markov chains that start at the cases of the previous level below the threshold: conditional sampling with an
 adaptive step in standard normal space (Papaioannou et al. 2015, Probabilistic Engineering Mechanics 41, 89-103,
-algorithm with acceptance 0.44). The random streams of a case are a further variable: a step replaces them by new ones
-with probability 0.25.
+algorithm with acceptance 0.44). The normal and uniform numbers of the random streams (noise of the instruments) move by
+the same step: a new stream is blended into the previous ones (`marsyard.sim.streams.Blend`).
 
 The estimated coefficient of variation of one run is too small, because its chains are correlated. Intervals therefore
 use the spread of independent replicates (`marsyard.campaigns.studies.interval`).
@@ -14,42 +14,41 @@ use the spread of independent replicates (`marsyard.campaigns.studies.interval`)
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
+
+from marsyard.sim.streams import Blend
 
 #: Fraction of the cases that define the next level.
 LEVEL_FRACTION = 0.1
 #: Target acceptance rate of the chains, to which their step is adapted, and initial step.
 _TARGET_ACCEPTANCE, _INITIAL_STEP = 0.44, 0.6
-#: Probability that a step draws new random streams.
-_NEW_STREAM_PROBABILITY = 0.25
 #: Stream number of a proposed case that gets new random streams.
 NEW_STREAM = -1
 
 Coordinates = Float64[np.ndarray, "n dimensions"]
-StreamNumbers = Int64[np.ndarray, " n"]
 Margins = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
 class Proposals:
-    """Cases to be evaluated: coordinates, and numbers of their random streams (`NEW_STREAM` for new ones)."""
+    """Cases to be evaluated: coordinates, and components of their random streams; the last one is `NEW_STREAM`."""
 
     coordinates: Coordinates
-    streams: StreamNumbers
+    blends: Sequence[Blend]
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Evaluated cases: numbers of their random streams, and margins.
+    """Evaluated cases: components of their random streams, with the numbers of the new ones, and margins.
 
     A margin is infinite if a violation is excluded, and minus infinite if it is certain.
     """
 
-    streams: StreamNumbers
+    blends: Sequence[Blend]
     margins: Margins
 
 
@@ -79,8 +78,8 @@ def subset_simulation(dimension: int, samples: int, min_probability: float, rng:
     `dimension` is the number of standard normal variables.
     """
     coordinates = rng.standard_normal((samples, dimension))
-    evaluated = yield Proposals(coordinates, np.full(samples, NEW_STREAM))
-    streams, margins = evaluated.streams, evaluated.margins
+    evaluated = yield Proposals(coordinates, [new_blend()] * samples)
+    blends, margins = list(evaluated.blends), evaluated.margins
     probability, step, thresholds = 1.0, _INITIAL_STEP, list[float]()
     while True:
         is_violation = margins < 0.0
@@ -93,24 +92,31 @@ def subset_simulation(dimension: int, samples: int, min_probability: float, rng:
         seeds = rng.permutation(np.flatnonzero(margins <= threshold))
         probability *= seeds.size / samples
         # all chains advance together; the cases of the level are the states of the chains, including the seeds
-        states = coordinates[seeds], streams[seeds], margins[seeds]
-        level = [states]
+        points, point_blends, point_margins = coordinates[seeds], [blends[seed] for seed in seeds], margins[seeds]
+        level_points, level_blends, level_margins = [points], list(point_blends), [point_margins]
         for chain_step in range(1, math.ceil(samples / seeds.size)):
             size = min(seeds.size, samples - chain_step * seeds.size)
-            points, previous_streams, previous_margins = (values[:size] for values in states)
+            points, point_blends, point_margins = points[:size], point_blends[:size], point_margins[:size]
             proposed_points = math.sqrt(1.0 - step**2) * points + step * rng.standard_normal(points.shape)
-            new_streams = np.where(rng.random(size) < _NEW_STREAM_PROBABILITY, NEW_STREAM, previous_streams)
-            evaluated = yield Proposals(proposed_points, new_streams)
+            evaluated = yield Proposals(proposed_points, [new_blend(blend, step) for blend in point_blends])
             is_accepted = evaluated.margins <= threshold
-            states = (
-                np.where(is_accepted[:, None], proposed_points, points),
-                np.where(is_accepted, evaluated.streams, previous_streams),
-                np.where(is_accepted, evaluated.margins, previous_margins),
-            )
-            level.append(states)
+            points = np.where(is_accepted[:, None], proposed_points, points)
+            choices = zip(is_accepted, evaluated.blends, point_blends, strict=True)
+            point_blends = [proposed if accepted else previous for accepted, proposed, previous in choices]
+            point_margins = np.where(is_accepted, evaluated.margins, point_margins)
+            level_points.append(points)
+            level_blends += point_blends
+            level_margins.append(point_margins)
             log_step_change = (float(is_accepted.mean()) - _TARGET_ACCEPTANCE) / math.sqrt(chain_step)
             step = min(step * math.exp(log_step_change), 1.0)
-        coordinates, streams, margins = (np.concatenate(values) for values in zip(*level, strict=True))
+        coordinates, blends, margins = np.concatenate(level_points), level_blends, np.concatenate(level_margins)
+
+
+def new_blend(previous: Blend = (), step: float = 1.0) -> Blend:
+    """Blend new streams into the previous ones, as the coordinates by a step; only new streams for a step of 1."""
+    factor = math.sqrt(1.0 - step**2)
+    older = tuple((number, factor * weight) for number, weight in previous) if factor > 0.0 else ()
+    return (*older, (NEW_STREAM, step if older else 1.0))
 
 
 def _next_threshold(margins: Margins) -> float | None:

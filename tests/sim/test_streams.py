@@ -1,8 +1,10 @@
 """Tests of random number streams and their keys: seed, campaign, case and name of the stream."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import kstest
 
 from benchmarks.validation.sampling_checks import all_seeds, collisions, seeds, stream_words
 from marsyard.sim.streams import Streams, stream_key
@@ -70,3 +72,46 @@ def test_400_000_streams_have_different_seeds() -> None:
     assert collisions(result) == 0
     # `collisions` detects duplicates.
     assert collisions(np.concatenate([result, result[7:9]])) == 2
+
+
+def _blended(step: float, name: str = "imu") -> np.random.Generator:
+    """Blend the streams of case 8 into those of case 7."""
+    blend = ((7, float(np.sqrt(1.0 - step**2))), (8, step))
+    return Streams(5, "campaign", 8, blend).generator(name)
+
+
+@pytest.mark.parametrize("step", [0.1, 0.6, 0.95])
+def test_blended_numbers_keep_their_distribution(step: float) -> None:
+    generator = _blended(step)
+    assert kstest(generator.standard_normal(20_000), "norm").pvalue > 0.001
+    assert kstest(generator.normal(3.0, 2.0, 20_000), "norm", (3.0, 2.0)).pvalue > 0.001
+    assert kstest(generator.random(20_000), "uniform").pvalue > 0.001
+    assert kstest(generator.uniform(-2.0, 4.0, 20_000), "uniform", (-2.0, 6.0)).pvalue > 0.001
+
+
+def test_blended_numbers_change_continuously() -> None:
+    """The correlation with the numbers of the older component is its weight; large draws are those of the newest."""
+    older = Streams(5, "campaign", 7).generator("imu").standard_normal(20_000)
+    for step in (0.01, 0.3):
+        blended = _blended(step).standard_normal(20_000)
+        assert np.corrcoef(older, blended)[0, 1] == pytest.approx(np.sqrt(1.0 - step**2), abs=0.02)
+    uniform = Streams(5, "campaign", 7).generator("dust").random(1000)
+    np.testing.assert_allclose(_blended(1e-9, "dust").random(1000), uniform, atol=1e-7)
+    newest = Streams(5, "campaign", 8).generator("detector").standard_normal((400, 400), dtype=np.float32)
+    np.testing.assert_array_equal(_blended(0.3, "detector").standard_normal((400, 400), dtype=np.float32), newest)
+
+
+def test_blended_numbers_have_the_shapes_of_numpy() -> None:
+    generator = _blended(0.5)
+    assert isinstance(generator.standard_normal(), float)
+    assert isinstance(generator.random(), float)
+    assert isinstance(generator.normal(1.0, 2.0), float)
+    assert generator.normal(np.zeros((2, 3)), 1.0).shape == (2, 3)
+    assert generator.uniform(np.zeros(4), 1.0).shape == (4,)
+    assert generator.standard_normal((2, 2), dtype=np.float32).dtype == np.float32
+    assert 0 <= int(generator.integers(10)) < 10
+
+
+def test_one_component_has_the_numbers_of_its_case() -> None:
+    alone = Streams(5, "campaign", 8).generator("imu").standard_normal(10)
+    np.testing.assert_array_equal(Streams(5, "campaign", 8, ((8, 1.0),)).generator("imu").standard_normal(10), alone)

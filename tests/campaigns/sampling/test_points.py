@@ -76,7 +76,8 @@ def test_extreme_coordinates_have_finite_values(campaign_path: Path) -> None:
 
 
 def test_point_round_trips_as_text() -> None:
-    point = Point((0.1, -1.0 / 3.0), 12, ("a.b",))
-    assert Point.read(point.text) == point
+    for blend in ((), ((3, 0.8), (12, 0.6))):
+        point = Point((0.1, -1.0 / 3.0), 12, ("a.b",), blend=blend)
+        assert Point.read(point.text) == point
     with pytest.raises(ValueError, match="not a point"):
         Point.read("[1, 2]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from marsyard.campaigns.studies.interval import (
     weighted_interval,
 )
 from marsyard.campaigns.studies.subset import SubsetResult
+from marsyard.sim.streams import Blend
 
 
 def run_with_random_seed(
@@ -28,7 +30,8 @@ def run_with_random_seed(
 
 
 @pytest.mark.parametrize(
-    ("dimension", "probability", "noise_fraction"), [(2, 1e-2, 0.0), (20, 1e-4, 0.0), (100, 1e-6, 0.0), (5, 1e-3, 0.3)]
+    ("dimension", "probability", "noise_fraction"),
+    [(2, 1e-2, 0.0), (20, 1e-4, 0.0), (100, 1e-6, 0.0), (5, 1e-3, 0.3), (5, 1e-3, 0.95)],
 )
 def test_estimates_are_unbiased(dimension: int, probability: float, noise_fraction: float) -> None:
     rng = np.random.default_rng(1)
@@ -65,7 +68,7 @@ def test_simulation_needs_fewer_cases_than_counting() -> None:
 
 
 def test_cases_outside_the_population_do_not_bias_the_estimate() -> None:
-    def margins(coordinates: np.ndarray, streams: np.ndarray) -> np.ndarray:
+    def margins(coordinates: np.ndarray, _blends: Sequence[Blend]) -> np.ndarray:
         # 95 % of the cases are outside the population: 1.645 is the 95 % quantile of the normal distribution
         return np.where(coordinates[:, 0] > 1.645, 2.5 - coordinates[:, 1], np.inf)
 
@@ -95,7 +98,7 @@ def test_importance_sampling_is_unbiased_and_precise(dimension: int) -> None:
     coordinates, weights = density.draw(4000, rng)
     # a tenth of the cases is drawn from the nominal density, which limits the weights to 10
     assert weights.max() <= 10.0
-    interval = weighted_interval((weights * (margins(coordinates, weights) < 0.0)).tolist(), 0.99)
+    interval = weighted_interval((weights * (margins(coordinates, ()) < 0.0)).tolist(), 0.99)
     assert interval.lower < 1e-4 < interval.upper
     assert interval.upper / interval.lower < 2.0
 

@@ -35,18 +35,24 @@ def test_each_system_has_requirements_with_margins_and_error_sources(system: str
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
-    """A case at a point is deterministic, has a margin, and changes if all sources of error are removed."""
+    """A case at a point is deterministic, has a margin, and changes if all sources of error are removed.
+
+    A small step of its random streams changes it as well.
+    """
     campaign = load_campaign(name, CAMPAIGNS[name])
     removed = tuple(source.name for source in active_sources(campaign)[0])
     requirement = next(item for item in campaign.configuration.requirements if item.bound or item.margin)
     rows = []
-    for sources in ((), removed, ()):
-        parameters = campaign.parameters_at(Point((0.1,) * len(campaign.drawn_paths), 3, (), sources))
+    step = ((3, 0.995), (4, math.sqrt(1.0 - 0.995**2)))
+    for sources, blend in (((), ()), (removed, ()), ((), ()), ((), step)):
+        point = Point((0.1,) * len(campaign.drawn_paths), 3, (), sources, blend)
+        parameters = campaign.parameters_at(point)
         for shared_input in campaign.scenario.shared_inputs(parameters):
             campaign.scenario.prepare(parameters, shared_input)
-        result = campaign.scenario.run(parameters, campaign.streams(3))
+        result = campaign.scenario.run(parameters, campaign.streams_at(point))
         row = {column: value for column, value in result.row.items() if "time" not in column}
         rows.append({"outcome": str(result.outcome), "answered": result.answered, **row})
         assert not math.isnan(compute_margin(rows[-1], requirement))
     assert rows[0] == pytest.approx(rows[2], nan_ok=True)
     assert rows[0] != rows[1]
+    assert rows[0] != rows[3]
