@@ -110,14 +110,14 @@ def _requested_exports(rerun: Path | None, glb: Path | None, rosbag: Path | None
     ):
         if target is None:
             continue
-        if find_spec(package) is None:
-            raise CampaignError(f"{option} needs the package {package}: pip install 'marsyard[view]'")
         if suffix and target.suffix != suffix:
             raise CampaignError(f"{option} {target}: allowed: a file with the suffix {suffix}")
         if not suffix and target.exists():
             raise CampaignError(f"{option} {target} exists; allowed: a new folder")
         if not target.parent.is_dir():
             raise CampaignError(f"{option} {target}: the folder {target.parent} does not exist")
+        if find_spec(package) is None:
+            raise CampaignError(f"{option} needs the package {package}: pip install 'marsyard[view]'")
         exports.append(_Export(option, target, write))
     return exports
 

@@ -10,7 +10,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.reports.timeline.rerun_file import write_rerun
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.timeline import SurfacePatch, TimedImage, Timeline, recording_timelines
 from tests.reports.timeline.test_exports import run_rerun
@@ -37,6 +36,9 @@ MAX_DISTORTION_PX = 3.0
 
 @pytest.mark.parametrize("name", CAMPAIGNS)
 def test_timeline_of_a_case(name: str, tmp_path: Path) -> None:
+    # the extra `view` is installed only for slow tests
+    from marsyard.reports.timeline.rerun_file import write_rerun
+
     settings, contents = CAMPAIGNS[name]
     campaign = load_campaign(name, settings)
     parameters = campaign.parameters(0)
