@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from benchmarks import descent, engine, estimators, hda, images, renderers, reporting, starting, vtt
+from benchmarks import descent, engine, estimators, hda, images, localisation, renderers, reporting, starting, vtt
 from benchmarks.page import PAGE, write_page
 from benchmarks.timing import Measurement
 from marsyard.sim.kernel_cache import processor_features
@@ -40,6 +40,7 @@ def main() -> None:
         *descent.measure_new_terrains(2),
         *vtt.measure(9),
         *hda.measure(9),
+        *localisation.measure(3),
         *engine.measure(),
         *starting.measure(5),
         *reporting.measure(),

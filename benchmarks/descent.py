@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.images import descent_pose, descent_scene
-from benchmarks.stages import measure_stages
+from benchmarks.stages import DESCENT_STAGES, measure_stages
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
@@ -46,9 +46,9 @@ def measure_case(repeats: int) -> list[Measurement]:
 
     return [
         Measurement(
-            "dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=1.0
+            "dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=0.6
         ),
-        *measure_stages(run_next, repeats),
+        *measure_stages("dimes-gusev case", run_next, repeats, DESCENT_STAGES),
     ]
 
 

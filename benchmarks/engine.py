@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -121,6 +122,11 @@ def measure(repeats: int = 3) -> list[Measurement]:
             minimum=1.85,
         ),
         Measurement(
+            "dimes-gusev on two workers (cases per wall s)",
+            [measure_rate("dimes-gusev", ["location.bank=8"]) for _ in range(repeats)],
+            minimum=3.3,
+        ),
+        Measurement(
             f"engine: conversion of 1,000,000 rows of {COLUMNS} numbers to Parquet (s)",
             [measure_table_s(1_000_000)],
             limit=30.0,
@@ -171,20 +177,23 @@ def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
     return CaseCost((end_s - start_s) / (last - first), inside_case_s, end_mb - start_mb)
 
 
-def measure_speed_up(campaign_name: str = "dimes-smoke", cases: int = 120) -> float:
-    """Measure the speed-up of two workers with rendered cases; needs idle cores.
+def measure_rate(campaign_name: str, settings: Sequence[str] = (), cases: int = 120, jobs: int = 2) -> float:
+    """Measure the rate of a campaign of rendered cases, cases per second (wall-clock time); needs idle cores.
 
     The first 24 cases (start-up of the workers) and the last 8 (small batches) are excluded.
     """
     first, last = 24, cases - 8
-    times = []
-    for jobs in (1, 2):
-        stopwatch = Stopwatch((first, last))
-        with TemporaryDirectory() as folder:
-            campaign = load_campaign(campaign_name, ["retain.showcase=none"], cases)
-            run_campaign(campaign, Path(folder, "run"), ExecutorConfig(jobs), stopwatch)
-        times.append(stopwatch.records[last][0] - stopwatch.records[first][0])
-    return times[0] / times[1]
+    stopwatch = Stopwatch((first, last))
+    with TemporaryDirectory() as folder:
+        campaign = load_campaign(campaign_name, [*settings, "retain.showcase=none"], cases)
+        run_campaign(campaign, Path(folder, "run"), ExecutorConfig(jobs), stopwatch)
+    return (last - first) / (stopwatch.records[last][0] - stopwatch.records[first][0])
+
+
+def measure_speed_up() -> float:
+    """Measure the speed-up of two workers with rendered cases; needs idle cores."""
+    one, two = (measure_rate("dimes-smoke", jobs=jobs) for jobs in (1, 2))
+    return two / one
 
 
 def measure_table_s(rows: int) -> float:

@@ -47,7 +47,7 @@ def measure(repeats: int) -> list[Measurement]:
     render_pyrender = _prepare_pyrender(inputs)
     paired_s = [(core_seconds(render_marsyard, 1)[0], core_seconds(render_pyrender, 1)[0]) for _ in range(repeats)]
     measurements = [
-        Measurement("descent frame with shadows and detector", [marsyard_s for marsyard_s, _ in paired_s], limit=0.2),
+        Measurement("descent frame with shadows and detector", [marsyard_s for marsyard_s, _ in paired_s], limit=0.15),
         *measure_all_cores(repeats),
         Measurement("pyrender: frame of the terrain mesh with shadows", [pyrender_s for _, pyrender_s in paired_s]),
         Measurement(

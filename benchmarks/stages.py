@@ -1,4 +1,4 @@
-"""Core-seconds of the stages of a `dimes-gusev` case, measured by Python's profiler."""
+"""Core-seconds of the stages of a case, measured by Python's profiler."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from benchmarks.timing import Measurement
 #: Functions of each stage, by its name: end of the file name, and function name. The time of a function includes that
 #: of the functions that it calls.
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
-STAGES: Stages = {
+#: Stages of a `dimes-gusev` case.
+DESCENT_STAGES: Stages = {
     "terrain and rocks": (("descent/exposure.py", "from_parameters"), ("descent/exposure.py", "scene")),
     "flight": (("descent/flight.py", "create_flight"),),
     "mesh and OpenGL": (("render/renderer.py", "_draw_views"),),
@@ -33,13 +34,13 @@ STAGES: Stages = {
 REMAINDER = "other"
 
 
-def measure_stages(run: Callable[[], object], repeats: int) -> list[Measurement]:
+def measure_stages(case: str, run: Callable[[], object], repeats: int, stages: Stages) -> list[Measurement]:
     """Measure the core-seconds of every stage and of the remainder, per run, after a warm-up run.
 
     Python's profiler slows stages with many small calls (flight, instruments) by up to a half.
     """
-    timings = profile_stages(run, repeats, STAGES)
-    return [Measurement(f"dimes-gusev case, profiled stage: {name}", values) for name, values in timings.items()]
+    timings = profile_stages(run, repeats, stages)
+    return [Measurement(f"{case}, profiled stage: {name}", values) for name, values in timings.items()]
 
 
 def profile_stages(run: Callable[[], object], repeats: int, stages: Stages) -> dict[str, list[float]]:

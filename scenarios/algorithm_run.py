@@ -83,10 +83,13 @@ def copy_inputs(original: Inputs, *, writable: bool = False) -> Inputs:
 def hash_inputs(value: Any, excluded: tuple[str, ...] = ()) -> str:
     """Compute the SHA-256 of all values in arrays, poses and data classes, without the fields in `excluded`."""
     digest = hashlib.sha256()
+    array_digests: dict[int, bytes] = {}  # all images of a stream contain the same calibration
     for item in _walk_values(value, excluded):
         if isinstance(item, np.ndarray):
+            if id(item) not in array_digests:
+                array_digests[id(item)] = hashlib.sha256(np.ascontiguousarray(item).data).digest()
             digest.update(f"{item.dtype}{item.shape}".encode())
-            digest.update(np.ascontiguousarray(item).data)
+            digest.update(array_digests[id(item)])
         elif isinstance(item, Rotation):
             digest.update(item.as_quat().tobytes())
         elif isinstance(item, RigidTransform):

@@ -31,6 +31,7 @@ from marsyard.algorithms.localisation.consistency import (
     OffsetTest,
     PatchGeometry,
     check_offsets,
+    estimate_position_error,
     offset_covariance,
 )
 from marsyard.algorithms.localisation.inertial_state import POSITION
@@ -96,8 +97,7 @@ class CoarseFix:
     """Horizontal offset of the true position from the estimated one, the same for all images.
 
     - offset_m: true minus estimated position (east, north)
-    - covariance: of the offset, m^2: the scatter of the patches, the attitude error that is common to them, and the
-      map's registration and distortion
+    - covariance: of the offset, m^2, by the stated errors of state, altitudes, map and matching
     - matches: the patches' matches
     - support, second_support: sums of the scores of the consistent patches of the best and of the second candidate
     - consistency: test of the consistent patches' offsets
@@ -174,7 +174,10 @@ def find_coarse_position(
     sd_m = float(np.sqrt(np.diag(covariance)[POSITION][:2].max()))
     # differences from the mean keep the precision of float32 sums
     appearance = grid.appearance - grid.appearance.mean()
-    radius = int(np.ceil(min(options.search_radius_m, options.search_sigmas * sd_m) / grid.pixel_m))
+    # an offset contains the map's registration error; offsets near the border of the search area are refused
+    search_m = min(options.search_radius_m, options.search_sigmas * sd_m) + options.relief_tolerance_m
+    search_m += options.search_sigmas * map_product.registration_sd_m
+    radius = int(np.ceil(search_m / grid.pixel_m))
     surfaces = np.stack([_correlate_patch(patch, appearance, radius) for patch in patches])
     peaks = _candidate_offsets(surfaces, radius, grid.pixel_m, options)
     candidates = [_verify_candidate(peak, patches, views, grid, appearance, options) for peak in peaks]
@@ -370,16 +373,24 @@ def _accept_best_candidate(
         return CoarseRefusal.AMBIGUOUS
     if np.linalg.norm(best.offset_m) > radius * grid.pixel_m - options.relief_tolerance_m:
         return CoarseRefusal.BORDER
-    consistency = _check_consistency(best, patches, views, grid, covariance, options)
-    if consistency.members.sum() < options.min_consistent_patches or not consistency.is_consistent:
+    rows = np.flatnonzero(best.consistent)
+    geometry, errors = _describe_patches(best, patches, views, grid, options)
+    # a wrong patch has its maximum anywhere in the square window of the verification
+    chance = np.pi * options.relief_tolerance_m**2 / (2.0 * options.coarse_tolerance_m) ** 2
+    test = OffsetTest(options.patch_outlier_probability, options.false_refusal, chance)
+    state_offsets = offset_covariance(geometry, covariance, errors)
+    consistency = check_offsets(best.offsets_m[rows], state_offsets, len(patches) - len(rows), test)
+    members = consistency.members
+    if members.sum() < options.min_consistent_patches or not consistency.is_consistent:
         return CoarseRefusal.INCONSISTENT
-    rows = np.flatnonzero(best.consistent)[consistency.members]
-    consistent = np.isin(np.arange(len(patches)), rows)
-    mean = np.average(best.offsets_m[rows], axis=0, weights=best.scores[rows])
-    best = replace(best, offset_m=mean, consistent=consistent)
+    errors = replace(errors, height_m=errors.height_m[members])
+    offset, offset_errors = estimate_position_error(
+        best.offsets_m[rows[members]], geometry.select(members), covariance, errors
+    )
+    best = replace(best, offset_m=offset, consistent=np.isin(np.arange(len(patches)), rows[members]))
     return CoarseFix(
-        offset_m=best.offset_m,
-        covariance=_offset_covariance(best, patches, views, grid, options),
+        offset_m=offset,
+        covariance=offset_errors,
         matches=_collect_matches(best, patches, grid),
         support=best.support,
         second_support=second,
@@ -387,15 +398,10 @@ def _accept_best_candidate(
     )
 
 
-def _check_consistency(
-    best: _Candidate,
-    patches: Sequence[_Patch],
-    views: Sequence[GroundView],
-    grid: MapProduct,
-    covariance: Float[np.ndarray, "9 9"],
-    options: LvsOptions,
-) -> Consistency:
-    """Test the offsets of the consistent patches against the stated errors of state, altitudes and map."""
+def _describe_patches(
+    best: _Candidate, patches: Sequence[_Patch], views: Sequence[GroundView], grid: MapProduct, options: LvsOptions
+) -> tuple[PatchGeometry, OffsetErrors]:
+    """Return the geometry of the consistent patches, and the errors of altitudes, map and matching."""
     rows = np.flatnonzero(best.consistent)
     members = [patches[k] for k in rows.tolist()]
     images = np.array([patch.image for patch in members])
@@ -410,30 +416,10 @@ def _check_consistency(
         height_m=np.hypot(options.altitude_sd * cameras[:, 2], grid.elevation_sd_m),
         distortion_m=grid.distortion_sd_m,
         elevation_m=grid.elevation_sd_m,
-        matching_m=_matching_sd_m(grid),
+        # an error that is uniform over a coarse pixel
+        matching_m=grid.pixel_m / float(np.sqrt(12.0)),
     )
-    # a wrong patch has its maximum anywhere in the square window of the verification
-    chance = np.pi * options.relief_tolerance_m**2 / (2.0 * options.coarse_tolerance_m) ** 2
-    test = OffsetTest(options.patch_outlier_probability, options.false_refusal, chance)
-    state_offsets = offset_covariance(geometry, covariance, errors)
-    return check_offsets(best.offsets_m[rows], state_offsets, len(patches) - len(rows), test)
-
-
-def _matching_sd_m(grid: MapProduct) -> float:
-    """Standard deviation of a patch's offset per axis: an error that is uniform over a coarse pixel."""
-    return grid.pixel_m / float(np.sqrt(12.0))
-
-
-def _offset_covariance(
-    best: _Candidate, patches: Sequence[_Patch], views: Sequence[GroundView], grid: MapProduct, options: LvsOptions
-) -> Float[np.ndarray, "2 2"]:
-    """Covariance of the offset. Only the patches of one image are independent: all images show the same ground."""
-    offsets = best.offsets_m[best.consistent]
-    scatter = np.cov(offsets.T) if len(offsets) > 2 else np.eye(2) * options.relief_tolerance_m**2
-    patches_per_image = max(len(offsets) / max(len(views), 1), 1.0)
-    height = float(np.mean([view.camera.c[2] for view in views]))
-    common = (options.attitude_sd_rad * height) ** 2 + grid.distortion_sd_m**2
-    return np.asarray(scatter / patches_per_image + (common + _matching_sd_m(grid) ** 2) * np.eye(2))
+    return geometry, errors
 
 
 def _collect_matches(best: _Candidate, patches: Sequence[_Patch], grid: MapProduct) -> CoarseMatches:

@@ -9,6 +9,8 @@ is found on the map at the offset
 
 t is the time from the image to the last one, and the index h means the horizontal part. dz is the map's error of
 elevation, n its distortion and the error of matching. The ground is level within a patch.
+The position error is estimated as its conditional mean: with the covariance C of dp and o, dp = C S^-1 o, with the
+covariance P - C S^-1 C'. The patches at different angles thereby determine errors of height and attitude, too.
 If the stated covariances are correct, the offsets are normally distributed with zero mean and the covariance S, and
 o' S^-1 o is chi-square with two degrees of freedom per patch (Bar-Shalom, Li and Kirubarajan, Estimation with
 Applications to Tracking and Navigation, section 5.4). An attitude error shifts patches at large off-nadir angles more
@@ -18,7 +20,7 @@ the same value.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -45,6 +47,10 @@ class PatchGeometry:
     sides_m: Vector
     lines_m: Points3
     ages_s: Vector
+
+    def select(self, members: Flags) -> PatchGeometry:
+        """Return the geometry of some of the patches."""
+        return PatchGeometry(*(getattr(self, field.name)[members] for field in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -73,16 +79,7 @@ def offset_covariance(
     and one for each image, both with the stated standard deviation. Two patches share the map's errors by the fraction
     of their area that overlaps.
     """
-    count = len(patches.images)
-    tangents = patches.lines_m[:, :2] / -patches.lines_m[:, 2:]  # d_h / H
-    # horizontal shift of a patch by a displacement (east, north, up) of its line of sight
-    project = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), tangents[:, :, np.newaxis]], axis=2)
-    jacobian = np.zeros((count, _AXES, 9))
-    jacobian[:, :, POSITION] = np.eye(2, 3)
-    jacobian[:, :, VELOCITY] = -patches.ages_s[:, np.newaxis, np.newaxis] * np.eye(2, 3)
-    # e x d = -[d]x e
-    jacobian[:, :, ATTITUDE] = project @ -cross_matrix(patches.lines_m)
-    flat = jacobian.reshape(-1, 9)
+    count, tangents, flat = len(patches.images), _tangents(patches), _state_jacobian(patches)
     height = (tangents * errors.height_m[:, np.newaxis]).reshape(-1)
     same_image = (patches.images[:, np.newaxis] == patches.images).astype(np.float64)
     overlap = _overlap(patches)
@@ -99,6 +96,38 @@ def offset_covariance(
         + errors.distortion_m**2 * np.kron(overlap, np.eye(_AXES))
         + errors.matching_m**2 * np.eye(_AXES * count)
     )
+
+
+def estimate_position_error(
+    offsets_m: Points2, patches: PatchGeometry, state_covariance: Float[np.ndarray, "9 9"], errors: OffsetErrors
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2 2"]]:
+    """Estimate the horizontal position error (true minus estimated) from the patches' offsets; return its covariance.
+
+    The arguments are those of `offset_covariance`.
+    """
+    position = slice(POSITION.start, POSITION.start + _AXES)
+    cross = state_covariance[position] @ _state_jacobian(patches).T
+    gain = np.linalg.solve(offset_covariance(patches, state_covariance, errors), cross.T).T
+    covariance = state_covariance[position, position] - gain @ cross.T
+    return gain @ offsets_m.reshape(-1), 0.5 * (covariance + covariance.T)
+
+
+def _tangents(patches: PatchGeometry) -> Points2:
+    """Return d_h / H of each patch."""
+    return np.asarray(patches.lines_m[:, :2] / -patches.lines_m[:, 2:])
+
+
+def _state_jacobian(patches: PatchGeometry) -> Float[np.ndarray, "m 9"]:
+    """Return the derivatives of the offsets with respect to position, velocity and attitude of the last image."""
+    count, tangents = len(patches.images), _tangents(patches)
+    # horizontal shift of a patch by a displacement (east, north, up) of its line of sight
+    project = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), tangents[:, :, np.newaxis]], axis=2)
+    jacobian = np.zeros((count, _AXES, 9))
+    jacobian[:, :, POSITION] = np.eye(2, 3)
+    jacobian[:, :, VELOCITY] = -patches.ages_s[:, np.newaxis, np.newaxis] * np.eye(2, 3)
+    # e x d = -[d]x e
+    jacobian[:, :, ATTITUDE] = project @ -cross_matrix(patches.lines_m)
+    return jacobian.reshape(-1, 9)
 
 
 def _overlap(patches: PatchGeometry) -> Float[np.ndarray, "n n"]:

@@ -13,7 +13,7 @@ class LocalisationDetails:
     """Intermediate results of one image.
 
     - stage: Last stage that was run: `coarse` (search over the map) or `fine` (landmarks)
-    - coarse_offset_m: Horizontal correction of the coarse stage (east, north); None if it found none, or was not run
+    - coarse_position_m: Position found by the coarse stage (east, north); None if it found none, or was not run
     - inliers: Number of landmarks that agree with each other and with the state; the update uses only these. The number
       is also given if the update was not applied, for example because they are too few. None without a match. For the
       SIFT baseline: number of features that agree with the solved position.
@@ -23,7 +23,7 @@ class LocalisationDetails:
     """
 
     stage: str
-    coarse_offset_m: Float[np.ndarray, "2"] | None = None
+    coarse_position_m: Float[np.ndarray, "2"] | None = None
     inliers: int | None = None
     measured_px: Float[np.ndarray, "n 2"] | None = None
     residuals_px: Float[np.ndarray, "n 2"] | None = None

@@ -46,6 +46,7 @@ class MapRelativeEstimator:
         self._inertial = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
         self._filter = self._inertial
         self._has_fix = False
+        self._increments_since_fix: list[ImuIncrements] = []
         self._coarse_images: list[tuple[PosedImage, float]] = []
         self._altitudes: list[AltitudeMeasurement] = []
         self._failures = 0
@@ -53,10 +54,10 @@ class MapRelativeEstimator:
         self._last_update_s: float | None = None
 
     def imu(self, increments: ImuIncrements) -> None:
-        """Propagate the state by inertial increments."""
-        self._inertial.propagate(increments)
+        """Propagate the state by inertial increments; pure inertial navigation follows if the fix is discarded."""
+        self._filter.propagate(increments)
         if self._has_fix:
-            self._filter.propagate(increments)
+            self._increments_since_fix.append(increments)
 
     def altitude(self, measurement: AltitudeMeasurement) -> None:
         """Update the state by an altitude, if the position on the map is known; store it otherwise.
@@ -78,21 +79,21 @@ class MapRelativeEstimator:
             return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)
         state = self._filter.state_at(image.time_s)
         posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
-        coarse_offset = None
+        coarse_position = None
         if not self._has_fix:
-            coarse_offset = self._run_coarse_stage(posed)
-            if coarse_offset is None:
+            coarse_position = self._run_coarse_stage(posed)
+            if coarse_position is None:
                 return self._answer(image.time_s, LocalisationDetails("coarse"))
             state = self._filter.state_at(image.time_s)
             posed = PosedImage.from_detector(image, state.position_m, state.world_from_body)
-        return self._run_fine_stage(image, posed, coarse_offset)
+        return self._run_fine_stage(image, posed, coarse_position)
 
     def finish(self) -> PositionEstimate:
         """Return the state at the time of the last increment."""
         return self._answer(self._filter.time_s, None)
 
     def _run_coarse_stage(self, image: PosedImage) -> Float[np.ndarray, "2"] | None:
-        """Collect images; with enough of them, search the map. Returns the correction of the position."""
+        """Collect images; with enough of them, search the map. Returns the position found (east, north)."""
         height = self._height_above_ground(image.time_s)
         if height is None:
             return None
@@ -104,25 +105,31 @@ class MapRelativeEstimator:
         fix = find_coarse_position(images, heights, self._map, state.covariance[:9, :9], self.options)
         if not isinstance(fix, CoarseFix):
             return None
+        position_m = state.position_m[:2] + fix.offset_m
         updated = copy.deepcopy(self._inertial)
-        result = updated.update_position(image.time_s, state.position_m[:2] + fix.offset_m, fix.covariance)
+        result = updated.update_position(image.time_s, position_m, fix.covariance)
         if result.outcome is not UpdateOutcome.APPLIED:
             return None
         self._filter = updated
         self._has_fix, self._failures, self._is_contradicted, self._last_update_s = True, 0, False, None
         for altitude in self._altitudes:
-            self._update_altitude(altitude)
-        return fix.offset_m
+            # at the time of the altitude, the state does not yet contain the fix
+            if self._inertial.is_stored(altitude.time_s):
+                below_m = self._inertial.state_at(altitude.time_s).position_m[:2] + fix.offset_m
+                self._update_altitude(altitude, (elevation_at(self._map, below_m), np.zeros(2)))
+        return np.asarray(position_m)
 
     def _run_fine_stage(
-        self, image: DetectorImage, posed: PosedImage, coarse_offset: Float[np.ndarray, "2"] | None
+        self, image: DetectorImage, posed: PosedImage, coarse_position: Float[np.ndarray, "2"] | None
     ) -> PositionEstimate:
         """Match landmarks and update the state; after several failures the coarse stage is repeated."""
         options, covariance = self.options, self._filter.state_at(image.time_s).covariance
         position_sd_m = np.sqrt(np.diag(covariance)[:3])  # east, north, up
         matches = match_landmarks(posed, self._landmarks, self._map, position_sd_m, options)
         if len(matches) == 0:
-            return self._count_failure(image.time_s, LocalisationDetails("fine", coarse_offset), is_contradicted=False)
+            return self._count_failure(
+                image.time_s, LocalisationDetails("fine", coarse_position), is_contradicted=False
+            )
         point_sd_m = np.array([self._map.distortion_sd_m, self._map.distortion_sd_m, self._map.elevation_sd_m])
         height_m = max(float(posed.position_m[2]) - elevation_at(self._map, posed.position_m[:2]), 0.0)
         # error common to all landmarks of an image: of the map, and of the camera's alignment (horizontal)
@@ -142,7 +149,7 @@ class MapRelativeEstimator:
         )
         details = LocalisationDetails(
             "fine",
-            coarse_offset,
+            coarse_position,
             int(np.count_nonzero(result.inliers)),
             matches.measured_px,
             matches.residuals_px,
@@ -162,6 +169,9 @@ class MapRelativeEstimator:
         self._is_contradicted |= is_contradicted
         if self._failures >= self.options.max_failures:
             self._has_fix, self._filter, self._coarse_images = False, self._inertial, []
+            for increments in self._increments_since_fix:
+                self._inertial.propagate(increments)
+            self._increments_since_fix = []
             return PositionEstimate(PositionOutcome.INCONSISTENT, time_s, details=details)
         return self._answer(time_s, details)
 
@@ -189,10 +199,10 @@ class MapRelativeEstimator:
         velocity = self._inertial.state_at(time_s).velocity_m_s
         return last.altitude_m + float(velocity[2]) * (time_s - last.time_s)
 
-    def _update_altitude(self, measurement: AltitudeMeasurement) -> None:
-        """Update the state by an altitude above the map's elevation."""
+    def _update_altitude(self, measurement: AltitudeMeasurement, ground: GroundHeight | None = None) -> None:
+        """Update the state by an altitude above `ground`, by default the map's elevation at the estimated position."""
         sd_m = float(np.hypot(self.options.altitude_sd * measurement.altitude_m, self._map.elevation_sd_m))
-        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, self._ground_height, sd_m)
+        self._filter.update_altitude(measurement.time_s, measurement.altitude_m, ground or self._ground_height, sd_m)
 
     def _ground_height(self, position_m: Float[np.ndarray, "2"]) -> GroundHeight:
         """Elevation of the map and its slope (east, north) at a position."""

@@ -155,7 +155,13 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, S
     details = [estimate.details for estimate in answers.estimates[:-1]]
     inliers = [item.inliers for item in details if isinstance(item, LocalisationDetails) and item.inliers is not None]
     horizontal = [error.horizontal_m for error in valid]
+    coarse = [
+        (estimate.time_s, item.coarse_position_m)
+        for estimate, item in zip(answers.estimates, details, strict=False)
+        if isinstance(item, LocalisationDetails) and item.coarse_position_m is not None
+    ]
     return {
+        "coarse_error_m": _coarse_error_m(descent, *coarse[0]) if coarse else _NAN,
         "fix_after_s": valid[0].time_s if valid else _NAN,
         "fixed_in_time": bool(early),
         "position_reported": bool(valid),
@@ -170,6 +176,13 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, S
         "image_time_max_s": max(times.image_s, default=0.0),
         "image_time_median_s": float(np.median(times.image_s)) if times.image_s else 0.0,
     }
+
+
+def _coarse_error_m(descent: LocalisedDescent, time_s: float, position_m: Float64[np.ndarray, "2"]) -> float:
+    """Return the horizontal error, relative to the map, of a position at a time of the inertial unit."""
+    first_s, last_s = descent.flight.span_s
+    truth = descent.flight.state(float(np.clip(time_s - descent.imu_offset_s, first_s, last_s)))
+    return float(np.hypot(*(position_m - descent.map_truth.map_position(truth.position_m[:2]))))
 
 
 def _final_columns(error: EstimateErrors | None) -> dict[str, Scalar]:
@@ -219,7 +232,7 @@ def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, 
     estimated = [np.full(2, np.nan) if item.position_m is None else item.position_m[:2] for item in estimates]
     map_product = descent.measurements.map_product
     side_px = min(_THUMBNAIL_PX, *map_product.appearance.shape)
-    low, high = np.quantile(map_product.appearance, (0.005, 0.995))
+    low, high = np.quantile(map_product.appearance[::4, ::4], (0.005, 0.995))
     scaled = np.clip(255.0 * (map_product.appearance - low) / max(float(high - low), 1e-9), 0.0, 255.0)
     thumbnail = cv2.resize(scaled.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_AREA)
     west, south = map_product.origin_m - 0.5 * map_product.pixel_m

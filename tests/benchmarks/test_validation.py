@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.stages import STAGES
+from benchmarks.localisation import STAGES
+from benchmarks.stages import DESCENT_STAGES
 from benchmarks.threshold_derivation import ThresholdInputs, draw_correct_track_errors
 from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
 from benchmarks.validation.document import RESULTS
@@ -129,7 +130,7 @@ def test_matching_is_the_only_error_of_a_reference_with_exact_instruments() -> N
 
 def test_profiled_stages_name_existing_functions() -> None:
     root = Path(__file__).parents[2]
-    for file, function in {pair for pairs in STAGES.values() for pair in pairs}:
+    for file, function in {pair for stages in (STAGES, DESCENT_STAGES) for pairs in stages.values() for pair in pairs}:
         # folders sim, scenarios, algorithms and campaigns
         texts = [path.read_text() for path in root.glob(f"[sac]*/**/{file}")]
         assert any(f"def {function}(" in text for text in texts), (file, function)

@@ -13,6 +13,8 @@ from marsyard.sim.streams import hash_words
 from marsyard.sim.terrain.landforms.kernels import add_refined
 
 SMALLEST_SIDE = 16  #: Minimum side of the grid of a landform, samples.
+#: Waves per wavelength of a Gaussian low-pass filter (gain exp(-1/2) at this wavelength) at which its gain is 3e-8.
+_NEGLIGIBLE_WAVES = 5.9
 Grid = Float32[np.ndarray, "side side"]
 
 
@@ -172,7 +174,9 @@ class Spectrum:
     ) -> tuple[Float32[np.ndarray, "samples samples"], Float32[np.ndarray, "samples samples"]]:
         """Draw the field of `draw_field` as the sum of a coarse and a fine field, separated at a wavelength."""
         modes = self._draw_modes(rng)
-        coarse = self._transform(self._filter(modes, wavelength_m), scale)
+        # modes with a gain below the rounding of single precision are omitted
+        columns = 1 + int(_NEGLIGIBLE_WAVES * len(modes) * self.spacing_m / wavelength_m)
+        coarse = self._transform(self._filter(modes[:, :columns], wavelength_m), scale)
         fine = self._transform(modes, scale)
         fine -= coarse
         return coarse, fine
@@ -181,9 +185,14 @@ class Spectrum:
         self, modes: Inexact[np.ndarray, "samples half"], wavelength_m: float
     ) -> Inexact[np.ndarray, "samples half"]:
         """Apply a Gaussian low-pass filter with the gain exp(-1/2) at a wavelength to modes."""
-        samples, factor = modes.shape[0], np.float32(wavelength_m)
-        along_y = scipy.fft.fftfreq(samples, self.spacing_m).astype(np.float32) * factor
-        along_x = scipy.fft.rfftfreq(samples, self.spacing_m).astype(np.float32) * factor
+        samples, columns = modes.shape
+        along_y, along_x = (
+            (frequencies * wavelength_m).astype(np.float32)
+            for frequencies in (
+                scipy.fft.fftfreq(samples, self.spacing_m),
+                scipy.fft.rfftfreq(samples, self.spacing_m)[:columns],
+            )
+        )
         filtered = modes * np.exp(np.float32(-0.5) * along_x**2)
         filtered *= np.exp(np.float32(-0.5) * along_y**2)[:, None]
         return np.asarray(filtered)
@@ -199,11 +208,12 @@ class Spectrum:
         return noise
 
     def _transform(
-        self, modes: Complex64[np.ndarray, "samples half"], scale: float
+        self, modes: Complex64[np.ndarray, "samples columns"], scale: float
     ) -> Float32[np.ndarray, "samples samples"]:
-        """Transform modes to a field with the expected variance ``scale**2``."""
+        """Transform modes to a field with the expected variance ``scale**2``; missing columns are 0."""
         samples = modes.shape[0]
-        field = scipy.fft.irfft2(modes, s=(samples, samples), workers=1, overwrite_x=True)
+        modes = scipy.fft.ifft(modes, axis=0, workers=1, overwrite_x=True)
+        field = scipy.fft.irfft(modes, n=samples, axis=1, workers=1, overwrite_x=True)
         # complex noise has variance 2; irfft2 divides by samples**2
         field *= np.float32(scale * samples**2 / np.sqrt(2.0 * self.column_power.sum()))
         return np.asarray(field)

@@ -128,7 +128,8 @@ class Lava(Parameters):
         warp_x, warp_y = (resample(warp[..., axis], layer.side) for axis in (0, 1))
         stamp_lobes(layer.height, layer.log_albedo, layer.spacing_m, lobes, warp_x, warp_y)
         ground.add(layer)
-        self._add_blocks(ground, rng)
+        if self.aa_fraction > 0.0 or self.pahoehoe_relief_m > 0.0:
+            self._add_blocks(ground, rng)
 
     def _add_blocks(self, ground: Ground, rng: Generator) -> None:
         """Add noise with the wavelength of the blocks, in patches where a smooth random field exceeds a threshold."""
@@ -142,6 +143,7 @@ class Lava(Parameters):
         threshold = float(np.quantile(patches[::4, ::4], 1.0 - self.aa_fraction))
         # the coverage rises from 0 to 1 around the threshold, over 1/6 of the field's unit
         coverage = np.clip((patches - np.float32(threshold)) * np.float32(6.0) + np.float32(0.5), 0.0, 1.0)
+        coverage *= self.aa_fraction > 0.0  # without a'a the threshold is a maximum, around which the coverage rises
         relief = np.float32(self.pahoehoe_relief_m) + np.float32(self.aa_relief_m - self.pahoehoe_relief_m) * coverage
         relief *= rng.standard_normal(relief.shape, dtype=np.float32)
         relief *= np.float32(1.0 / SPLINE_OF_NOISE_RMS)

@@ -74,6 +74,14 @@ def test_exact_images_determine_an_offset_of_three_kilometres() -> None:
     np.testing.assert_allclose(fix.matches.map_m - fix.matches.predicted_m, np.tile(OFFSET_M, (15, 1)), atol=12.0)
 
 
+def test_an_offset_at_the_limit_of_the_initial_error_is_found() -> None:
+    """The search area extends beyond 3.2 km: offsets near its border are refused."""
+    limit_m = OPTIONS.search_radius_m * np.array([0.8, -0.6])
+    fix = run_coarse_stage(random_images(), make_scene().map_product, limit_m)
+    assert isinstance(fix, CoarseFix)
+    np.testing.assert_allclose(fix.offset_m, limit_m, atol=1.2)
+
+
 def test_errors_of_pose_altitude_radiometry_and_noise_stay_within_100_m() -> None:
     rng = np.random.default_rng(3)
     images = []

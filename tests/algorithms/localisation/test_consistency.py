@@ -15,6 +15,7 @@ from marsyard.algorithms.localisation.consistency import (
     OffsetTest,
     PatchGeometry,
     check_offsets,
+    estimate_position_error,
     offset_covariance,
 )
 
@@ -55,9 +56,11 @@ def find_offsets(state_errors: np.ndarray, height_errors_m: np.ndarray) -> np.nd
     return np.asarray(position + hits - patches.lines_m[:, :2])
 
 
-def draw_offsets(rng: np.random.Generator, attitude_rad: np.ndarray | None = None) -> np.ndarray:
-    """Draw errors with the stated standard deviations, with another attitude error if one is given."""
-    state = STATE_SD * rng.standard_normal(9)
+def draw_offsets(
+    rng: np.random.Generator, attitude_rad: np.ndarray | None = None, state: np.ndarray | None = None
+) -> np.ndarray:
+    """Draw errors with the stated standard deviations, with other errors of attitude or state if they are given."""
+    state = STATE_SD * rng.standard_normal(9) if state is None else state.copy()
     if attitude_rad is not None:
         state[6:] = attitude_rad
     offsets = find_offsets(state, 60.0 * (rng.standard_normal() + rng.standard_normal(3)))
@@ -76,6 +79,22 @@ def test_offsets_with_the_stated_errors_are_chi_square() -> None:
     assert squares.mean() == pytest.approx(30.0, abs=4.0 * np.sqrt(60.0 / 400.0) + 0.3)
     # 5 % above the 95 % quantile: 4 standard deviations of a binomial number
     assert np.mean(squares > chi2.ppf(0.95, 30)) == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 400.0))
+
+
+def test_position_error_is_estimated_with_its_covariance() -> None:
+    """The normalised square of the estimate's error has the mean 2; its variance is below that of the mean offset."""
+    rng, patches, state_covariance = np.random.default_rng(6), make_patches(), np.diag(STATE_SD**2)
+    squares, errors, mean_errors = [], [], []
+    for _ in range(400):
+        state = STATE_SD * rng.standard_normal(9)
+        offsets = draw_offsets(rng, state=state)
+        estimate, covariance = estimate_position_error(offsets, patches, state_covariance, ERRORS)
+        errors.append(estimate - state[:2])
+        mean_errors.append(offsets.mean(axis=0) - state[:2])
+        squares.append(errors[-1] @ np.linalg.solve(covariance, errors[-1]))
+    # standard deviation of the mean of 400 draws: sqrt(4 / 400); 1 % for the effect of linearisation
+    assert np.mean(squares) == pytest.approx(2.0, abs=4.0 * np.sqrt(4.0 / 400.0) + 0.02)
+    assert np.var(errors) < 0.75 * np.var(mean_errors)
 
 
 def test_stated_errors_are_accepted() -> None:

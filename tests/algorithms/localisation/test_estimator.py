@@ -203,7 +203,23 @@ def test_no_position_before_three_images(make_stages: Callable[..., Stages]) -> 
     assert isinstance(details, LocalisationDetails)
     assert details.inliers is not None
     assert details.inliers > 20
-    np.testing.assert_array_equal(details.coarse_offset_m, ERROR_M[:2])
+    assert details.coarse_position_m is not None
+    np.testing.assert_allclose(details.coarse_position_m, _true_position(3.0)[:2], atol=1e-6)
+
+
+def test_altitudes_before_the_fix_refer_to_the_ground_below_the_corrected_position(
+    make_stages: Callable[..., Stages],
+) -> None:
+    """A step of 100 m lies between the initial and the true positions."""
+    elevation = np.zeros((300, 300), np.float32)
+    east_m = FLAT_MAP.origin_m[0] + FLAT_MAP.pixel_m * np.arange(300)
+    elevation[:, east_m < START_M[0] - 0.5 * ERROR_M[0]] = 100.0
+    make_stages([ERROR_M[:2]], [True])
+    estimator = MapRelativeEstimator()
+    list(_descend(estimator, replace(FLAT_MAP, elevation_m=elevation), _images(3)))
+    state = estimator._filter.state_at(2.0)
+    # the altitudes reduce the initial height error of 15 m; at the initial position they would be 100 m too large
+    assert abs(state.position_m[2] - _true_position(2.0)[2]) < 15.0
 
 
 def test_coarse_stage_is_not_run_without_an_altitude(make_stages: Callable[..., Stages]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -151,6 +152,9 @@ def test_truth_is_at_the_time_of_the_tag_without_the_clock_offset() -> None:
 
 def test_row_of_a_located_descent() -> None:
     details = [LocalisationDetails("fine", inliers=count) for count in (40, 90, 60)]
+    coarse_m = _estimate(6.0, [30.0, -40.0, 0.0]).position_m
+    assert coarse_m is not None
+    details[0] = replace(details[0], coarse_position_m=coarse_m[:2])
     row = _row(
         _refusal(2.0),
         _estimate(6.0, [6.0, 8.0, 0.0], details=details[0]),
@@ -158,6 +162,7 @@ def test_row_of_a_located_descent() -> None:
         _estimate(14.0, [0.0, 20.0, 0.0], details=details[2]),
         _estimate(END_S, [3.0, 4.0, -2.0]),
     )
+    assert row["coarse_error_m"] == pytest.approx(50.0)
     assert row["fix_after_s"] == 6.5
     assert row["fixed_in_time"] is True
     assert row["position_error_at_10_s_m"] == pytest.approx(3.0)
@@ -201,6 +206,7 @@ def test_row_of_refusals_has_nan_errors() -> None:
     assert (row["fixed_in_time"], row["false_fix"], row["valid_images"]) == (False, False, 0)
     numbers = {name for name, value in row.items() if isinstance(value, float) and np.isnan(value)}
     assert numbers == {
+        "coarse_error_m",
         "fix_after_s",
         *(f"position_error_{name}_m" for name in ("at_10_s", "max", "east", "north", "up", "world")),
         "position_error_m",

@@ -1,0 +1,46 @@
+"""Run times of complete localisation cases, and of their stages."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+from benchmarks.stages import Stages, measure_stages
+from benchmarks.timing import Measurement, core_seconds
+from marsyard.campaigns.definition.loading import load_campaign
+
+#: Stages of a case of `loc-jezero` with the published algorithm alone.
+STAGES: Stages = {
+    "terrain": (("views.py", "from_bank"),),
+    "map product": (("localisation/map_product.py", "make_map"),),
+    "flight": (("localisation/flight.py", "simulate"),),
+    "scene": (("localisation/world.py", "scene"),),
+    "24 images": (("exposure.py", "render_state"), ("exposure.py", "add_haze")),
+    "detector": (("sensor/detector.py", "expose"),),
+    "landmarks of the map": (("localisation/landmarks.py", "select_landmarks"),),
+    "coarse stage": (("localisation/coarse.py", "find_coarse_position"),),
+    "fine stage": (("localisation/fine.py", "match_landmarks"),),
+    "navigation filter": (
+        ("localisation/navigation_filter.py", "propagate"),
+        ("localisation/navigation_filter.py", "update_landmarks"),
+        ("localisation/navigation_filter.py", "update_altitude"),
+    ),
+}
+
+
+def measure(cases: int) -> list[Measurement]:
+    """Measure cases of `loc-jezero` with `lvs` alone; each one builds a terrain of its own, as in a campaign."""
+    campaign = load_campaign("loc-jezero", ["compared=[]"])
+    case_numbers = itertools.count()
+
+    def run_next() -> None:
+        case = next(case_numbers)
+        campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+
+    with TemporaryDirectory() as folder, patch("marsyard.sim.terrain.bank.cache_directory", lambda _: Path(folder)):
+        return [
+            Measurement("loc-jezero case: terrain, map, 24 frames, lvs", core_seconds(run_next, cases), limit=10.0),
+            *measure_stages("loc-jezero case", run_next, max(cases - 1, 1), STAGES),
+        ]
