@@ -33,6 +33,7 @@ from marsyard.scenarios.parts.named import PartKind
 from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+from marsyard.sim.render.renderer import return_freed_memory
 from marsyard.sim.sensor import ClockParameters, Detector, Imu
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.sensor.ranging import RadarAltimeter
@@ -72,6 +73,7 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one descent and score all algorithms."""
+        return_freed_memory()  # that of the previous case: the memory of a new terrain would be in addition
         descent = LocalisedDescent.simulate(self.check_parameters(parameters), streams)
         p = descent.p
         shared = {

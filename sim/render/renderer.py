@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
+from weakref import ref
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, Int32, Int64
@@ -118,7 +119,8 @@ class Renderer:
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
         self._views: dict[int, DepthRenderer] = {}
-        self._last_scene: Scene | None = None
+        # not the scene itself, whose terrain would stay in memory while the next one is built
+        self._last_scene: ref[Scene] | None = None
         self._scene_count = 0
         keep_freed_memory()
 
@@ -185,8 +187,8 @@ class Renderer:
 
         `clearance_m` is the height of the camera above the ground.
         """
-        if self._last_scene is not scene:
-            self._last_scene = scene
+        if self._last_scene is None or self._last_scene() is not scene:
+            self._last_scene = ref(scene)
             self._scene_count += 1
             if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
                 return_freed_memory()
