@@ -145,15 +145,7 @@ class Viewpoint:
 
 def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
     """Build the scene for a viewpoint: ground, resolved rocks, texture and light."""
-    spacing_m = ground.surface.spacing_m
-    # the terrain contains no detail for a mesh that is much finer than its samples
-    finest_m = max(_MESH_FINEST * viewpoint.height_m, 0.8 * spacing_m)
-    horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * viewpoint.height_m))
-    half_width_m = max(
-        _MIN_HALF_WIDTH_RATIO * viewpoint.height_m, _MIN_HALF_WIDTH_M, min(horizon_m, viewpoint.max_distance_m)
-    )
-    # line k of the mesh is at finest_m * sinh(k growth) / sinh(growth)
-    half_lines = int(np.ceil(np.arcsinh(half_width_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
+    finest_m, half_width_m, lines = mesh_size(ground.surface.spacing_m, viewpoint.height_m, viewpoint.max_distance_m)
     objects = select_rocks(ground, viewpoint, half_width_m)
     if ground.site.hills and np.isinf(viewpoint.max_distance_m) and viewpoint.height_m < _MAX_AMONG_ROCKS_M:
         mean_m = float(ground.surface.levels[-1][..., 0].mean())
@@ -169,9 +161,24 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
         mesh_finest_m=finest_m,
         mesh_half_width_m=half_width_m,
-        mesh_lines=2 * half_lines + 1,
+        mesh_lines=lines,
         among_objects=viewpoint.height_m < _MAX_AMONG_ROCKS_M,
     )
+
+
+def mesh_size(spacing_m: float, height_m: float, max_distance_m: float = np.inf) -> tuple[float, float, int]:
+    """Return spacing at the centre, half width, m, and number of lines of the ground's mesh for a camera.
+
+    - spacing_m: of the terrain's samples
+    - height_m, max_distance_m: height of the camera above the ground, and largest distance of visible ground
+    """
+    # the terrain contains no detail for a mesh that is much finer than its samples
+    finest_m = max(_MESH_FINEST * height_m, 0.8 * spacing_m)
+    horizon_m = float(np.sqrt(2.0 * _MARS_RADIUS_M * height_m))
+    half_width_m = max(_MIN_HALF_WIDTH_RATIO * height_m, _MIN_HALF_WIDTH_M, min(horizon_m, max_distance_m))
+    # line k of the mesh is at finest_m * sinh(k growth) / sinh(growth)
+    half_lines = int(np.ceil(np.arcsinh(half_width_m / finest_m * np.sinh(_MESH_GROWTH)) / _MESH_GROWTH))
+    return finest_m, half_width_m, 2 * half_lines + 1
 
 
 def micro_relief(ground: SiteGround) -> MicroRelief:

@@ -45,6 +45,8 @@ from marsyard.sim.terrain import TerrainBank
 LEAD_S, MARGIN_S = 0.2, 0.2
 #: Largest bank whose terrains are built before the cases; a terrain needs 180 MB on disk.
 MAX_SHARED_TERRAINS = 20
+#: Minimum height of a camera for which the ground's mesh is made, m: a lower one needs no finer first guess.
+_MIN_HEIGHT_M = 50.0
 #: Index of the terrain that a wrong map shows, minus the index of the case's terrain.
 _WRONG_TERRAIN = 1
 
@@ -211,10 +213,8 @@ def _take_images(
     clock = Clock.draw(p.clock, streams.generator("image clock"))
     times = np.array([state.time_s for state in states])
     tags = times if p.exact_instruments else clock.tags(times, streams.generator("image tags"))
-    first, last = states[0].position_m, states[-1].position_m
-    # a mesh for at least 50 m: a lower last image needs no denser first guess
-    height_m = max(float(last[2] - world.surface.height(last[0], last[1])), 50.0)
-    scene = world.scene(float(first[0]), float(first[1]), height_m, optics.rays.pixel_rad)
+    east_m, north_m = states[0].position_m[:2].tolist()
+    scene = world.scene(east_m, north_m, _MIN_HEIGHT_M, optics.rays.pixel_rad)
     shield = None
     if p.faults.heat_shield_deg:
         angle = float(np.radians(p.faults.heat_shield_deg))
@@ -223,8 +223,10 @@ def _take_images(
     images: list[DetectorImage] = []
     delivered_states: list[State] = []
     for number, (state, tag) in enumerate(zip(states, tags, strict=True), start=1):
+        east_m, north_m, up_m = state.position_m.tolist()
+        height = up_m - float(world.surface.height(east_m, north_m))
+        scene = world.move_scene(scene, east_m, north_m, max(height, _MIN_HEIGHT_M))
         frame, motion = render_state(p.render.backend, scene, optics, state)
-        height = float(state.position_m[2] - world.surface.height(*state.position_m[:2]))
         extinction = world.air.mean_extinction_m(height) + p.faults.haze / HAZE_PATH_M
         radiance = add_haze(frame, world.air, world.sun, extinction)
         if shield is not None:

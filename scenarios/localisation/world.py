@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from marsyard.scenarios.exposure import sunlight_ratio
-from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, mesh_size, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Scene, Sun
 from marsyard.sim.sensor import DetectorParameters
@@ -63,19 +63,22 @@ class LocalisationWorld:
         return cls(ground, sun, brightness)
 
     def scene(self, east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
-        """Create the scene for a camera at or above a height above the ground.
+        """Create the scene for a camera; the terrain repeats beyond its period.
 
-        A whole descent uses one scene; `height_m` is then the height of the last image. The ground's mesh gives only
-        first guesses of the range, which are refined on the exact surface. A mesh that is too coarse changes pixels at
-        the edges of hidden slopes: 0.2 % of the pixels in an image 500 m above the highland, with a mesh for 2000 m. A
-        finer mesh takes longer: at 4200 m, a mesh for 500 m takes a third more time per image than one for 4200 m.
-        The terrain repeats beyond its period.
-
-        - east_m, north_m: position around which the mesh is dense: below one of the images
-        - height_m: height above the ground of the lowest image
+        - east_m, north_m: position below the camera, around which the ground's mesh is dense
+        - height_m: height above the ground
         - pixel_rad: angle of a pixel
         """
         return site_scene(self.ground, Viewpoint(east_m, north_m, height_m, pixel_rad), self.sun)
+
+    def move_scene(self, scene: Scene, east_m: float, north_m: float, height_m: float) -> Scene:
+        """Return the scene with the mesh for another position of the camera.
+
+        The mesh gives only first guesses of the range, which are refined on the exact surface. A mesh that is too
+        coarse changes pixels at the edges of hidden slopes: 0.2 % of the pixels in an image 500 m above the highland,
+        with a mesh for 2000 m. A mesh that is too fine takes longer.
+        """
+        return scene.with_mesh((east_m, north_m), *mesh_size(self.surface.spacing_m, height_m))
 
 
 def sun_at(air: Environment, azimuth_deg: float, elevation_deg: float) -> Sun:

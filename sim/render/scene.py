@@ -109,6 +109,13 @@ class Scene:
         # infinite bounds of the slope depend on the direction of the sun
         return self._keep_results(scene, "max_slopes") if np.all(np.isfinite(self.max_slopes)) else scene
 
+    def with_mesh(self, centre_m: tuple[float, float], finest_m: float, half_width_m: float, lines: int) -> Scene:
+        """Return the scene with another mesh of the ground; all other cached results are kept."""
+        scene = replace(
+            self, centre_m=centre_m, mesh_finest_m=finest_m, mesh_half_width_m=half_width_m, mesh_lines=lines
+        )
+        return self._keep_results(scene, "height_range_m", "max_slopes", "shadow")
+
     def _keep_results(self, scene: Scene, *names: str) -> Scene:
         """Copy cached results of this scene to a changed scene for which they are valid."""
         scene.__dict__.update({name: getattr(self, name) for name in names})
