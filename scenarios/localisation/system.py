@@ -19,7 +19,14 @@ SYSTEM = System(
     columns=_FOLDER / "columns.toml",
     error_sources=_FOLDER / "error_sources.toml",
     compilation_campaigns={
-        "loc-smoke": ("terrain.samples=512", "map.side_px=256", "camera.pixels=128", "camera.pixel_mrad=13.36")
+        "loc-smoke": (
+            "terrain.samples=1024",
+            "map.side_px=512",
+            "camera.pixels=256",
+            "camera.pixel_mrad=6.68",
+            # small enough for a coarse fix, after which the fine stage runs
+            "initial.horizontal_sd_m=100",
+        )
     },
     report="marsyard.reports.localisation.presentation:LOCALISATION",
 )

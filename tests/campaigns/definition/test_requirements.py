@@ -17,7 +17,7 @@ from tests.campaigns.fake_campaign import write_campaign
 BOUNDS = {
     "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None,
     "HDA-SAFE": None, "HDA-TOUCHDOWN": None, "HDA-POS": 2.0, "HDA-TIME": 2.0, "LOC-POS": 40.0, "LOC-FINAL": 40.0,
-    "LOC-HARM": 40.0, "LOC-AVAIL": None, "LOC-TIME": 3.0,
+    "LOC-HARM": 40.0, "LOC-COARSE": 200.0, "LOC-AVAIL": None, "LOC-TIME": 3.0,
 }  # fmt: skip
 
 
