@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
 from marsyard.reports.localisation import case_figures as figures
 from marsyard.reports.localisation.consistency import create_consistency_blocks
 from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, save_figures, to_float
+from marsyard.reports.rates import CaseFraction, fraction_of
 from marsyard.reports.section import svg_figure
 from marsyard.reports.section_kinds import (
     CustomBlocks,
@@ -26,7 +28,7 @@ from marsyard.reports.section_kinds import (
     SectionDeclaration,
     flag_rate,
 )
-from marsyard.reports.wording import number
+from marsyard.reports.wording import number, numbers
 
 _LEGEND = "The blue line is the true position; the bands are three standard deviations that the algorithm reports."
 #: Required position error: the bound of a false fix.
@@ -66,6 +68,18 @@ def write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
 
 
 _FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
+#: Error of the published coarse stage, m.
+_MAX_COARSE_ERROR_M = 200.0
+
+
+def _compute_coarse_rate(frame: pd.DataFrame) -> CaseFraction:
+    """Return the fraction of descents with a correct coarse position; of no descent without a coarse stage."""
+    errors_m = numbers(frame, "coarse_error_m")
+    rows = frame if np.isfinite(errors_m).any() else frame[:0]
+    return fraction_of(numbers(rows, "coarse_error_m") <= _MAX_COARSE_ERROR_M, rows)
+
+
+_COARSE = Rate("coarse", "Coarse position within 200 m", _compute_coarse_rate)
 _FALSE_FIX = Rate("false_fix", "A reported position is wrong by more than 40 m", flag_rate("false_fix"))
 
 POSITION = SectionDeclaration(
@@ -74,7 +88,7 @@ POSITION = SectionDeclaration(
     "Position on the map",
     requires=("fixed_in_time",),
     parts=(
-        RateTable((_FIXED_IN_TIME, _FALSE_FIX), cases="Descents", heading="Positions"),
+        RateTable((_COARSE, _FIXED_IN_TIME, _FALSE_FIX), cases="Descents", heading="Positions"),
         Distribution(
             (
                 Quantity("position_error_at_10_s_m", "after 10 s"),
@@ -89,6 +103,7 @@ POSITION = SectionDeclaration(
         ),
         Quantiles(
             (
+                Quantity("coarse_error_m", "horizontal error of the coarse position (m)"),
                 Quantity("position_error_at_10_s_m", "horizontal position error after 10 s (m)"),
                 Quantity("position_error_m", "last horizontal position error (m)"),
                 Quantity("position_error_up_m", "last error of the height (m)"),
@@ -114,7 +129,7 @@ CONDITIONS = SectionDeclaration(
     parts=(
         RateByCondition(
             Quantity("sun_difference_deg", "Angle between the suns of map and landing (deg)"),
-            (_FIXED_IN_TIME, Rate("answered", "Position reported at the end", flag_rate("answered"))),
+            (_COARSE, _FIXED_IN_TIME, Rate("answered", "Position reported at the end", flag_rate("answered"))),
             cases="Descents",
             ylabel="fraction of descents",
             caption="Descents with a reported position against the angle between the suns of map and landing.",

@@ -69,6 +69,7 @@ def localisation_frame(cases: int, fixed_fraction: float = 0.9, seed: int = 1) -
             "answered": is_fixed,
             "fixed_in_time": is_fixed,
             "false_fix": False,
+            "coarse_error_m": mask_unreported(2.5 * horizontal),
             "fix_after_s": mask_unreported(rng.uniform(7.1, 9.0, cases)),
             "position_error_at_10_s_m": mask_unreported(1.5 * horizontal),
             "position_error_m": mask_unreported(horizontal),
