@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.exposure import draw_calibrated
 from marsyard.scenarios.landing.helicopter import Transit
@@ -65,12 +65,11 @@ class Flight:
         # another name of a random stream would change the random values
         received_indices = draw_received_images(p.faults, transit.times_s.size, streams.generator("lost pictures"))
         # laser ranges to the ground, without rocks, at all images; no echo beyond five times the height
-        transit_states = [transit.state(number) for number in range(transit.times_s.size)]
+        motion = transit.flight.path.motion(transit.times_s)
         laser = RangingUnit.draw(p.laser, streams.generator("laser"))
-        axes = [np.asarray(state.attitude.apply(laser.axis)) for state in transit_states]
         true_ranges = [
-            range_along(surface, state.position_m, axis, 5.0 * height)
-            for state, axis in zip(transit_states, axes, strict=True)
+            range_along(surface, position, axis, 5.0 * height)
+            for position, axis in zip(motion.positions_m, motion.attitudes.apply(laser.axis), strict=True)
         ]
         readings = laser.readings(transit.times_s, np.array(true_ranges), streams.generator("laser noise, transit"))
         ranges = add_range_faults(p.faults, readings.values, height)[received_indices]
@@ -80,7 +79,7 @@ class Flight:
         )
         first, second = int(received_indices[choice.first]), int(received_indices[choice.second])
         poses = (transit.pose(first), transit.pose(second))
-        return cls((transit_states[first], transit_states[second]), poses, transit.up_body(first), transit)
+        return cls((motion.state(first), motion.state(second)), poses, transit.up_body(first), transit)
 
     @property
     def position_error_m(self) -> Float64[np.ndarray, "3"]:
@@ -162,53 +161,39 @@ def choose_pair(
     """
     if len(poses) < 2:
         raise ValueError(f"cannot choose a pair from {len(poses)} images; at least 2 are needed")
-    views = [_ImageView.from_pose(camera, pose) for pose in poses]
+    columns, rows = camera.size
+    rays = camera.rays(np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5)[1]
+    transforms = RigidTransform.concatenate([pose.world_from_body for pose in poses])
+    centres_m, axes = transforms.apply(np.array(camera.c)), transforms.rotation.apply(np.array(camera.a))
+    corner_rays = np.stack([transforms.rotation.apply(ray) for ray in rays], axis=1)
     best, best_score = None, (False, -np.inf)
     max_shift_px = np.inf if parameters.max_shift_px is None else parameters.max_shift_px
-    for first_index, first in enumerate(views[:-1]):
-        distance = float(ranges_m[first_index]) if np.isfinite(ranges_m[first_index]) else height_m
-        ground_m = float(first.centre_m[2] + distance * first.axis[2])
-        first_footprint = first.footprint(ground_m, first.centre_m)
-        for second_index, second in enumerate(views[first_index + 1 :], start=first_index + 1):
-            step = second.centre_m - first.centre_m
-            baseline = float(np.linalg.norm(step - (step @ first.axis) * first.axis))
-            second_footprint = second.footprint(ground_m, first.centre_m)
-            overlap, shift_px = 0.0, np.inf
-            if first_footprint is not None and second_footprint is not None:
-                shared_area = cv2.intersectConvexConvex(first_footprint, second_footprint)[0]
-                overlap = float(shared_area / cv2.contourArea(first_footprint))
-                pixel_m = np.sqrt(cv2.contourArea(first_footprint) / np.prod(camera.size))
-                shift_px = float(np.linalg.norm(second_footprint - first_footprint, axis=1).max() / pixel_m)
-            is_usable = overlap >= parameters.min_overlap and shift_px <= max_shift_px
-            score = overlap * min(baseline / (parameters.max_baseline_fraction * distance), 1.0)
+    for first, axis in enumerate(axes[:-1]):
+        distance = float(ranges_m[first]) if np.isfinite(ranges_m[first]) else height_m
+        steps_m = centres_m[first:] - centres_m[first]
+        baselines_m = np.linalg.norm(steps_m - (steps_m @ axis)[:, None] * axis, axis=1)
+        footprints = _level_footprints(corner_rays[first:], steps_m, distance * axis[2])
+        area = cv2.contourArea(footprints[0])
+        shifts_px = np.linalg.norm(footprints - footprints[0], axis=2).max(axis=1) / np.sqrt(area / (columns * rows))
+        for k in range(1, len(footprints)):
+            # an image of the horizon has no footprint
+            has_overlap = np.isfinite(shifts_px[k])
+            overlap = cv2.intersectConvexConvex(footprints[0], footprints[k])[0] / area if has_overlap else 0.0
+            is_usable = bool(overlap >= parameters.min_overlap and shifts_px[k] <= max_shift_px)
+            score = overlap * min(baselines_m[k] / (parameters.max_baseline_fraction * distance), 1.0)
             if (is_usable, score) > best_score:
                 best_score = (is_usable, score)
-                best = PairChoice(first_index, second_index, baseline, overlap)
+                best = PairChoice(first, first + k, float(baselines_m[k]), overlap)
     if best is None:
         raise ValueError("no pair of images has finite poses")
     return best
 
 
-@dataclass(frozen=True)
-class _ImageView:
-    """An image's projection centre, optical axis, and corner rays, world axes."""
-
-    centre_m: Float64[np.ndarray, "3"]
-    axis: Float64[np.ndarray, "3"]
-    corners: Float64[np.ndarray, "4 3"]
-
-    @classmethod
-    def from_pose(cls, camera: CameraModel, pose: PoseMeasurement) -> _ImageView:
-        rotation = pose.world_from_body.rotation
-        columns, rows = camera.size
-        rays = camera.rays(np.array([[0.0, 0.0], [columns, 0.0], [columns, rows], [0.0, rows]]) - 0.5)[1]
-        centre = np.asarray(pose.world_from_body.apply(np.array(camera.c)))
-        return cls(centre, np.asarray(rotation.apply(np.array(camera.a))), np.asarray(rotation.apply(rays)))
-
-    def footprint(self, level_m: float, origin_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "4 2"] | None:
-        """Project the corners onto a level plane, relative to a point; None if a corner is at or above the horizon."""
-        if not np.all(self.corners[:, 2] < 0.0):
-            return None
-        distances = (level_m - self.centre_m[2]) / self.corners[:, 2]
-        corners = self.centre_m[:2] - origin_m[:2] + distances[:, None] * self.corners[:, :2]
-        return np.asarray(corners, dtype=np.float32)
+def _level_footprints(
+    corner_rays: Float64[np.ndarray, "n 4 3"], centres_m: Float64[np.ndarray, "n 3"], level_m: float
+) -> Float32[np.ndarray, "n 4 2"]:
+    """Project the corners of images onto a level plane; NaN for an image with a corner at or above the horizon."""
+    below = np.all(corner_rays[..., 2] < 0.0, axis=1)
+    heights = np.where(below, level_m - centres_m[:, 2], np.nan)
+    distances = heights[:, None] / corner_rays[..., 2]
+    return np.asarray(centres_m[:, None, :2] + distances[..., None] * corner_rays[..., :2], dtype=np.float32)

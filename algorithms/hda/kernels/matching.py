@@ -26,10 +26,13 @@ def correlation(first: Image, second: Image, r1: int, c1: int, r2: int, c2: int,
     # Subtract the centre value first to avoid cancellation in the variances.
     centre_a = np.float64(first[r1, c1])
     centre_b = np.float64(second[r2, c2])
-    for i in range(-half, half + 1):
-        for j in range(-half, half + 1):
-            a = first[r1 + i, c1 + j] - centre_a
-            b = second[r2 + i, c2 + j] - centre_b
+    # unsigned indices are faster, because they need no test for negative values
+    top, left, width = np.uint64(r1 - half), np.uint64(c1 - half), np.uint64(2 * half + 1)
+    second_top, second_left = np.uint64(r2 - half), np.uint64(c2 - half)
+    for i in range(width):
+        for j in range(width):
+            a = first[top + i, left + j] - centre_a
+            b = second[second_top + i, second_left + j] - centre_b
             sum_a += a
             sum_b += b
             sum_aa += a * a
@@ -143,15 +146,14 @@ def sum_absolute_differences(
     first: NDArray[np.uint16], second: NDArray[np.uint16], r1: int, c1: int, r2: int, c2: int, half: int, max_sum: int
 ) -> int:
     """Sum of absolute differences (Eq. 9, section II.C) of two windows; stops when the sum exceeds `max_sum`."""
-    width = 2 * half + 1
+    # unsigned indices are faster, because they need no test for negative values
+    top, left, width = np.uint64(r1 - half), np.uint64(c1 - half), np.uint64(2 * half + 1)
+    second_top, second_left = np.uint64(r2 - half), np.uint64(c2 - half)
     total = 0
-    for i in range(-half, half + 1):
-        a = first[r1 + i, c1 - half : c1 - half + width]
-        b = second[r2 + i, c2 - half : c2 - half + width]
-        row_sum = 0
+    for i in range(width):
         for j in range(width):
-            row_sum += int(abs(np.int32(a[j]) - np.int32(b[j])))
-        total += row_sum
+            difference = np.int64(first[top + i, left + j]) - np.int64(second[second_top + i, second_left + j])
+            total += int(abs(difference))
         if total > max_sum:
             break
     return total
@@ -172,15 +174,20 @@ def match_along_epipolar_segments(
     the longer axis of the segment, rounded to whole pixels. All windows must lie inside the image.
     """
     best_pixels = np.empty_like(pixels)
+    fraction = 0.5  # position of the previous pixel's match on its segment
     for k in range(pixels.shape[0]):
         du, dv = ends[k, 0] - starts[k, 0], ends[k, 1] - starts[k, 1]
         steps = max(math.ceil(max(abs(du), abs(dv))), 1)
         best = 2**62  # larger than any sum
-        for n in range(steps + 1):
-            u = round(starts[k, 0] + du * n / steps)
-            v = round(starts[k, 1] + dv * n / steps)
+        # the first test, at the previous pixel's position, only gives a limit that ends most of the other sums early
+        for test in range(-1, steps + 1):
+            n = test if test >= 0 else np.int64(np.rint(fraction * steps))
+            u = np.int64(np.rint(starts[k, 0] + du * n / steps))
+            v = np.int64(np.rint(starts[k, 1] + dv * n / steps))
             value = sum_absolute_differences(first, second, pixels[k, 1], pixels[k, 0], v, u, half, best)
-            if value < best:
-                best = value
+            if test < 0:
+                best = value + 1
+            elif value < best:
+                best, fraction = value, n / steps
                 best_pixels[k, 0], best_pixels[k, 1] = u, v
     return best_pixels
