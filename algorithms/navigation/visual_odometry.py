@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.arrays import Flags, Points2, Points3
 from marsyard.algorithms.navigation.stereo import RectifiedPair, track_features
-from marsyard.sim.frames import rigid
+from marsyard.sim.frames import rigid_from_axes, rotation_matrix
 from marsyard.sim.measurements import StereoMeasurement
 
 
@@ -129,7 +129,8 @@ def estimate_motion(
             )
         whitening = _compute_whitening(covariances, motion)
         motion, sigma_m = _refine_motion(points, second_points, whitening, inliers, motion)
-        distances = np.linalg.norm(_residuals(points, second_points, whitening, motion), axis=1)
+        residuals = _residuals(points, second_points, whitening, rotation_matrix(motion), motion.translation)
+        distances = np.linalg.norm(residuals, axis=1)
         inliers = distances <= _MAX_NORMALISED_DISTANCE
     inlier_count = int(np.count_nonzero(inliers))
     outcome = _check_motion(motion, sigma_m, predicted, options)
@@ -168,16 +169,20 @@ def _compute_whitening(
     covariances: tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3 3"]], motion: RigidTransform
 ) -> Float64[np.ndarray, "n 3 3"]:
     """Compute the matrices that normalise the differences of both sets of points."""
-    rotation = motion.rotation.as_matrix()
+    rotation = rotation_matrix(motion)
     total = covariances[0] + rotation @ covariances[1] @ rotation.T
     return np.asarray(np.linalg.inv(np.linalg.cholesky(total)))
 
 
 def _residuals(
-    points: Points3, second_points: Points3, whitening: Float64[np.ndarray, "n 3 3"], motion: RigidTransform
+    points: Points3,
+    second_points: Points3,
+    whitening: Float64[np.ndarray, "n 3 3"],
+    rotation: Float64[np.ndarray, "3 3"],
+    translation: Float64[np.ndarray, "3"],
 ) -> Points3:
     """Compute the normalised differences between the first pair's points and the second pair's transformed points."""
-    difference = points - motion.apply(second_points.copy())
+    difference = points - (second_points @ rotation.T + translation)
     return np.asarray((whitening @ difference[..., None])[..., 0])
 
 
@@ -190,19 +195,22 @@ def _refine_motion(
 ) -> tuple[RigidTransform, float]:
     """Minimise the normalised distances of the inliers; return the motion and the position's standard deviation."""
     first, second, weights = points[inliers], second_points[inliers], whitening[inliers]
+    start_rotation, start_translation = rotation_matrix(start), start.translation
+    # a small rotation w moves a point q by w x q
+    crosses = np.cross(np.eye(3)[None], second[:, None]).transpose(0, 2, 1)
 
     # a correction is a rotation vector and a translation
-    def correct_motion(correction: Float64[np.ndarray, "6"]) -> RigidTransform:
-        return rigid(start.rotation * Rotation.from_rotvec(correction[:3]), start.translation + correction[3:])
+    def correct_motion(
+        correction: Float64[np.ndarray, "6"],
+    ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]]:
+        turn = Rotation.from_rotvec(correction[:3]).as_matrix()
+        return start_rotation @ turn, start_translation + correction[3:]
 
     def compute_residuals(correction: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n"]:
-        return _residuals(first, second, weights, correct_motion(correction)).ravel()
+        return _residuals(first, second, weights, *correct_motion(correction)).ravel()
 
     def compute_jacobian(correction: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "n 6"]:
-        # a small rotation w moves a point q by w x q
-        rotation = correct_motion(correction).rotation.as_matrix()
-        crosses = np.cross(np.eye(3)[None], second[:, None])
-        rotation_jacobian = (rotation @ crosses.transpose(0, 2, 1)).astype(np.float64)
+        rotation_jacobian = correct_motion(correction)[0] @ crosses
         columns = np.concatenate([rotation_jacobian, np.broadcast_to(np.eye(3), rotation_jacobian.shape)], axis=2)
         return np.asarray(-(weights @ columns).reshape(-1, 6))
 
@@ -210,9 +218,9 @@ def _refine_motion(
     jacobian = np.asarray(solution.jac)
     covariance = np.linalg.pinv(jacobian.T @ jacobian)
     # residuals larger than the assumed match error increase the uncertainty
-    variance = max(float(np.mean(_residuals(first, second, weights, correct_motion(solution.x)) ** 2)), 1.0)
+    variance = max(float(np.mean(compute_residuals(solution.x) ** 2)), 1.0)
     sigma = np.sqrt(variance * np.linalg.eigvalsh(covariance[3:, 3:])[-1])
-    return correct_motion(solution.x), float(sigma)
+    return rigid_from_axes(*correct_motion(solution.x)), float(sigma)
 
 
 def _check_motion(

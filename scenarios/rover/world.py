@@ -136,12 +136,12 @@ class RunWorld:
         """Build the scene for a camera anywhere on the route, with the rocks that it resolves, without the rover."""
         viewpoint = Viewpoint.from_pose(rays, world_from_camera, self.ground.surface)
         viewpoint = replace(viewpoint, max_distance_m=min(viewpoint.max_distance_m, NAVIGATION_ROCKS_M))
-        return replace(
-            site_scene(self.ground, viewpoint, self.scene(time_s).sun),
-            mesh_finest_m=MESH_FINEST_M,
-            mesh_half_width_m=NAVIGATION_HALF_WIDTH_M,
-            mesh_lines=_mesh_lines(NAVIGATION_HALF_WIDTH_M),
-            clouds=self.base.clouds,
+        return self.scene(time_s).with_viewpoint(
+            select_rocks(self.ground, viewpoint),
+            (viewpoint.east_m, viewpoint.north_m),
+            MESH_FINEST_M,
+            NAVIGATION_HALF_WIDTH_M,
+            _mesh_lines(NAVIGATION_HALF_WIDTH_M),
         )
 
     @cached_property

@@ -176,6 +176,7 @@ _ARM_JOINTS_M = ((0.06, 0.30, -0.02), (0.20, -0.30, 0.0), (0.22, 0.06, -0.01))
 _ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.025, 0.06, 0.18
 
 Triangles = Float64[np.ndarray, "triangles 3 3"]
+Point = Float64[np.ndarray, "3"]
 
 
 def rover_objects(
@@ -194,23 +195,24 @@ def rover_objects(
     length, width = _BODY_FRACTION[0] * rover.body_length_m, _BODY_FRACTION[1] * rover.body_width_m
     x, y, z = mast.base_m
     parts = [
-        # body, deck, and mast up to the elbow
+        # body and deck
         _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m))),
         _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
-        _cylinder((x, y, rover.deck_m), (x, y, z + mast.elbow_m[2]), _MAST_RADIUS_M),
     ]
+    # start, end and radius, first of the mast up to the elbow
+    cylinders = [(np.array([x, y, rover.deck_m]), np.array([x, y, z + mast.elbow_m[2]]), _MAST_RADIUS_M)]
     shoulder, elbow, wrist = np.array([0.5 * length, 0.0, rover.deck_m]) + np.array(_ARM_JOINTS_M)
     turret = np.array([0.0, 0.5 * _TURRET_M, 0.0])
-    parts += [_cylinder(shoulder, elbow, _ARM_RADIUS_M), _cylinder(elbow, wrist, _ARM_RADIUS_M)]
-    parts.append(_cylinder(wrist - turret, wrist + turret, _TURRET_RADIUS_M))
+    cylinders += [(shoulder, elbow, _ARM_RADIUS_M), (elbow, wrist, _ARM_RADIUS_M)]
+    cylinders.append((wrist - turret, wrist + turret, _TURRET_RADIUS_M))
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     for side, bogie in enumerate(compute_bogie_pivots(rover, stance.differential_rad)):
         front, middle, rear = centres[3 * side : 3 * side + 3]
         rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
         legs = ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
-        parts += [_cylinder(start, end, 0.5 * _LEG_M) for start, end in legs]
+        cylinders += [(start, end, 0.5 * _LEG_M) for start, end in legs]
     half_axle = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
-    parts += [_cylinder(centre - half_axle, centre + half_axle, rover.wheel_radius_m) for centre in centres]
+    cylinders += [(centre - half_axle, centre + half_axle, rover.wheel_radius_m) for centre in centres]
     # camera bar behind the cameras' centres, which lie on the y axis of the head's frame
     depth, height, extra_width = _HEAD_M
     rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
@@ -218,8 +220,8 @@ def rover_objects(
     parts.append(_transform(_box((depth, baseline_m + extra_width, height), middle_of_head), rover_from_head))
     # the elevation axis, from the mast's elbow to the head's middle
     top, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
-    parts.append(_cylinder(top, end, _MAST_RADIUS_M))
-    triangles = _transform(np.concatenate(parts), stance.world_from_rover)
+    cylinders.append((top, end, _MAST_RADIUS_M))
+    triangles = _transform(np.concatenate([*parts, _make_cylinders(cylinders)]), stance.world_from_rover)
     face_normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     normals = face_normals / np.linalg.norm(face_normals, axis=1, keepdims=True)
     faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
@@ -288,18 +290,16 @@ def _unit_cylinder() -> Triangles:
     return np.asarray(cylinder.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
 
 
-def _cylinder(
-    start: Float64[np.ndarray, "3"] | tuple[float, float, float],
-    end: Float64[np.ndarray, "3"] | tuple[float, float, float],
-    radius_m: float,
-) -> Triangles:
-    """Create a cylinder between the centres of its ends."""
-    axis = np.subtract(end, start)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(axis)))], axis)
-    x /= np.linalg.norm(x)
-    y = np.cross(axis / float(np.linalg.norm(axis)), x)
-    axes = np.stack([radius_m * x, radius_m * y, axis], axis=1)
-    return np.asarray(np.asarray(start) + _unit_cylinder() @ axes.T)
+def _make_cylinders(cylinders: list[tuple[Point, Point, float]]) -> Triangles:
+    """Create cylinders between the centres of their ends, with these radii."""
+    starts, ends = (np.array([cylinder[end] for cylinder in cylinders]) for end in (0, 1))
+    radii = np.array([radius for _, _, radius in cylinders])[:, None]
+    axes = ends - starts
+    x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    y = np.cross(axes / np.linalg.norm(axes, axis=1, keepdims=True), x)
+    scaled_axes = np.stack([radii * x, radii * y, axes], axis=1)
+    return np.asarray(starts[:, None, None] + _unit_cylinder() @ scaled_axes[:, None]).reshape(-1, 3, 3)
 
 
 def _transform(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:

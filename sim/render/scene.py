@@ -116,6 +116,20 @@ class Scene:
         )
         return self._keep_results(scene, "height_range_m", "max_slopes", "shadow")
 
+    def with_viewpoint(
+        self, objects: Objects, centre_m: tuple[float, float], finest_m: float, half_width_m: float, lines: int
+    ) -> Scene:
+        """Return the scene for another camera, with other objects and another mesh of the same ground."""
+        scene = replace(
+            self,
+            objects=objects,
+            centre_m=centre_m,
+            mesh_finest_m=finest_m,
+            mesh_half_width_m=half_width_m,
+            mesh_lines=lines,
+        )
+        return self._keep_results(scene, "height_range_m", "max_slopes")
+
     def _keep_results(self, scene: Scene, *names: str) -> Scene:
         """Copy cached results of this scene to a changed scene for which they are valid."""
         scene.__dict__.update({name: getattr(self, name) for name in names})
