@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
+from marsyard.algorithms.arrays import Points2
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.map_sampling import sample_raster
@@ -18,6 +21,9 @@ from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuInc
 MAX_DISTANCE_RATIO = 0.8
 #: Number of descriptors that are matched together; limits the memory to 40 MB.
 _MATCHED_TOGETHER = 256
+#: Number of strips of rows in which the features of the map are extracted, and their margin in pixels. OpenCV's scale
+#: space of a whole map of 16 x 16 km needs 0.7 GB.
+_STRIPS, _MARGIN_PX = 4, 64
 
 
 class InertialEstimator:
@@ -64,8 +70,7 @@ class FeatureEstimator(InertialEstimator):
         """Reset the state, and extract the features of the map."""
         super().start(initial, map_product)
         self._sift = cv2.SIFT.create(nfeatures=self.options.sift_map_features)
-        keypoints, self._descriptors = self._sift.detectAndCompute(_to_bytes(map_product.appearance), None)
-        pixels = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64).reshape(-1, 2)
+        pixels, self._descriptors = extract_map_features(map_product.appearance, self.options.sift_map_features)
         heights = sample_raster(map_product.elevation_m, pixels[:, np.newaxis])[:, 0] if len(pixels) else np.empty(0)
         self._points = np.column_stack([map_product.origin_m + map_product.pixel_m * pixels, heights])
         self._is_valid = False  # whether a pose was found in this descent
@@ -100,7 +105,7 @@ class FeatureEstimator(InertialEstimator):
         scaled = image.bin(binning_factor(image, altitude_m, self._map.pixel_m))
         # columns of an image that looks down increase to the east and rows to the south; rows of the map to the north
         keypoints, descriptors = self._sift.detectAndCompute(_to_bytes(scaled.radiance[::-1]), None)
-        if descriptors is None or self._descriptors is None or len(keypoints) < self.options.min_matches:
+        if descriptors is None or len(keypoints) < self.options.min_matches:
             return None
         indices, map_indices = match_descriptors(descriptors, self._descriptors)
         if len(indices) < self.options.min_matches:
@@ -133,6 +138,29 @@ class FeatureEstimator(InertialEstimator):
         if not self._is_valid:
             return PositionEstimate(PositionOutcome.NO_COARSE_FIX, time_s, details=details)
         return PositionEstimate(PositionOutcome.VALID, time_s, *self._filter.estimate(time_s), details=details)
+
+
+def extract_map_features(
+    appearance: Float[np.ndarray, "rows columns"], count: int
+) -> tuple[Points2, Float32[np.ndarray, "n 128"]]:
+    """Extract SIFT features of a map, at most an equal part of `count` from each strip of rows.
+
+    Returns their pixels (u, v) and descriptors.
+    """
+    raster, sift = _to_bytes(appearance), cv2.SIFT.create(nfeatures=count // _STRIPS)
+    pixels, descriptors = [np.zeros((0, 2))], [np.zeros((0, 128), dtype=np.float32)]
+    for first, last in pairwise(np.linspace(0, len(raster), _STRIPS + 1).astype(int).tolist()):
+        # a multiple of the margin, so that the scale space has the same samples as that of the whole map
+        top = max(first // _MARGIN_PX - 1, 0) * _MARGIN_PX
+        strip = raster[top : last + _MARGIN_PX]
+        inside = np.zeros(strip.shape, dtype=np.uint8)
+        inside[first - top : last - top] = 255
+        keypoints, strip_descriptors = sift.detectAndCompute(strip, inside)
+        if len(keypoints):
+            positions = np.array([keypoint.pt for keypoint in keypoints], dtype=np.float64)
+            pixels.append(positions + np.array([0.0, top]))
+            descriptors.append(strip_descriptors)
+    return np.concatenate(pixels), np.concatenate(descriptors)
 
 
 def match_descriptors(

@@ -10,18 +10,12 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation import estimator as estimator_module
-from marsyard.algorithms.localisation.baselines import (
-    MAX_DISTANCE_RATIO,
-    FeatureEstimator,
-    InertialEstimator,
-    match_descriptors,
-)
+from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
 from marsyard.algorithms.localisation.coarse import CoarseFix, CoarseMatches, CoarseRefusal
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
@@ -478,21 +472,3 @@ def test_features_need_contrast_and_an_altitude() -> None:
     assert set(_outcomes(list(_descend(FeatureEstimator(), product, _images(1))))) == {NO_COARSE_FIX}
     without = _descend(FeatureEstimator(), product, _traced_images()[:1], with_altitudes=False)
     assert set(_outcomes(list(without))) == {NO_COARSE_FIX}
-
-
-def test_matches_equal_those_of_the_brute_force_matcher() -> None:
-    rng = np.random.default_rng(7)
-    map_descriptors = rng.integers(0, 256, (900, 128)).astype(np.float32)
-    noisy = map_descriptors[rng.choice(900, 600, replace=False)] + rng.normal(0.0, 30.0, (600, 128))
-    descriptors = np.clip(np.rint(noisy), 0, 255).astype(np.float32)
-    descriptors[::3] = rng.integers(0, 256, (200, 128))
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(descriptors, map_descriptors, k=2)
-    expected = [
-        (first.queryIdx, first.trainIdx)
-        for first, second in pairs
-        if first.distance < MAX_DISTANCE_RATIO * second.distance
-    ]
-    indices, map_indices = match_descriptors(descriptors, map_descriptors)
-    assert list(zip(indices.tolist(), map_indices.tolist(), strict=True)) == expected
-    assert len(expected) > 300
-    assert match_descriptors(descriptors, map_descriptors[:1])[0].size == 0
