@@ -5,7 +5,7 @@ a reference workload (matrix products, filters, sorting, copies), so that a slow
 is the processor time of a run divided by that of the reference workload. Welch's test compares the logarithms of the
 ratios with those that an earlier version stored (``--keep``). A hot path is slower if its mean ratio has grown by more
 than the factor `ALLOWED_GROWTH`. The false alarm rate is `FALSE_ALARM_RATE` for all hot paths together. Ratios are
-valid for one type of processor.
+valid for one type of processor; the file contains those of each type on which an earlier version was measured.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.hda import ElevationMap, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.sim.kernel_cache import processor_features
 
-#: File of the stored ratios.
+#: File of the stored ratios, by processor.
 RATIOS = Path(__file__).parent / "results" / "ratios.json"
 #: Number of runs of each hot path; each run is paired with runs of the reference workload.
 PAIRS = 15
@@ -73,7 +73,7 @@ HOT_PATHS: Mapping[str, Callable[[], Callable[[], object]]] = {
 
 
 def reference_workload() -> Callable[[], object]:
-    """Return the reference workload, which takes about 30 ms."""
+    """Return the reference workload, which takes some milliseconds."""
     rng = np.random.default_rng(0)
     matrix = rng.standard_normal((300, 300))
     image = rng.standard_normal((1024, 1024)).astype(np.float32)
@@ -135,28 +135,25 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.check", description=__doc__)
     parser.add_argument("--keep", action="store_true", help="store these ratios for later comparisons")
     keep = parser.parse_args().keep
-    stored = json.loads(RATIOS.read_text()) if RATIOS.exists() else None
-    if not keep and (stored is None or stored["processor"] != processor_features()):
-        reason = (
-            "no ratios are stored"
-            if stored is None
-            else f"the stored ratios are of another processor, {stored['processor']}"
+    records = json.loads(RATIOS.read_text()) if RATIOS.exists() else {}
+    processor = processor_features()
+    if not keep and processor not in records:
+        print(
+            f"no ratios are stored of this processor, {processor} (stored: {', '.join(records) or 'none'}): "
+            "run 'python -m benchmarks.check --keep' on the version to compare with",
+            file=sys.stderr,
         )
-        print(f"{reason}: run 'python -m benchmarks.check --keep' on the version to compare with", file=sys.stderr)
         return 2
     cv2.setNumThreads(1)
     reference = reference_workload()
     ratios = {name: log_ratios(prepare(), reference, PAIRS) for name, prepare in HOT_PATHS.items()}
     if keep:
-        record = {
-            "measured": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
-            "processor": processor_features(),
-            "log_ratios": ratios,
-        }
-        RATIOS.write_text(json.dumps(record, indent=2) + "\n")
+        measured = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
+        records[processor] = {"measured": measured, "log_ratios": ratios}
+        RATIOS.write_text(json.dumps(records, indent=2) + "\n")
         print(f"stored in {RATIOS}")
         return 0
-    assert stored is not None, "the program ends earlier without stored ratios"
+    stored = records[processor]
     return _print_comparison(compare(ratios, stored["log_ratios"]), stored["measured"])
 
 

@@ -216,7 +216,11 @@ def _parameters_type(run: StoredRun) -> type[BaseModel] | None:
 
 
 #: Machine properties whose names in the record are not words.
-_FACT_NAMES = {"processor_features": "processor features (hash)", "implementation": "Python implementation"}
+_FACT_NAMES = {
+    "processor_features": "processor features (hash)",
+    "implementation": "Python implementation",
+    "machine": "architecture",
+}
 
 
 def list_provenance(run: StoredRun) -> list[tuple[str, str]]:

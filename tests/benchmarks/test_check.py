@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks import check
 from benchmarks.check import PAIRS, compare, log_ratios, select_slower
 
 #: Names of the timed functions (hot paths).
@@ -55,3 +58,16 @@ def test_ratio_of_processor_times_is_measured() -> None:
 
     ratios = log_ratios(lambda: occupy_processor(0.02), lambda: occupy_processor(0.01), 3)
     assert np.median(ratios) == pytest.approx(np.log(2.0), abs=0.1)
+
+
+def test_ratios_of_another_processor_are_not_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = {"measured": "2026-01-01T00:00:00+00:00", "log_ratios": {}}
+    (tmp_path / "ratios.json").write_text(json.dumps({"another": record}))
+    monkeypatch.setattr(check, "RATIOS", tmp_path / "ratios.json")
+    monkeypatch.setattr("sys.argv", ["check"])
+    assert check.main() == 2
+    message = capsys.readouterr().err
+    assert check.processor_features() in message
+    assert "another" in message
