@@ -176,7 +176,7 @@ def choose_pair(
         area = cv2.contourArea(footprints[0])
         shifts_px = np.linalg.norm(footprints - footprints[0], axis=2).max(axis=1) / np.sqrt(area / (columns * rows))
         for k in range(1, len(footprints)):
-            # an image of the horizon has no footprint
+            # an image that shows the horizon has no footprint
             has_overlap = np.isfinite(shifts_px[k])
             overlap = cv2.intersectConvexConvex(footprints[0], footprints[k])[0] / area if has_overlap else 0.0
             is_usable = bool(overlap >= parameters.min_overlap and shifts_px[k] <= max_shift_px)

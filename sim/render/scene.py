@@ -111,10 +111,8 @@ class Scene:
 
     def with_mesh(self, centre_m: tuple[float, float], finest_m: float, half_width_m: float, lines: int) -> Scene:
         """Return the scene with another mesh of the ground; all other cached results are kept."""
-        scene = replace(
-            self, centre_m=centre_m, mesh_finest_m=finest_m, mesh_half_width_m=half_width_m, mesh_lines=lines
-        )
-        return self._keep_results(scene, "height_range_m", "max_slopes", "shadow")
+        scene = self.with_viewpoint(self.objects, centre_m, finest_m, half_width_m, lines)
+        return self._keep_results(scene, "shadow")
 
     def with_viewpoint(
         self, objects: Objects, centre_m: tuple[float, float], finest_m: float, half_width_m: float, lines: int

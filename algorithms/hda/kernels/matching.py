@@ -116,7 +116,7 @@ def refine_peak(
     first: Image, second: Image, r1: int, c1: int, r2: int, c2: int, half: int
 ) -> tuple[float, float, float]:
     """Row, column and value of the biquadratic correlation peak around (r2, c2); NaN if a window does not fit."""
-    if not window_fits(second, r2, c2, half + 1):
+    if not (window_fits(first, r1, c1, half) and window_fits(second, r2, c2, half + 1)):
         return math.nan, math.nan, math.nan
     z = np.empty((3, 3))
     for i in range(3):

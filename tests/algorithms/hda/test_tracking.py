@@ -226,3 +226,12 @@ def test_tracks_near_boulders_are_correct_or_rejected() -> None:
     assert np.sum(unaligned.accepted & is_wrong) >= 3
     assert np.sum(aligned.accepted & is_wrong) <= 1
     assert np.sum(aligned.accepted) > 40
+
+
+def test_positions_whose_window_leaves_an_image_are_not_refined() -> None:
+    image = np.random.default_rng(3).integers(0, 255, (40, 40)).astype(np.uint16)
+    positions, shifts = np.array([[2, 20], [20, 37], [20, 20]]), np.array([[10, 0], [0, -10], [0, 0]])
+    pixels, correlations = matching.refine_positions(image, image, positions, shifts, 5)
+    assert np.isnan(pixels[:2]).all()
+    assert np.isnan(correlations[:2]).all()
+    np.testing.assert_allclose(pixels[2], [20.0, 20.0], atol=0.5)

@@ -25,11 +25,11 @@ def test_features_of_strips_are_those_of_the_whole_map() -> None:
     tree = cKDTree(np.hstack([pixels, strip_descriptors]))
     distances = np.asarray(tree.query(np.hstack([positions, descriptors[small]]))[0])
     assert len(positions) > 1000
-    # the descriptors have a length of 512
-    assert np.mean(distances < 10.0) > 0.99
-    # also next to the edges of the strips
+    # the descriptors have a length of 512; with this seed and another one, at most 0.2 % of all features and 1.4 % of
+    # those next to the edges of the strips differ by more than 1
+    assert np.mean(distances < 1.0) > 0.995
     at_edges = np.min(np.abs(positions[:, 1:] - np.array([225.0, 450.0, 675.0])), axis=1) < 10.0
-    assert np.mean(distances[at_edges] < 10.0) > 0.95
+    assert np.mean(distances[at_edges] < 1.0) > 0.97
 
 
 def test_matches_equal_those_of_the_brute_force_matcher() -> None:
