@@ -348,12 +348,11 @@ def _find_near_rocks(
     for column, row in product(repetitions, repetitions):
         offsets = reference_offsets + np.array([column, row]) * period
         distance = np.hypot(*offsets.T)
-        bearing = np.abs(
-            (np.arctan2(offsets[:, 0], offsets[:, 1]) - viewpoint.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi
-        )
-        widening = np.arcsin(np.minimum(extent / np.maximum(distance, 1e-9), 1.0))
-        is_relevant = (bearing <= viewpoint.half_width_rad + widening) | (distance <= near_m + extent)
-        is_selected |= is_relevant & (distance <= radius_m)
+        within = np.flatnonzero(distance <= radius_m)
+        (east, north), distance, extent_within = offsets[within].T, distance[within], extent[within]
+        bearing = np.abs((np.arctan2(east, north) - viewpoint.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
+        widening = np.arcsin(np.minimum(extent_within / np.maximum(distance, 1e-9), 1.0))
+        is_selected[within] |= (bearing <= viewpoint.half_width_rad + widening) | (distance <= near_m + extent_within)
     return is_selected
 
 

@@ -62,12 +62,6 @@ def mark_ready(scenario: str) -> None:
             marker.touch()
 
 
-def count_compiled_functions() -> int:
-    """Count the cached compiled functions; 0 if there is no cache."""
-    folder = os.environ.get("NUMBA_CACHE_DIR")
-    return 0 if folder is None else sum(1 for _ in Path(folder).rglob("*.nbc"))
-
-
 def _marker_path(scenario: str) -> Path | None:
     # numba stores compiled code per processor type and folder of the sources
     folder = os.environ.get("NUMBA_CACHE_DIR")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -21,7 +21,7 @@ from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError,
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.running.preparation import plan_inputs, report_compilation
+from marsyard.campaigns.running.preparation import compile_kernels, plan_inputs
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard
 from marsyard.campaigns.sampling.design import ADAPTIVE
@@ -32,7 +32,6 @@ from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, numeric_metrics, write_table
 from marsyard.scenarios.systems import RowColumns, row_columns
-from marsyard.sim.kernel_cache import mark_ready
 
 
 class ProgressObserver(Protocol):
@@ -239,9 +238,9 @@ def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None
         with create_executor(run.executor) as executor:
             missing = _list_missing_cases(run, store)
             if missing or retries:
-                with report_compilation(configuration.scenario, run.observer.note) as first_case_ended:
-                    _prepare_inputs(run, executor, itertools.chain(*missing, retries))
-                    _run_cases(run, store, executor, [*missing, retries], first_case_ended)
+                compile_kernels(executor, configuration.scenario, run.observer.note)
+                _prepare_inputs(run, executor, itertools.chain(*missing, retries))
+                _run_cases(run, store, executor, [*missing, retries])
             write_table(table, store, numeric_metrics(configuration.requirements))
             if run.shard is None:
                 _rerun_for_products(run, store, executor)
@@ -283,13 +282,7 @@ def _prepare_inputs(run: _CampaignRun, executor: Executor, cases: Iterable[int])
         observer.step()
 
 
-def _run_cases(
-    run: _CampaignRun,
-    store: RowStore,
-    executor: Executor,
-    case_groups: Sequence[Sequence[int]],
-    first_case_ended: Callable[[], None],
-) -> None:
+def _run_cases(run: _CampaignRun, store: RowStore, executor: Executor, case_groups: Sequence[Sequence[int]]) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
     configuration, observer = run.campaign.configuration, run.observer
     total = sum(len(group) for group in case_groups)
@@ -306,8 +299,6 @@ def _run_cases(
         finished_row = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
         if not is_checked and finished_row is not None:
             check_metrics(configuration, finished_row, run.directory)
-            mark_ready(configuration.scenario)
-            first_case_ended()
             is_checked = True
         for _ in batch:
             observer.step()

@@ -7,26 +7,24 @@ from __future__ import annotations
 
 import json
 import statistics
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.store.products import ALL_PRODUCTS
 from marsyard.scenarios.interface import SelectsInputs
-from marsyard.scenarios.systems import scenario_paths
+from marsyard.scenarios.systems import systems
 from marsyard.sim.cache import cache_directory, cached_bytes, limit_bytes
-from marsyard.sim.kernel_cache import count_compiled_functions, kernels_are_ready
+from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
-#: Seconds between two reports on compilation.
-REPORT_INTERVAL_S = 10.0
 #: Maximum number of trial cases; the first is excluded from the mean, since it loads code and terrains.
 _MAX_TRIALS = 9
 #: Seconds after which no further trial case is started.
@@ -113,37 +111,46 @@ def find_used_inputs(campaign: Campaign, cases: Iterable[int]) -> tuple[int, ...
     return tuple(sorted(used_inputs))
 
 
-@contextmanager
-def report_compilation(scenario: str, note: Callable[[str], None]) -> Iterator[Callable[[], None]]:
-    """Report the compilation of kernels until the context ends; report nothing if the kernels are already compiled.
+def list_compilations(scenario: str | None = None) -> list[tuple[str, str, tuple[str, ...]]]:
+    """List the campaigns that compile the kernels of a scenario's system, or of all systems.
 
-    Yields a function that must be called when the first case has ended: then the compilation is complete.
+    Returns the scenario, the campaign, and the settings that make its cases small.
     """
-    if scenario not in scenario_paths() or kernels_are_ready(scenario):
-        yield lambda: None
+    compilations = (
+        item
+        for system in systems()
+        if scenario is None or scenario in system.scenarios
+        for item in system.compilation_campaigns.items()
+    )
+    return [(load_campaign(name, settings).configuration.scenario, name, settings) for name, settings in compilations]
+
+
+def compile_campaign(name: str, settings: Sequence[str]) -> None:
+    """Run one small case of a campaign, which compiles the kernels of its scenario."""
+    campaign = load_campaign(name, settings)
+    campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
+    mark_ready(campaign.configuration.scenario)
+
+
+def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], None]) -> None:
+    """Compile the kernels of a scenario in a worker, unless they are compiled on this machine.
+
+    Otherwise the first case of each worker would compile them, and an algorithm's computation time would include it.
+    """
+    missing = [item for item in list_compilations(scenario) if not kernels_are_ready(item[0])]
+    if not missing:
         return
     note("compiling numeric kernels once on this machine, about two minutes (to compile in advance: marsyard compile)")
-    is_done, start_s, initial_count = threading.Event(), time.monotonic(), count_compiled_functions()
+    start_s, state = time.monotonic(), "are compiled"
+    for result in chain.from_iterable(executor.run(Work(partial(_compile_item, missing), range(len(missing))))):
+        if result.error is not None:
+            state = f"could not be compiled ({result.error}); the times of each worker's first case include compilation"
+    note(f"numeric kernels {state}, {time.monotonic() - start_s:.0f} s")
 
-    def report() -> None:
-        while not is_done.wait(REPORT_INTERVAL_S):
-            number = count_compiled_functions() - initial_count
-            note(f"compiling numeric kernels: {number} functions so far, {time.monotonic() - start_s:.0f} s")
 
-    thread = threading.Thread(target=report, daemon=True)
-
-    def finish() -> None:
-        if not is_done.is_set():
-            is_done.set()
-            thread.join()  # its last note precedes this one
-            note(f"numeric kernels are compiled, {time.monotonic() - start_s:.0f} s")
-
-    thread.start()
-    try:
-        yield finish
-    finally:
-        is_done.set()
-        thread.join()
+def _compile_item(compilations: Sequence[tuple[str, str, tuple[str, ...]]], number: int) -> None:
+    _scenario, name, settings = compilations[number]
+    compile_campaign(name, settings)
 
 
 @dataclass(frozen=True)

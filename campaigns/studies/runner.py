@@ -23,7 +23,7 @@ from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import Executor
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.engine import ProgressObserver, check_metrics
-from marsyard.campaigns.running.preparation import report_compilation
+from marsyard.campaigns.running.preparation import compile_kernels
 from marsyard.campaigns.running.replay import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
@@ -34,7 +34,6 @@ from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 from marsyard.campaigns.studies.subset import NEW_STREAM
-from marsyard.sim.kernel_cache import mark_ready
 from marsyard.sim.streams import Blend
 
 #: A study is stopped with an error if none of this number of first cases has finished.
@@ -108,8 +107,6 @@ class PointRunner:
         self._is_checked = self._has_finished_case = False
         #: Number of cases evaluated so far.
         self.n_cases = 0
-        #: Function that is called when the first case has ended.
-        self.first_case_ended: Callable[[], None] = lambda: None
 
     @property
     def evidence(self) -> Evidence:
@@ -147,8 +144,6 @@ class PointRunner:
                     self._observer.note(completed.note)
                 if not self._is_checked and completed.row["outcome"] not in ENGINE_FAILURES:
                     check_metrics(configuration, completed.row, self._directory)
-                    mark_ready(configuration.scenario)
-                    self.first_case_ended()
                     self._is_checked = True
                 rows[int(completed.row["case"])] = completed.row
                 self._observer.step()
@@ -246,12 +241,9 @@ def _run_study(
     observer = session.observer
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         try:
-            with (
-                create_executor(session.executor) as executor,
-                report_compilation(campaign.configuration.scenario, observer.note) as first_case_ended,
-            ):
+            with create_executor(session.executor) as executor:
+                compile_kernels(executor, campaign.configuration.scenario, observer.note)
                 runner = PointRunner(campaign, directory, store, executor, observer)
-                runner.first_case_ended = first_case_ended
                 result = session.execute(campaign, runner)
         finally:
             counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}

@@ -104,35 +104,29 @@ def compile_kernels() -> None:
     """
     from joblib import Parallel, delayed
 
-    from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.scenarios.systems import systems
+    from marsyard.campaigns.running.preparation import list_compilations
     from marsyard.sim.kernel_cache import kernels_are_ready
 
-    compilations = [item for system in systems() for item in system.compilation_campaigns.items()]
-    campaigns = []
-    for name, settings in compilations:
-        scenario = load_campaign(name, settings).configuration.scenario
-        if kernels_are_ready(scenario):
-            typer.echo(f"{scenario}: already compiled")
+    missing = []
+    for item in list_compilations():
+        if kernels_are_ready(item[0]):
+            typer.echo(f"{item[0]}: already compiled")
         else:
-            campaigns.append((name, settings))
+            missing.append(item)
     # all scenarios call the kernels of the renderer: the first one compiles them, then the others run in parallel
-    for group, jobs in ((campaigns[:1], 1), (campaigns[1:], 2)):
+    for group, jobs in ((missing[:1], 1), (missing[1:], 2)):
         if group:
             lines = Parallel(n_jobs=jobs, return_as="generator")(delayed(_compile_scenario)(*item) for item in group)
             for line in lines:
                 typer.echo(line)
 
 
-def _compile_scenario(name: str, settings: Sequence[str]) -> str:
-    """Run one small case of a campaign, which compiles the kernels of its scenario; return a line of text."""
-    from marsyard.campaigns.definition.loading import load_campaign
+def _compile_scenario(scenario: str, name: str, settings: Sequence[str]) -> str:
+    """Compile the kernels of a scenario; return a line of text."""
     from marsyard.campaigns.execution.worker_process import limit_threads
-    from marsyard.sim.kernel_cache import mark_ready
+    from marsyard.campaigns.running.preparation import compile_campaign
 
     limit_threads()
-    campaign = load_campaign(name, settings)
     start_s = time.monotonic()
-    campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
-    mark_ready(campaign.configuration.scenario)
-    return f"{campaign.configuration.scenario}: compiled, {time.monotonic() - start_s:.0f} s"
+    compile_campaign(name, settings)
+    return f"{scenario}: compiled, {time.monotonic() - start_s:.0f} s"

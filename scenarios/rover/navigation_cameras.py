@@ -5,7 +5,7 @@ The rover's software bins images to 256 x 256 pixels. `oracle_heights` replaces 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,13 +14,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.interface import PixelBox
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
-from marsyard.scenarios.rover.stops import StereoCamera
+from marsyard.scenarios.rover.stops import StereoCamera, cached_rays
 from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import CAMERA_MOUNTINGS
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose, rigid
 from marsyard.sim.measurements import MastCalibration, StereoMeasurement
-from marsyard.sim.render import PixelRays
 from marsyard.sim.sensor import Detector, StereoHead, natural_fall_off, preset, stereo_mast
 from marsyard.sim.streams import Streams
 
@@ -75,8 +74,8 @@ class _StereoPair:
     ) -> StereoMeasurement:
         """Take a pair; `mounts` are the true and the measured pose of the mount's frame in the rover frame."""
         world_from_mount = compose(vehicle.stance.world_from_rover, mounts[0])
-        rays = PixelRays.from_camera(self.true[0])
-        scene = replace(world.navigation_scene(rays, world_from_mount, time_s), edge_rays=edge_rays)
+        rays = cached_rays(self.true[0])
+        scene = world.navigation_scene(rays, world_from_mount, time_s).with_edge_rays(edge_rays)
         ahead = np.asarray(vehicle.stance.world_from_rover.apply(np.array([_SHADOW_AHEAD_M, 0.0, 0.0])))
         geometry, sun = rig.calibrated.geometry, scene.sun.direction
         shadow = None

@@ -42,6 +42,8 @@ from marsyard.sim.streams import Streams
 _BINNING = 16
 #: Fall-off of a lens; cached because all runs of a process use the same camera designs.
 _cached_fall_off = lru_cache(maxsize=8)(natural_fall_off)
+#: Rays of a camera; cached because a navigation camera has the same rays in all images.
+cached_rays = lru_cache(maxsize=8)(PixelRays.from_camera)
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class StereoCamera:
             return np.asarray(frame.radiance * scale)
 
         pairs = zip(cameras, boxes, strict=True)
-        pixel_rays = [PixelRays.from_camera(camera.crop(*box.corner, box.size)) for camera, box in pairs]
+        pixel_rays = [cached_rays(camera.crop(*box.corner, box.size)) for camera, box in pairs]
         local_scene = add_rover(scene.restrict_to_cones([rays.cone(world_from_head) for rays in pixel_rays]))
         radiances, exposure_s = [render(local_scene, rays) for rays in pixel_rays], 0.0
         if p.camera.detector_noise:
@@ -114,7 +116,7 @@ class StereoCamera:
             if p.exposure.metering == "full-frame":
                 # reduced full frame, and a detector of its size
                 reduced_rays = PixelRays.from_camera(cameras[0].scale(1.0 / _BINNING))
-                metering_radiance = render(replace(add_rover(scene), edge_rays=1), reduced_rays)
+                metering_radiance = render(add_rover(scene).with_edge_rays(1), reduced_rays)
                 rows, columns = metering_radiance.shape
                 response = np.resize(detector.response[:rows, :columns], (rows, columns))
                 detector = replace(detector, response=response, hot_e_s=None)

@@ -204,7 +204,7 @@ class CameraModel(ABC):
     @property
     def focal_lengths(self) -> tuple[float, float]:
         """Focal lengths (hs, vs): the focal length divided by the pixel pitch along a row and along a column."""
-        hs, vs = (float(np.linalg.norm(np.cross(self.a, vector)) / (self.a @ self.a)) for vector in (self.h, self.v))
+        hs, vs = (float(np.linalg.norm(_cross(self.a, vector)) / (self.a @ self.a)) for vector in (self.h, self.v))
         return hs, vs
 
     @property

@@ -128,6 +128,12 @@ class Scene:
         )
         return self._keep_results(scene, "height_range_m", "max_slopes")
 
+    def with_edge_rays(self, edge_rays: int) -> Scene:
+        """Return the scene with another number of rays at edges; all cached results are kept."""
+        scene = replace(self, edge_rays=edge_rays)
+        scene.__dict__.update(self.__dict__ | {"edge_rays": edge_rays})
+        return scene
+
     def _keep_results(self, scene: Scene, *names: str) -> Scene:
         """Copy cached results of this scene to a changed scene for which they are valid."""
         scene.__dict__.update({name: getattr(self, name) for name in names})

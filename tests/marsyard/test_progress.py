@@ -1,20 +1,13 @@
-"""Tests of progress output: rates, remaining time and notes about compilation."""
+"""Tests of progress output: rates and remaining time."""
 
 from __future__ import annotations
 
 import io
-import re
-import time
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from marsyard.campaigns.running import preparation
-from marsyard.campaigns.running.preparation import report_compilation
 from marsyard.cli.progress import BarProgress, LineProgress
-from marsyard.sim.kernel_cache import mark_ready
-from tests.campaigns.fake_campaign import RecordingWatch
 
 
 class Clock:
@@ -83,26 +76,3 @@ def test_lines_print_time_left_at_the_printed_rate(monkeypatch: pytest.MonkeyPat
     file = console.file
     assert isinstance(file, io.StringIO)
     assert file.getvalue().splitlines()[-1] == "cases: 1/8, 12.5 s per item, 88 s left"
-
-
-def test_compilation_is_reported_until_first_case_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(preparation, "REPORT_INTERVAL_S", 0.01)
-    watch = RecordingWatch()
-    with report_compilation("descent", watch.note) as end_first_case:
-        assert watch.notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
-        assert "marsyard compile" in watch.notes[0]
-        for number in range(3):
-            (tmp_path / f"kernel-{number}.nbc").touch()
-        deadline = time.monotonic() + 20.0
-        while not any("3 functions so far" in note for note in watch.notes) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        end_first_case()
-    assert any("3 functions so far" in note for note in watch.notes)
-    assert re.fullmatch(r"numeric kernels are compiled, \d+ s", watch.notes[-1])
-    # compiled kernels give no notes
-    mark_ready("descent")
-    second_watch = RecordingWatch()
-    with report_compilation("descent", second_watch.note) as end_first_case:
-        end_first_case()
-    assert second_watch.notes == []

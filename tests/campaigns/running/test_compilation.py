@@ -1,0 +1,65 @@
+"""Tests of the compilation of kernels before the first case of a campaign."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from marsyard.campaigns.execution.worker_process import TaskResult, Work
+from marsyard.campaigns.running import preparation
+from marsyard.campaigns.running.preparation import compile_kernels, list_compilations
+from marsyard.sim.kernel_cache import mark_ready
+
+
+class InlineExecutor:
+    """An executor that runs tasks in this process."""
+
+    def run(self, work: Work[Any]) -> Iterator[list[TaskResult[Any]]]:
+        for item in work.items:
+            try:
+                yield [TaskResult(item, work.task(item), None)]
+            except RuntimeError as error:
+                yield [TaskResult(item, None, error)]
+
+
+def test_missing_kernels_are_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compiled, notes = [], list[str]()
+
+    def compile_campaign(name: str, settings: tuple[str, ...]) -> None:
+        compiled.append((name, settings))
+        mark_ready("descent")
+
+    monkeypatch.setattr(preparation, "compile_campaign", compile_campaign)
+    compile_kernels(InlineExecutor(), "descent", notes.append)
+    assert compiled == [("dimes-smoke", ("terrain.samples=512",))]
+    assert notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
+    assert re.fullmatch(r"numeric kernels are compiled, \d+ s", notes[1])
+    # neither compiled kernels nor a scenario without kernels of its own cause notes
+    compile_kernels(InlineExecutor(), "descent", notes.append)
+    compile_kernels(InlineExecutor(), "tests.campaigns.fake_scenario:FakeScenario", notes.append)
+    assert len(compiled) == 1
+    assert len(notes) == 2
+
+
+def test_failed_compilation_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
+    def fail(name: str, settings: tuple[str, ...]) -> None:
+        raise RuntimeError("no renderer")
+
+    monkeypatch.setattr(preparation, "compile_campaign", fail)
+    notes = list[str]()
+    compile_kernels(InlineExecutor(), "descent", notes.append)
+    assert notes[-1].startswith("numeric kernels could not be compiled (no renderer)")
+
+
+def test_scenarios_share_the_compilation_of_their_system() -> None:
+    rover = [scenario for scenario, _name, _settings in list_compilations("rover-drive")]
+    assert rover == [scenario for scenario, _name, _settings in list_compilations("rover")]
+    assert "rover" in rover
+    assert len(list_compilations()) > len(rover)
