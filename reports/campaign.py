@@ -8,6 +8,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -252,6 +253,7 @@ def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
     return [] if column not in frame else [str(value) for value in frame[column].dropna().unique()[:_MAX_NAMES]]
 
 
+@cache
 def page_environment() -> Environment:
     """Create a Jinja environment that escapes all values; its filter `code` marks words in backticks as code."""
     environment = Environment(

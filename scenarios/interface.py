@@ -21,6 +21,7 @@ Scalar = float | int | str | bool
 
 
 _recorder: ContextVar[Callable[[Mapping[str, Scalar]], None] | None] = ContextVar("_recorder", default=None)
+_is_recording_timelines: ContextVar[bool] = ContextVar("_is_recording_timelines", default=False)
 
 
 def record_conditions(columns: Mapping[str, Scalar]) -> None:
@@ -43,6 +44,21 @@ def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> 
         yield
     finally:
         _recorder.reset(token)
+
+
+@contextmanager
+def recording_timelines(is_recording: bool = True) -> Iterator[None]:
+    """Add timelines to the products of cases that run while the context is active, or do not."""
+    token = _is_recording_timelines.set(is_recording)
+    try:
+        yield
+    finally:
+        _is_recording_timelines.reset(token)
+
+
+def is_recording_timelines() -> bool:
+    """Return whether the products of the running case contain its timeline (`marsyard.scenarios.timeline`)."""
+    return _is_recording_timelines.get()
 
 
 @dataclass(frozen=True)

@@ -1,16 +1,14 @@
 """Timeline of a case: ground, trajectories, cameras with images, points and measured values, over space and time.
 
-A scenario adds a timeline to the products of a case by `timeline_products`, and only while `recording_timelines` is
-active: for replayed cases and for the case that the report shows. `marsyard replay` exports it
-(`marsyard.reports.timeline`). Positions are in the world frame (east, north, up), times are seconds on the clock of the
-simulation.
+A scenario adds a timeline to the products of a case by `timeline_products`, and only while timelines are recorded
+(`marsyard.scenarios.interface.recording_timelines`): for replayed cases and for the case that the report shows.
+`marsyard replay` exports it (`marsyard.reports.timeline`). Positions are in the world frame (east, north, up), times are
+seconds on the clock of the simulation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -18,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.scenarios.interface import is_recording_timelines
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from marsyard.sim.dynamics import Motion
 from marsyard.sim.frames import rigid
@@ -32,18 +31,6 @@ _SIDE_PX, _HEIGHT_RATIO = 384, 6.0
 #: Quantiles of the brightness that become black and white.
 _DARK, _BRIGHT = 0.005, 0.995
 
-_is_recording: ContextVar[bool] = ContextVar("_is_recording", default=False)
-
-
-@contextmanager
-def recording_timelines(is_recording: bool = True) -> Iterator[None]:
-    """Add timelines to the products of cases that run while the context is active, or do not."""
-    token = _is_recording.set(is_recording)
-    try:
-        yield
-    finally:
-        _is_recording.reset(token)
-
 
 def timeline_products(create: Callable[[], Timeline], *, is_tested: bool = True) -> dict[str, Any]:
     """Return the timeline as a product; empty, without a call of `create`, unless timelines are recorded.
@@ -51,7 +38,7 @@ def timeline_products(create: Callable[[], Timeline], *, is_tested: bool = True)
     is_tested: whether the products are those of the algorithm under test; other products are not stored
     An exception of `create` does not affect the case: its text is stored instead of the timeline.
     """
-    if not _is_recording.get() or not is_tested:
+    if not is_recording_timelines() or not is_tested:
         return {}
     try:
         return {PRODUCT: create().to_products()}

@@ -24,9 +24,8 @@ from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Wo
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
-from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
+from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by, recording_timelines
 from marsyard.scenarios.systems import scenario
-from marsyard.scenarios.timeline import recording_timelines
 from marsyard.sim.cache import CacheWarning
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.

@@ -9,7 +9,8 @@ import trimesh
 
 from marsyard.campaigns.store.products import load_products
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.timeline import Timeline, recording_timelines, timeline_products
+from marsyard.scenarios.interface import recording_timelines
+from marsyard.scenarios.timeline import Timeline, timeline_products
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.campaigns.fake_scenario import FakeParameters, FakeScenario

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.timeline import SurfacePatch, TimedImage, Timeline, recording_timelines
+from marsyard.scenarios.interface import recording_timelines
+from marsyard.scenarios.timeline import SurfacePatch, TimedImage, Timeline
 from tests.reports.timeline.test_exports import run_rerun
 
 pytestmark = pytest.mark.slow
