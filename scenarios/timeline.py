@@ -2,8 +2,8 @@
 
 A scenario adds a timeline to the products of a case by `timeline_products`, and only while timelines are recorded
 (`marsyard.scenarios.interface.recording_timelines`): for replayed cases and for the case that the report shows.
-`marsyard replay` exports it (`marsyard.reports.timeline`). Positions are in the world frame (east, north, up), times are
-seconds on the clock of the simulation.
+`marsyard replay` exports it (`marsyard.reports.timeline`). Positions are in the world frame (east, north, up), times
+are seconds on the clock of the simulation.
 """
 
 from __future__ import annotations

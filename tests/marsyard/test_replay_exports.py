@@ -8,8 +8,7 @@ import pytest
 import trimesh
 
 from marsyard.campaigns.store.products import load_products
-from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.interface import recording_timelines
+from marsyard.scenarios.interface import CaseResult, recording_timelines
 from marsyard.scenarios.timeline import Timeline, timeline_products
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
