@@ -141,11 +141,12 @@ def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], Non
     if not missing:
         return
     note("compiling numeric kernels once on this machine, about two minutes (to compile in advance: marsyard compile)")
-    start_s, state = time.monotonic(), "are compiled"
-    for result in chain.from_iterable(executor.run(Work(partial(_compile_item, missing), range(len(missing))))):
-        if result.error is not None:
-            state = f"could not be compiled ({result.error}); the times of each worker's first case include compilation"
-    note(f"numeric kernels {state}, {time.monotonic() - start_s:.0f} s")
+    start_s, work = time.monotonic(), Work(partial(_compile_item, missing), range(len(missing)))
+    errors = [result.error for result in chain.from_iterable(executor.run(work)) if result.error is not None]
+    for error in errors:
+        note(f"numeric kernels could not be compiled: {error}; each worker's first case compiles them")
+    if not errors:
+        note(f"numeric kernels are compiled, {time.monotonic() - start_s:.0f} s")
 
 
 def _compile_item(compilations: Sequence[tuple[str, str, tuple[str, ...]]], number: int) -> None:

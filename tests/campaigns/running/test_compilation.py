@@ -55,7 +55,7 @@ def test_failed_compilation_is_reported(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(preparation, "compile_campaign", fail)
     notes = list[str]()
     compile_kernels(InlineExecutor(), "descent", notes.append)
-    assert notes[-1].startswith("numeric kernels could not be compiled (no renderer)")
+    assert notes[-1].startswith("numeric kernels could not be compiled: no renderer")
 
 
 def test_scenarios_share_the_compilation_of_their_system() -> None:
