@@ -137,6 +137,8 @@ def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], Non
 
     Otherwise the first case of each worker would compile them, and an algorithm's computation time would include it.
     """
+    if kernels_are_ready(scenario):
+        return
     missing = [item for item in list_compilations(scenario) if not kernels_are_ready(item[0])]
     if not missing:
         return

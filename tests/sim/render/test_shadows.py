@@ -185,7 +185,12 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     assert np.all(shadow.height < heights + 1e-3)
     scene = Scene(terrain, (0.0, 0.0), just_above, Photometry())
     assert scene.shadow is NO_SHADOW
-    assert scene.with_light(just_below, Photometry()).shadow is not NO_SHADOW
+    below = scene.with_light(just_below, Photometry())
+    assert below.shadow is not NO_SHADOW
+    # the number of rays at edges changes no cached result
+    assert below.with_edge_rays(1).edge_rays == 1
+    assert below.with_edge_rays(1).shadow is below.shadow
+    assert below.edge_rays == 2
 
 
 def test_bounds_contain_all_ground_in_a_cone() -> None:
