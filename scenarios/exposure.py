@@ -17,6 +17,7 @@ from marsyard.sim.dynamics import State
 from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import Backend
+from marsyard.sim.render.kernels.photometry import add_air_light
 from marsyard.sim.sensor import DetectorParameters, ImageMotion, natural_fall_off
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment
@@ -138,19 +139,17 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
     """
     if extinction_m == 0.0:
         return frame.radiance
-    transmission = np.exp(np.float32(-extinction_m) * frame.range_m.astype(np.float32))
-    # Sunlight travels along -sun and is scattered along -direction, towards the camera. `cosine`: cosine of the
-    # scattering angle; g: asymmetry factor of the phase function; `source`: source function of the air
-    sun_body = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
-    cosine = (frame.rays.directions.astype(np.float32) @ sun_body).reshape(frame.radiance.shape)
-    g = np.float32(air.asymmetry)
-    base = np.float32(1.0) + g * g - np.float32(2.0) * g * cosine
-    phase = (np.float32(1.0) - g * g) / (base * np.sqrt(base))
+    transmission = np.multiply(frame.range_m, -extinction_m, dtype=np.float32, casting="same_kind")
+    np.exp(transmission, out=transmission)
+    # sunlight travels along -sun and is scattered along -direction, towards the camera
+    east, north, up = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
     sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
-    ambient = np.float32(0.5 * (sky + float(frame.radiance.mean())))
-    source = np.float32(air.single_scattering_albedo) * (np.float32(0.25) * phase + ambient)
-    hazy = transmission * frame.radiance + (np.float32(1.0) - transmission) * source
-    return np.where(np.isfinite(frame.range_m), hazy, frame.radiance)
+    ambient = 0.5 * (sky + float(frame.radiance.mean()))
+    scattering = np.float32(air.single_scattering_albedo), np.float32(air.asymmetry), np.float32(ambient)
+    hazy = np.empty_like(frame.radiance)
+    flat_arrays = (array.reshape(-1) for array in (frame.radiance, frame.range_m, transmission))
+    add_air_light(*flat_arrays, frame.rays.directions, (east, north, up), scattering, hazy.reshape(-1))
+    return hazy
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:

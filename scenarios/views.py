@@ -26,7 +26,6 @@ from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank
 from marsyard.sim.terrain.microrelief import octave_heights
 from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
 from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
-from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
 #: Scales of a site's terrains: kilometres for descents, or tens of metres for rovers and helicopters.
 Scale = Literal["descent", "ground"]
@@ -186,8 +185,7 @@ def micro_relief(ground: SiteGround) -> MicroRelief:
     p, factors = ground.terrain, ground.surface.factors
     slope = float(np.radians(p.rms_slope_deg))
     coarsest, heights = octave_heights(p.hurst, slope, p.slope_baseline_m, p.outer_scale_m, p.spacing_m)
-    roughness, texture = (np.ascontiguousarray(factors[..., channel]) for channel in (ROUGHNESS, TEXTURE))
-    return MicroRelief(coarsest, heights, roughness, texture, len(factors) / ground.surface.period_m)
+    return MicroRelief(coarsest, heights, factors, len(factors) / ground.surface.period_m)
 
 
 def select_rocks(ground: SiteGround, viewpoint: Viewpoint, farthest_m: float = np.inf) -> Objects:

@@ -26,9 +26,9 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from CyRK import pysolve_ivp
 from jaxtyping import Float64
 from pydantic import Field, model_validator
-from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -235,7 +235,7 @@ def _fly_powered(
     height_left.terminal = True  # type: ignore[attr-defined]
     max_s = (initial.position_m[2] - last_height_m) / (_MIN_SPEED_FRACTION * p.descent_speed_m_s)
     state = [initial.position_m, initial.velocity_m_s, accelerations[1], jerk, attitude.as_quat()]
-    solution = solve_ivp(
+    solution = pysolve_ivp(
         derivative,
         (separation_s, separation_s + max_s),
         np.concatenate([*state, initial.body_rate_rad_s]),
@@ -245,15 +245,15 @@ def _fly_powered(
         # no step is so long that it passes over the start of the thrusters
         max_step=0.5,
         dense_output=True,
-        events=height_left,
+        events=(height_left,),
     )
-    if solution.status != 1 or solution.sol is None:
+    if not solution.event_terminated:
         raise ValueError(
             f"the powered descent is at z = {solution.y[2, -1]:.1f} m after {max_s:.6g} s; allowed: parameters with "
             f"which it reaches {last_height_m:.1f} m"
         )
     times = _knots(separation_s, float(solution.t[-1]))
-    states = solution.sol(times).T
+    states = np.ascontiguousarray(solution(times).T)
     phases = rng.uniform(0.0, 2.0 * np.pi, 3)
     elapsed = (times - separation_s)[:, None]
     angles = np.radians(p.limit_cycle_deg) * np.sin(2.0 * np.pi * elapsed / (p.limit_cycle_s * _CYCLE_RATIOS) + phases)

@@ -43,8 +43,8 @@ _WHITE_QUANTILE, _QUANTILE_STEP = 0.999, 4
 _BLOCK_ROWS, _BAND_ROWS = 128, 512
 #: Margin of error fields around the map, m: positions near its border can be inverted.
 _FIELD_MARGIN_M = 500.0
-#: Fixed-point iterations of `MapTruth.map_position`.
-_INVERSE_STEPS = 12
+#: Maximum number of fixed-point iterations of `MapTruth.map_position`, and the change after which they end, m.
+_INVERSE_STEPS, _INVERSE_CHANGE_M = 12, 1e-9
 Grid = Float32[np.ndarray, "rows columns"]
 Coordinates = Float64[np.ndarray, "count"]
 
@@ -130,7 +130,9 @@ class MapTruth:
         """
         map_m = world_m + self.shift_m
         for _ in range(_INVERSE_STEPS):
-            map_m = world_m + self.shift_m + self.distortion(map_m)
+            previous_m, map_m = map_m, world_m + self.shift_m + self.distortion(map_m)
+            if np.abs(map_m - previous_m).max(initial=0.0) < _INVERSE_CHANGE_M:
+                break
         return np.asarray(map_m)
 
 

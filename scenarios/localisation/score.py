@@ -246,7 +246,7 @@ def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, 
                 for item in details
             ]
         ),
-        "true_xy_m": np.array([descent.map_truth.map_position(state.position_m[:2]) for state in descent.states]),
+        "true_xy_m": descent.map_truth.map_position(np.array([state.position_m[:2] for state in descent.states])),
         "estimated_xy_m": np.stack(estimated),
         "initial_xy_m": descent.measurements.initial.position_m[:2],
         "map": thumbnail.astype(np.uint8),

@@ -44,9 +44,9 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
+from CyRK import PySolver, pysolve_ivp
 from jaxtyping import Float64
 from pydantic import Field, model_validator
-from scipy.integrate import OdeSolution, solve_ivp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
@@ -232,19 +232,10 @@ def build_chain(p: SwingParameters, modes: Modes, gravity_m_s2: float, canopy_he
 
 @dataclass(frozen=True)
 class DescentPath:
-    """Solution of the equations of motion as polynomials, one for each integration step of SciPy's DOP853.
+    """Solutions of the equations of motion from time 0 backward and forward, with CyRK's dense output."""
 
-    - knots_s: earliest time of each step, increasing
-    - starts_s, states, lengths_s: time and state at the step's start, and its length; backward steps have negative ones
-    - polynomials: coefficients of SciPy's Horner scheme, whose factors alternate: elapsed fraction x, and 1 - x
-    """
-
-    span_s: tuple[float, float]
-    knots_s: Float64[np.ndarray, "steps"]
-    starts_s: Float64[np.ndarray, "steps"]
-    lengths_s: Float64[np.ndarray, "steps"]
-    states: Float64[np.ndarray, "steps 22"]
-    polynomials: Float64[np.ndarray, "steps 7 22"]
+    backward: PySolver
+    forward: PySolver
 
     @classmethod
     def integrate(
@@ -255,9 +246,9 @@ class DescentPath:
         `constants` are from `kernels.pack_constants`. Raises ValueError if the integration fails.
         """
         event.terminal = True  # type: ignore[attr-defined]
-        parts: list[OdeSolution] = []
-        for end_s, events in ((-lead_s, None), (max_s, event)):
-            solution = solve_ivp(
+        solutions = []
+        for end_s, events in ((-lead_s, None), (max_s, (event,))):
+            solution = pysolve_ivp(
                 kernels.state_derivative,
                 (0.0, end_s),
                 state,
@@ -268,29 +259,24 @@ class DescentPath:
                 events=events,
                 args=constants,
             )
-            if solution.sol is None or not solution.success:
+            if not solution.success:
                 raise ValueError(f"the integration of the descent fails at {solution.t[-1]:.6g} s: {solution.message}")
-            parts.append(solution.sol)
-        backward, forward = parts
-        steps = [*reversed(backward.interpolants), *forward.interpolants]
-        starts, lengths = np.array([[step.t_old, step.h] for step in steps]).T.copy()
-        return cls(
-            span_s=(float(backward.t_min), float(forward.t_max)),
-            knots_s=np.minimum(starts, starts + lengths),
-            starts_s=starts,
-            lengths_s=lengths,
-            states=np.stack([step.y_old for step in steps]),
-            polynomials=np.stack([step.F for step in steps]),
-        )
+            solutions.append(solution)
+        return cls(*solutions)
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last time."""
+        return float(self.backward.t[-1]), float(self.forward.t[-1])
 
     def at(self, times_s: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 22"]:
         """Return the state vectors at many times (`kernels.swing`). Raises ValueError for times outside the span."""
         check_times(times_s, self.span_s)
-        return np.asarray(
-            kernels.interpolate_states(
-                times_s, self.knots_s, self.starts_s, self.lengths_s, self.states, self.polynomials
-            )
-        )
+        states = np.empty((times_s.size, kernels.SIZE))
+        is_backward = times_s < 0.0
+        for solution, selected in ((self.backward, is_backward), (self.forward, ~is_backward)):
+            states[selected] = solution(times_s[selected]).T
+        return states
 
 
 @dataclass(frozen=True)

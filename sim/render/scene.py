@@ -20,12 +20,12 @@ from marsyard.sim.render.kernels.sun import heights_in_rows, sweep_shadow
 from marsyard.sim.render.objects import Objects, spheres_in_cone
 from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture, no_cover
 from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.surface import UNIFORM
 
 #: Rounding error of a mean of heights of a few km in single precision, metres.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
-_UNIFORM_FACTOR = np.ones((1, 1), dtype=np.float32)
-NO_RELIEF = MicroRelief(1.0, np.empty(0), _UNIFORM_FACTOR, _UNIFORM_FACTOR, 0.0)
+NO_RELIEF = MicroRelief(1.0, np.empty(0), UNIFORM, 0.0)
 NO_CLOUDS = (no_cover(), np.zeros(5))
 #: Cone: apex in world axes, unit vector along the axis, and half angle in radians.
 Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]

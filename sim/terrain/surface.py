@@ -72,17 +72,18 @@ class Surface:
 
     def height(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
         """Evaluate the height above the datum, metres, at world positions."""
-        return self._evaluate(x, y, level)[..., 0]
+        return self.evaluate(x, y, level)[..., 0]
 
     def gradient(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch 2"]:
         """Evaluate the slope (dz/dx, dz/dy) at world positions."""
-        return self._evaluate(x, y, level)[..., 1:3]
+        return self.evaluate(x, y, level)[..., 1:3]
 
     def albedo(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
         """Evaluate the albedo at world positions."""
-        return self._evaluate(x, y, level)[..., 3]
+        return self.evaluate(x, y, level)[..., 3]
 
-    def _evaluate(self, x: Coordinate, y: Coordinate, level: int) -> Float[np.ndarray, "*batch 4"]:
+    def evaluate(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch 4"]:
+        """Evaluate height, slopes (dz/dx, dz/dy) and albedo at world positions."""
         x, y = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
         values = evaluate_field(self.levels[level], self.spacing_m * 2.0**level, x.ravel().copy(), y.ravel().copy())
         return np.asarray(values.reshape(*x.shape, 4))

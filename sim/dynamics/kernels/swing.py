@@ -66,9 +66,6 @@ CHAIN_SIZE = len(Chain._fields)
 #: Number of fields of a wind field without the waves.
 FIELD_SIZE = len(WindField._fields) - 1
 
-#: Number of coefficients of SciPy's polynomial over a step of DOP853.
-TERMS = 7
-
 
 @njit(cache=True)
 def compute_wind(height: float, field: WindField) -> tuple[float, float, float]:
@@ -129,7 +126,7 @@ def compute_aerodynamic_force(y: Array, chain: Chain, field: WindField) -> Array
 
 @njit(cache=True)
 def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Array:
-    """Compute the time derivatives of a state for SciPy's integrator; the other arguments are from `pack_constants`.
+    """Compute the time derivatives of a state for CyRK's integrator; the other arguments are from `pack_constants`.
 
     They are arrays, because numba converts named tuples slowly.
     """
@@ -142,24 +139,6 @@ def state_derivative(_t: float, y: Array, constants: Array, waves: Array) -> Arr
 def pack_constants(chain: Chain, field: WindField) -> tuple[Array, Array]:
     """Convert the constants of chain and wind to arrays: the last two arguments of `state_derivative`."""
     return np.array([*chain, *field[:FIELD_SIZE]]), field.waves
-
-
-@njit(cache=True)
-def interpolate_states(
-    times: Array, knots: Array, starts: Array, lengths: Array, states: Array, polynomials: Array
-) -> Array:
-    """Evaluate the polynomials of `marsyard.sim.dynamics.swing.DescentPath` at many times, a row with a state each."""
-    rows = np.empty((times.size, SIZE))
-    for n in range(times.size):
-        step = max(np.searchsorted(knots, times[n], side="right") - 1, 0)
-        # elapsed fraction of the step
-        x = (times[n] - starts[step]) / lengths[step]
-        for component in range(SIZE):
-            value = 0.0
-            for k in range(TERMS):
-                value = (value + polynomials[step, TERMS - 1 - k, component]) * (x if k % 2 == 0 else 1.0 - x)
-            rows[n, component] = states[step, component] + value
-    return rows
 
 
 @njit(cache=True)

@@ -9,6 +9,7 @@ from numba import njit
 from marsyard.sim.render.kernels.noise import NoiseBuffers, noise_2d
 from marsyard.sim.render.kernels.strips import ROW, STRIP
 from marsyard.sim.render.kernels.structs import Array32, MicroRelief
+from marsyard.sim.render.kernels.sun import find_grid_cell
 from marsyard.sim.terrain.kernels import Array
 
 #: Coefficient of the loss of contrast with (footprint / cell)^2, as in `marsyard.sim.render.kernels.photometry`, for
@@ -77,6 +78,18 @@ def _add_octave(
         slope_y[k] += gain * fade * noise[2 * ROW + k]
         resolved[k] += variance * fade * fade
         unresolved[k] += variance * (1.0 - fade * fade)
+
+
+@njit(cache=True, inline="always", error_model="numpy")
+def interpolate_factors(relief: MicroRelief, x: float, y: float) -> tuple[float, float]:
+    """Interpolate the factors of relief and texture bilinearly at a position."""
+    factors = relief.factors
+    (i0, i1), (j0, j1), fx, fy = find_grid_cell(factors.shape[0], relief.per_metre, x, y)
+    south_roughness = (1.0 - fx) * factors[i0, j0, 0] + fx * factors[i0, j1, 0]
+    north_roughness = (1.0 - fx) * factors[i1, j0, 0] + fx * factors[i1, j1, 0]
+    south_texture = (1.0 - fx) * factors[i0, j0, 1] + fx * factors[i0, j1, 1]
+    north_texture = (1.0 - fx) * factors[i1, j0, 1] + fx * factors[i1, j1, 1]
+    return (1.0 - fy) * south_roughness + fy * north_roughness, (1.0 - fy) * south_texture + fy * north_texture
 
 
 @njit(cache=True, inline="always", error_model="numpy")

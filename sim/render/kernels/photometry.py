@@ -1,9 +1,10 @@
-"""Kernels of the sky's brightness (single scattering by dust) and of the surface texture (noise of the albedo)."""
+"""Kernels of the light of dusty air, in the sky and before the ground, and of the surface texture (albedo noise)."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from marsyard.sim.render.kernels.noise import NoiseBuffers, noise_3d
@@ -51,6 +52,35 @@ def sky_brightness(sky: Array, sun_z: float, sun_radius: float, dz: float, cos_g
         # pixel**2 / 12 to the squared radius, on average
         brightness += min(max(disc_fraction, 0.0), 1.0) / (sun_radius * sun_radius + pixel_rad * pixel_rad / 12.0)
     return brightness
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def add_air_light(
+    radiance: Array32,
+    distance: Array,
+    transmission: Array32,
+    directions: Array32,
+    sun: tuple[np.float32, np.float32, np.float32],
+    air: tuple[np.float32, np.float32, np.float32],
+    hazy: Array32,
+) -> None:
+    """Compute the radiance factors behind dusty air, from those without it; the sky is not changed.
+
+    - distance, transmission: distance to the ground, infinite for the sky, and transmission of the air up to there
+    - directions, sun: unit vectors of the lines of sight and to the sun, in the same axes
+    - air: single-scattering albedo, asymmetry of the phase function, and mean light that the air scatters, excluding
+      direct sunlight
+    - hazy: output
+    """
+    one = np.float32(1.0)
+    albedo, g, ambient = air
+    for n in range(radiance.size):
+        cosine = directions[n, 0] * sun[0] + directions[n, 1] * sun[1] + directions[n, 2] * sun[2]
+        base = one + g * g - np.float32(2.0) * g * cosine
+        phase = (one - g * g) / (base * np.sqrt(base))
+        source = albedo * (np.float32(0.25) * phase + ambient)
+        value = transmission[n] * radiance[n] + (one - transmission[n]) * source
+        hazy[n] = value if distance[n] < math.inf else radiance[n]
 
 
 @njit(cache=True)

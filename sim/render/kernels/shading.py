@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from marsyard.sim.render.kernels.casters import Casters, find_occluded_positions
-from marsyard.sim.render.kernels.microrelief import add_relief_slopes, smith_shadowing
+from marsyard.sim.render.kernels.microrelief import add_relief_slopes, interpolate_factors, smith_shadowing
 from marsyard.sim.render.kernels.noise import NoiseBuffers, allocate_noise
 from marsyard.sim.render.kernels.photometry import add_texture, sky_brightness
 from marsyard.sim.render.kernels.primary import MIN_INCIDENCE_SINE
@@ -303,8 +303,7 @@ def _roughen_ground(relief: MicroRelief, width: int, strip: _Strip) -> None:
     for k in range(width):
         factor = 0.0
         if footprint[k] < math.inf:
-            factor = interpolate_bilinear(relief.roughness, relief.per_metre, x[k], y[k])[0]
-            work[STRENGTH + k] = interpolate_bilinear(relief.texture, relief.per_metre, x[k], y[k])[0]
+            factor, work[STRENGTH + k] = interpolate_factors(relief, x[k], y[k])
         work[ROUGHNESS + k] = factor
     for k in range(min(width, STRIP)):
         factor, is_ground = work[ROUGHNESS + k], work[FOOTPRINT + k] < math.inf

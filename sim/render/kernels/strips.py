@@ -94,6 +94,9 @@ def fetch_levels(
     for m in range(count):
         lowest = min(lowest, level_of[indices[m]])
         highest = max(highest, level_of[indices[m]])
+    if lowest == highest:
+        fetch_cells(levels[lowest], inverse_spacing / (1 << lowest), x, y, indices, count, cells, fractions)
+        return
     for level in range(lowest, highest + 1):
         selected = 0
         for m in range(count):

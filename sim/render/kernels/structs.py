@@ -168,14 +168,14 @@ class MicroRelief(NamedTuple):
 
     - coarsest: cell size of the coarsest octave, metres; the cell size is halved with each octave
     - heights: height amplitude of each octave, metres, coarsest first
-    - roughness, texture: factors of these heights, and of the ground's albedo texture, on a periodic grid
+    - factors: factors of these heights, and of the ground's albedo texture, on a periodic grid: the first two channels
+      of `marsyard.sim.terrain.surface.Surface.factors`
     - per_metre: samples of that grid per metre
     """
 
     coarsest: float
     heights: Array
-    roughness: Array32
-    texture: Array32
+    factors: Array32
     per_metre: float
 
 

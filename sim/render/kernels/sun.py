@@ -84,15 +84,22 @@ def sweep_shadow(height: Array32, row_sign: float, drop: float, shift: float, ma
 
 
 @njit(cache=True, inline="always")
+def find_grid_cell(
+    side: int, inverse_spacing: float, x: float, y: float
+) -> tuple[tuple[int, int], tuple[int, int], float, float]:
+    """Return rows and columns of the four samples around a position on a periodic grid, and its fractions of a cell."""
+    mask = side - 1
+    gx, gy = x * inverse_spacing, y * inverse_spacing
+    j, i = math.floor(gx), math.floor(gy)
+    return (i & mask, (i + 1) & mask), (j & mask, (j + 1) & mask), gx - j, gy - i
+
+
+@njit(cache=True, inline="always")
 def interpolate_bilinear(
     field: Array32, inverse_spacing: float, x: float, y: float
 ) -> tuple[float, tuple[int, int], tuple[int, int]]:
     """Interpolate a periodic field bilinearly; return the value, and rows and columns of the four neighbours."""
-    mask = field.shape[0] - 1
-    gx, gy = x * inverse_spacing, y * inverse_spacing
-    j, i = math.floor(gx), math.floor(gy)
-    fx, fy = gx - j, gy - i
-    i0, i1, j0, j1 = i & mask, (i + 1) & mask, j & mask, (j + 1) & mask
+    (i0, i1), (j0, j1), fx, fy = find_grid_cell(field.shape[0], inverse_spacing, x, y)
     south = (1.0 - fx) * field[i0, j0] + fx * field[i0, j1]
     north = (1.0 - fx) * field[i1, j0] + fx * field[i1, j1]
     return (1.0 - fy) * south + fy * north, (i0, i1), (j0, j1)

@@ -216,11 +216,13 @@ class RockField:
         yaw = np.concatenate([placed_yaw, appearance_rng.uniform(-np.pi, np.pi, random_diameter.size)])
         radius = rock_shapes(shapes.COARSEST).max_radius[shape] * diameter
         xy = _draw_positions(parameters, radius, diameter, surface, substream(rng, "rock places"))
-        position = np.column_stack([xy, surface.height(xy[:, 0], xy[:, 1])])
+        ground = surface.evaluate(xy[:, 0], xy[:, 1])
+        position = np.column_stack([xy, ground[:, 0]])
         # normal of the ground, averaged over about the size of the rock
         level = np.clip(np.log2(np.maximum(diameter / surface.spacing_m, 1.0)).astype(int), 0, len(surface.levels) - 1)
         up = np.ones((diameter.size, 3))
-        for number in np.unique(level):
+        up[:, :2] = -ground[:, 1:3]
+        for number in np.unique(level[level > 0]):
             has_level = level == number
             up[has_level, :2] = -surface.gradient(xy[has_level, 0], xy[has_level, 1], int(number))
         up /= np.linalg.norm(up, axis=1, keepdims=True)

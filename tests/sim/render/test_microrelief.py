@@ -30,13 +30,13 @@ from marsyard.sim.terrain.microrelief import octave_heights
 
 LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 #: Map of amplitude factors with a single sample, 1: equal relief everywhere.
-UNIFORM = np.ones((1, 1), dtype=np.float32)
+UNIFORM = np.ones((1, 1, 3), dtype=np.float32)
 POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
 
 
 def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
     """Create octaves of relief, equal everywhere; `coarsest_m` is the cell size of the first octave."""
-    return MicroRelief(coarsest_m, np.array(heights_m), roughness=UNIFORM, texture=UNIFORM, per_metre=0.0)
+    return MicroRelief(coarsest_m, np.array(heights_m), factors=UNIFORM, per_metre=0.0)
 
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
@@ -209,7 +209,7 @@ def test_kernels_receive_read_only_arrays(flat: Surface) -> None:
     """For writable arrays numba would compile the kernels again."""
     scene = Scene(flat, (0.0, 0.0), Sun(np.array([0.0, 0.0, 1.0])), LAMBERT, relief=_make_relief(1.0, 0.1))
     arrays = [value for value in scene.materials.relief if isinstance(value, np.ndarray)]
-    assert len(arrays) == 3
+    assert len(arrays) == 2
     assert not any(array.flags.writeable for array in (*arrays, *flat.levels))
     # the arrays of the caller remain writable
     assert UNIFORM.flags.writeable
