@@ -91,7 +91,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
         exposures = [take_image(run, scene, ground, state, detector, noise) for state in case.states]
         images = [counts for counts, _ in exposures]
-        ground_points = exposures[1][1].points_world(CLOUD_GRID_PX)
+        ground_points = exposures[1][1].points_world(np.s_[::CLOUD_GRID_PX, ::CLOUD_GRID_PX])
         truth = truth_velocities(p, case)[1, :2]
         measurements = measure(p, case, images, detector, key.calibrated_camera())
         # cloud transmittance on the ground of the second image, at the time of each image, and its changes

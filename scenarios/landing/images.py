@@ -164,7 +164,7 @@ class GroundTruth:
         right = right / np.hypot(*right)
         axes = np.array([right, [-right[1], right[0]]])
         # outline of the ground in the image; every eighth pixel suffices
-        ground_points = pair.frames[0].points_world()[::8, ::8, :2].reshape(-1, 2)
+        ground_points = pair.frames[0].points_world(np.s_[::8, ::8])[..., :2].reshape(-1, 2)
         hull = cv2.convexHull(ground_points[np.all(np.isfinite(ground_points), axis=1)].astype(np.float32))
         outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
         step = STEP_DIAMETERS * limits.diameter_m

@@ -184,7 +184,7 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
     elif details.tracks is not None:
         tracks = details.tracks
         column, row_index = np.rint(tracks.first).astype(np.int64).T
-        points = pair.frames[0].points_world()[row_index * pair.images[0].calibration.rows_summed, column]
+        points = pair.frames[0].points_world((row_index * pair.images[0].calibration.rows_summed, column))
         camera = pair.images[1].camera.transform(flight.states[1].world_from_body)
         pixels, in_front = camera.project(points)
         with np.errstate(invalid="ignore"):

@@ -127,12 +127,20 @@ def attitudes_and_body_rates(angles_rad: Vectors, rates_rad_s: Vectors) -> tuple
     """
     yaw_rate, pitch_rate, roll_rate = rates_rad_s.T
     _, pitch, roll = angles_rad.T
+    # product of the quaternions of the three rotations: a fifth of the time of `Rotation.from_euler`
+    (cy, cp, cr), (sy, sp, sr) = np.cos(0.5 * angles_rad).T, np.sin(0.5 * angles_rad).T
+    quaternions = [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
     rates = [
         roll_rate - yaw_rate * np.sin(pitch),
         pitch_rate * np.cos(roll) + yaw_rate * np.cos(pitch) * np.sin(roll),
         -pitch_rate * np.sin(roll) + yaw_rate * np.cos(pitch) * np.cos(roll),
     ]
-    return Rotation.from_euler("ZYX", angles_rad), np.stack(rates, axis=-1)
+    return Rotation.from_quat(np.stack(quaternions, axis=-1)), np.stack(rates, axis=-1)
 
 
 #: Shortest wavelength of the gusts: two diameters of the canopy, over which shorter gusts average out.

@@ -218,7 +218,10 @@ class DepthRenderer:
         for uniform, matrix in ((self._view, view_from_world), (self._projection, projection)):
             gl.glUniformMatrix4fv(uniform, 1, True, matrix.astype(np.float32))
         gl.glBindVertexArray(self._ground_array)
+        # the cleared colour is already that of the ground, which is drawn faster without colours
+        gl.glColorMask(False, False, False, False)
         gl.glDrawElements(gl.GL_TRIANGLES, self._ground_vertex_count, gl.GL_UNSIGNED_INT, None)
+        gl.glColorMask(True, True, True, True)
         if self._object_vertex_count:
             gl.glBindVertexArray(self._objects_array)
             gl.glDrawArrays(gl.GL_TRIANGLES, 0, self._object_vertex_count)

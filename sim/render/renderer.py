@@ -83,6 +83,10 @@ def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side:
     return Rays(origins, directions, np.repeat(rays.pixel_angles[pixels], side**2))
 
 
+#: Index of rows and columns of an image.
+PixelIndex = tuple[slice | Int64[np.ndarray, "n"], slice | Int64[np.ndarray, "n"]]
+
+
 @dataclass(frozen=True)
 class Frame:
     """An image before the detector model, and its ground truth.
@@ -101,11 +105,14 @@ class Frame:
     world_from_body: RigidTransform
     rays: PixelRays
 
-    def points_world(self, step_px: int = 1) -> Float64[np.ndarray, "m n 3"]:
-        """World point seen by each pixel of every `step_px`-th row and column, metres; NaN for the sky."""
-        distance = self.range_m[::step_px, ::step_px]
+    def points_world(self, pixels: PixelIndex = np.s_[:, :]) -> Float64[np.ndarray, "*selected 3"]:
+        """Return the world points, metres, that the selected pixels see; NaN for the sky.
+
+        `pixels` is an index of rows and columns: slices, or arrays of row and column numbers.
+        """
+        distance = self.range_m[pixels]
         origins, directions = (
-            vectors.reshape(*self.range_m.shape, 3)[::step_px, ::step_px].reshape(-1, 3)
+            vectors.reshape(*self.range_m.shape, 3)[pixels].reshape(-1, 3)
             for vectors in (self.rays.origins, self.rays.directions)
         )
         finite_distance = np.where(np.isfinite(distance), distance, np.nan).reshape(-1, 1)
