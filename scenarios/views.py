@@ -9,11 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.horizon import hill_objects
@@ -24,7 +23,7 @@ from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.sensor import CameraDesign
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
 from marsyard.sim.terrain.microrelief import octave_heights
-from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS
+from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS, find_periods
 from marsyard.sim.terrain.rocks.shapes import FINEST, max_pixels, rock_shapes
 
 #: Scales of a site's terrains: kilometres for descents, or tens of metres for rovers and helicopters.
@@ -200,40 +199,26 @@ def select_rocks(ground: SiteGround, viewpoint: Viewpoint, farthest_m: float = n
     if field is None or len(field) == 0:
         return Objects.none()
     smallest_rad, pixel_rad = smallest_rock_rad(field, viewpoint), _detail_pixel_rad(field, viewpoint)
-    max_distance = min(farthest_m, viewpoint.max_distance_m)
     smallest_m = float(field.diameter_m.min())
-    size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9).astype(int)
-    meshes = []
-    for number in np.unique(size_class):
-        members, min_diameter_m = np.flatnonzero(size_class == number), smallest_m * _CLASS_RATIO ** int(number)
-        # horizontal part of the maximum distance of this size class
-        horizontal = np.sqrt(
-            max((min_diameter_m * np.sqrt(_CLASS_RATIO) / smallest_rad) ** 2 - viewpoint.height_m**2, 0.0)
-        )
-        radius = float(min(horizontal, max_distance))
-        rock_indices = members[_find_near_rocks(field, members, viewpoint, radius)]
-        if rock_indices.size:
-            subset = replace(field, names={}, **{name: getattr(field, name)[rock_indices] for name in ROCK_ARRAYS})
-            mesh = subset.near(
-                viewpoint.east_m, viewpoint.north_m, radius, above_m=viewpoint.height_m, pixel_rad=pixel_rad
-            )
-            meshes.append(replace(mesh, rock_of_face=rock_indices[mesh.rock_of_face].astype(np.int32)))
-    if not meshes:
-        return Objects.none()
-    # keep only triangles in the viewpoint's sector or near the viewpoint; offsets number vertices and bodies of the
-    # joined meshes
-    masks = [_find_visible_triangles(mesh, viewpoint) for mesh in meshes]
-    vertex_offsets = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-    body_offsets = np.cumsum([0] + [int(mesh.body_of_face.max(initial=-1)) + 1 for mesh in meshes])
-    offsets = vertex_offsets.astype(np.int32), body_offsets.astype(np.int32)
-    mesh_parts = list(zip(meshes, masks, *offsets, strict=False))
+    size_class = np.floor(np.log(field.diameter_m / smallest_m) / np.log(_CLASS_RATIO) + 1e-9)
+    # maximum distance of each size class, and its horizontal part
+    distance_m = smallest_m * _CLASS_RATIO ** (size_class + 0.5) / smallest_rad
+    radius_m = np.sqrt(np.maximum(distance_m**2 - viewpoint.height_m**2, 0.0))
+    radius_m = np.minimum(radius_m, min(farthest_m, viewpoint.max_distance_m))
+    near = np.flatnonzero(_find_near_rocks(field, viewpoint, radius_m))
+    subset = replace(field, names={}, **{name: getattr(field, name)[near] for name in ROCK_ARRAYS})
+    mesh = subset.near(
+        viewpoint.east_m, viewpoint.north_m, radius_m[near], above_m=viewpoint.height_m, pixel_rad=pixel_rad
+    )
+    # keep only triangles in the viewpoint's sector or near the viewpoint
+    visible = _find_visible_triangles(mesh, viewpoint)
     return Objects.of_mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.vertex_normals for mesh in meshes]),
-        np.concatenate([mesh.faces[mask] + offset for mesh, mask, offset, _ in mesh_parts]),
-        np.concatenate([mesh.rock_of_face[mask] for mesh, mask, _, _ in mesh_parts]),
+        mesh.vertices,
+        mesh.vertex_normals,
+        mesh.faces[visible],
+        near[mesh.rock_of_face[visible]].astype(np.int32),
         np.minimum(ground.site.photometry.rock_albedo * field.albedo, 1.0),
-        np.concatenate([mesh.body_of_face[mask] + offset for mesh, mask, _, offset in mesh_parts]),
+        mesh.body_of_face[visible],
     )
 
 
@@ -330,25 +315,23 @@ def _position_above_ground(
 
 
 def _find_near_rocks(
-    field: RockField, members: Int64[np.ndarray, "members"], viewpoint: Viewpoint, radius_m: float
-) -> Bool[np.ndarray, "members"]:
-    """Select rocks of which a copy is within a radius of the viewpoint; the rock field repeats with its period.
+    field: RockField, viewpoint: Viewpoint, radius_m: Float64[np.ndarray, "rocks"]
+) -> Bool[np.ndarray, "rocks"]:
+    """Select rocks of which a copy is within their radius of the viewpoint; the rock field repeats with its period.
 
     All rocks with triangles of `_find_visible_triangles` are among them.
     """
-    period, is_selected = field.period_m, np.zeros(members.size, dtype=np.bool_)
+    is_selected = np.zeros(len(field), dtype=np.bool_)
     # larger than any shape on the steepest ground
-    extent = field.diameter_m[members] + field.height_m[members]
+    extent = field.diameter_m + field.height_m
     near_m = max(_NEAR_HEIGHTS * viewpoint.height_m, _NEAR_M)
-    eye_m = np.array([viewpoint.east_m, viewpoint.north_m])
-    reference_offsets = field.position_m[members, :2] + np.floor(eye_m / period) * period - eye_m
-    repetitions = range(-int(np.ceil(radius_m / period)), int(np.ceil(radius_m / period)) + 1)
-    for column, row in product(repetitions, repetitions):
-        offsets = reference_offsets + np.array([column, row]) * period
-        distance = np.hypot(*offsets.T)
+    for corner_m in find_periods(viewpoint.east_m, viewpoint.north_m, float(radius_m.max()), field.period_m):
+        east, north = (field.position_m[:, :2] + (corner_m - (viewpoint.east_m, viewpoint.north_m))).T
+        distance = np.hypot(east, north)
         within = np.flatnonzero(distance <= radius_m)
-        (east, north), distance, extent_within = offsets[within].T, distance[within], extent[within]
-        bearing = np.abs((np.arctan2(east, north) - viewpoint.azimuth_rad + np.pi) % (2.0 * np.pi) - np.pi)
+        distance, extent_within = distance[within], extent[within]
+        bearing = np.arctan2(east[within], north[within]) - viewpoint.azimuth_rad
+        bearing = np.abs((bearing + np.pi) % (2.0 * np.pi) - np.pi)
         widening = np.arcsin(np.minimum(extent_within / np.maximum(distance, 1e-9), 1.0))
         is_selected[within] |= (bearing <= viewpoint.half_width_rad + widening) | (distance <= near_m + extent_within)
     return is_selected

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -244,7 +245,7 @@ class RockField:
         self,
         x: float,
         y: float,
-        radius_m: float,
+        radius_m: float | PerRock,
         smallest_m: float = 0.0,
         *,
         above_m: float = 0.0,
@@ -254,20 +255,19 @@ class RockField:
         """Return the triangles of the rocks whose centres lie within a horizontal radius of a position.
 
         - x, y: world position in any period; within more than half a period a rock can occur several times
+        - radius_m: one radius, or one per rock
         - smallest_m: minimum diameter
         - above_m, pixel_rad: height of the camera above the ground at this position, and angle of a pixel
         - detail: level of detail of all rocks, 0 (20 triangles) to 4 (5120); by default the coarsest level of each rock
           whose deviation from the finest is not visible (`DEVIATION_PX`)
         """
         large = np.flatnonzero(self.diameter_m >= smallest_m)
-        periods = int(np.ceil(radius_m / self.period_m))
-        cell = np.floor(np.array([x, y]) / self.period_m)
-        numbers, positions = [], []
-        for i, j in product(range(-periods, periods + 1), repeat=2):
-            offset = (cell + np.array([j, i])) * self.period_m
+        radii = np.broadcast_to(radius_m, self.diameter_m.shape)[large]
+        numbers, positions = [large[:0]], [self.position_m[:0]]
+        for offset in find_periods(x, y, float(radii.max(initial=0.0)), self.period_m):
             dx = self.position_m[large, 0] + (offset[0] - x)
             dy = self.position_m[large, 1] + (offset[1] - y)
-            numbers.append(large[dx * dx + dy * dy <= radius_m * radius_m])
+            numbers.append(large[dx * dx + dy * dy <= radii * radii])
             positions.append(self.position_m[numbers[-1]] + np.append(offset, 0.0))
         number, position = np.concatenate(numbers), np.concatenate(positions)
         if detail is None:
@@ -310,6 +310,20 @@ class RockField:
         body_of_face = np.repeat(np.arange(number.size, dtype=np.int32), np.concatenate(counts))
         mesh_arrays = (np.concatenate(vertices), np.concatenate(normals), np.concatenate(faces))
         return RockMesh(*mesh_arrays, number.astype(np.int32)[body_of_face], body_of_face)
+
+
+def find_periods(x: float, y: float, radius_m: float, period_m: float) -> list[Float64[np.ndarray, "2"]]:
+    """Return the minimum x and y of the periods of a periodic field that a circle around (x, y) touches, row by row."""
+    first_column, first_row = (math.floor((centre - radius_m) / period_m) for centre in (x, y))
+    last_column, last_row = (math.floor((centre + radius_m) / period_m) for centre in (x, y))
+    corners = []
+    for row, column in product(range(first_row, last_row + 1), range(first_column, last_column + 1)):
+        west, south = column * period_m, row * period_m
+        nearest = max(west - x, 0.0, x - west - period_m), max(south - y, 0.0, y - south - period_m)
+        # with a margin for rounding
+        if math.hypot(*nearest) <= radius_m + 1e-9 * period_m:
+            corners.append(np.array([west, south]))
+    return corners
 
 
 def _draw_positions(
