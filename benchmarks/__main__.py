@@ -13,8 +13,9 @@ from pathlib import Path
 import cv2
 
 from benchmarks import descent, engine, estimators, hda, images, localisation, renderers, reporting, starting, vtt
+from benchmarks.check import reference_workload
 from benchmarks.page import PAGE, write_page
-from benchmarks.timing import Measurement
+from benchmarks.timing import Measurement, core_seconds
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
@@ -32,6 +33,10 @@ def main() -> None:
     measurements = [
         # first, because other benchmarks increase the memory of the process
         *images.measure_memory(500),
+        Measurement(
+            "reference workload of make bench-check (ms)",
+            [1e3 * time_s for time_s in core_seconds(reference_workload(), 50)],
+        ),
         *descent.measure_frame(15),
         *descent.measure_case(7),
         *estimators.compare_estimators(8),
