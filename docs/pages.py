@@ -16,9 +16,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from marsyard.campaigns.definition.loading import catalogue
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
-from marsyard.scenarios.systems import scenario, scenario_names
+from marsyard.scenarios.systems import catalogue, scenario, scenario_names
 
 #: Folder of the generated pages.
 FOLDER = Path(__file__).parent / "reference" / "generated"

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from marsyard.campaigns.definition import loading
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
+from marsyard.scenarios import systems
 from marsyard.scenarios.interface import CaseResult as CaseResult
 from marsyard.sim.camera import CameraModel as CameraModel
 from marsyard.sim.camera import read_camera as read_camera
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 
 def catalogue() -> list[str]:
     """Return the names of the built-in campaigns."""
-    return list(loading.catalogue())
+    return list(systems.catalogue())
 
 
 def sites() -> dict[str, str]:

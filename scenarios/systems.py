@@ -19,11 +19,13 @@ from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from marsyard.scenarios.imports import import_object
-from marsyard.scenarios.interface import Scenario
 from marsyard.sim.parameters import warn_deprecated
+
+if TYPE_CHECKING:  # its imports take longer than `marsyard list`
+    from marsyard.scenarios.interface import Scenario
 
 #: Folder of the files that the systems of Marsyard share.
 SCENARIOS_FOLDER = Path(__file__).resolve().parent
@@ -205,6 +207,11 @@ def systems() -> tuple[System, ...]:
     return registry().systems
 
 
+def catalogue() -> dict[str, Path]:
+    """Return the campaign files of all systems by campaign name, sorted."""
+    return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))
+
+
 def problems() -> tuple[str, ...]:
     """Return one message for each system of another package that is omitted."""
     return registry().problems
@@ -331,7 +338,7 @@ def scenario(name: str) -> Scenario:
     missing = [member for member in members if not hasattr(scenario_type, member)]
     if missing:
         raise UnknownScenarioError(f"'{path}' is not a valid scenario: missing members: {', '.join(missing)}")
-    return cast(Scenario, scenario_type())
+    return cast("Scenario", scenario_type())
 
 
 def scenario_source(name: str) -> str:

@@ -27,13 +27,7 @@ from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
 from marsyard.campaigns.sampling.design import MATRICES
 from marsyard.scenarios.interface import HasAlgorithms, Scenario
-from marsyard.scenarios.systems import UnknownScenarioError, scenario, systems
-
-
-def catalogue() -> dict[str, Path]:
-    """Return the campaign files of all systems by campaign name, sorted."""
-    return dict(sorted((name, path) for system in systems() for name, path in system.campaigns.items()))
-
+from marsyard.scenarios.systems import UnknownScenarioError, catalogue, scenario
 
 #: Keys of the file that `--set` accepts; any other key is a parameter.
 _FILE_KEYS = (

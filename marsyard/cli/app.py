@@ -68,8 +68,7 @@ def list_campaigns(as_json: JsonOption = False) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from marsyard.campaigns.definition.loading import catalogue
-    from marsyard.scenarios.systems import problems
+    from marsyard.scenarios.systems import catalogue, problems
 
     for problem in problems():
         typer.echo(f"warning: {problem}", err=True)

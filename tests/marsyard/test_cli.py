@@ -263,7 +263,7 @@ def test_negative_case_numbers_are_rejected(finished_run: Path, marsyard: Comman
 
 
 def test_internal_error_has_status_2(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.campaigns.definition.loading.catalogue", lambda: 1 / 0)
+    monkeypatch.setattr("marsyard.scenarios.systems.catalogue", lambda: 1 / 0)
     result = marsyard("list")
     assert result.status == 2
     assert "ZeroDivisionError" in result.err

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.rows import Row
 from marsyard.scenarios.rover.scenario import SharedDriveParameters, SharedDriveScenario
-from marsyard.scenarios.systems import systems
+from marsyard.scenarios.systems import catalogue, systems
 from marsyard.sim.streams import Streams
 
 

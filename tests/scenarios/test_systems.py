@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition import requirements
 from marsyard.campaigns.definition.identity import custom_sources
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
@@ -20,6 +20,7 @@ from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
     BUILT_IN,
     UnknownScenarioError,
+    catalogue,
     find_system,
     problems,
     registry,

@@ -11,8 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
+from marsyard.scenarios.systems import catalogue
 
 #: Fixture of conftest that writes a campaign file from its parameters, dispersions and other tables.
 CampaignFile = Callable[..., Path]

@@ -7,10 +7,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario
+from marsyard.scenarios.systems import catalogue
 
 #: A user's score function: its results are additional columns of a case.
 SCORE_MODULE = """

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.loading import catalogue, find_campaign, load_campaign
+from marsyard.campaigns.definition.loading import find_campaign, load_campaign
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
+from marsyard.scenarios.systems import catalogue
 from tests.campaigns.fake_campaign import write_campaign
 
 #: Bounds in the units of the metrics (m/s, m, s); None: the metric is true or false.

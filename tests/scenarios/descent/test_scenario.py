@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.systems import catalogue
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.settings import DESCENT, FLAT_TERRAIN, IDEAL_INSTRUMENTS, SMALL_WORLD, run_descent
 

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.requirements import read_requirements
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conditions import contrast_columns
@@ -23,7 +23,7 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationFaults, LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LEAD_S, LocalisationScenario, LocalisedDescent
 from marsyard.scenarios.localisation.system import SYSTEM
-from marsyard.scenarios.systems import row_columns
+from marsyard.scenarios.systems import catalogue, row_columns
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from marsyard.sim.streams import Streams
