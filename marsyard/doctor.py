@@ -38,7 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "marsyard"
 #: Import names of distributions whose import name differs from the distribution name.
 IMPORT_NAMES = {
-    "opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "yaml", "salib": "SALib",
+    "cyrk": "CyRK", "opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "yaml", "salib": "SALib",
     "scikit-learn": "sklearn",
 }  # fmt: skip
 #: Pairs of a required distribution and a conflicting distribution that overwrites its files.
