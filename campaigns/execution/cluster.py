@@ -290,7 +290,9 @@ def _start_local_cluster(address: str) -> Any:
         raise CampaignError(f"--cluster {address}: expected local:N, with N at least 1")
     # the memory limit applies to the worker processes of the cases, not to the Dask workers
     worker_options: dict[str, Any] = {"n_workers": int(number), "threads_per_worker": 1, "processes": True}
-    return LocalCluster(**worker_options, dashboard_address=None, memory_limit=0, silence_logs="ERROR")
+    # without a port of its own, Dask's HTTP server takes 8787, and warns if another local cluster already uses it
+    scheduler_options = {"dashboard": False, "dashboard_address": ":0"}
+    return LocalCluster(**worker_options, scheduler_kwargs=scheduler_options, memory_limit=0, silence_logs="ERROR")
 
 
 @cache

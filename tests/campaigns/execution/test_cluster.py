@@ -12,7 +12,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,18 @@ pytestmark = [
 ]
 
 
+@pytest.fixture
+def used_dask_port() -> Iterator[None]:
+    """Use the default port of Dask's HTTP server, as a second local cluster on the machine does."""
+    with socket.socket() as server:
+        with suppress(OSError):  # another program already uses it
+            server.bind(("", 8787))
+        server.listen()
+        yield
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("used_dask_port")
 def test_cluster_rows_equal_rows_of_one_machine(
     campaign_file: Callable[..., Path], tmp_path: Path, watch: RecordingWatch
 ) -> None:
