@@ -30,9 +30,12 @@ _MAX_REPLICATES = 8
 
 
 def read_result(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of a study of rare violations with its `result`; empty for another or an unfinished study."""
+    """Return the settings of a study of rare violations with its `result`; empty for another or an unfinished study.
+
+    It is also empty for a study that an earlier version evaluated, without a counting bound.
+    """
     study = table(record.get("study"))
-    return study if study.get("kind") == "rare" and table(study.get("result")) else {}
+    return study if study.get("kind") == "rare" and table(table(study.get("result")).get("decision")) else {}
 
 
 def describe_result(directory: Path) -> list[str]:
@@ -47,41 +50,75 @@ def probability_text(value: object) -> str:
 
 
 def result_sentences(study: Mapping[str, Any]) -> list[str]:
-    """Describe estimate, interval, verdict and cost of a study; empty without a result."""
+    """Describe verdict, counting bound, estimate and cost of a study; empty without a result.
+
+    The first sentence contains the verdict, the second the counting bound.
+    """
     if not study:
         return []
     result = table(study.get("result"))
-    interval, cases = table(result.get("interval")), int(result["cases"])
+    decision = table(result.get("decision"))
     limit = probability_text(study["max_probability"])
-    method = "subset simulation" if study["method"] == "subset" else "importance sampling"
-    bounds = f"{probability_text(interval.get('lower'))} to {probability_text(interval.get('upper'))}"
-    sentences = [
-        f"{study['requirement']}: {result['verdict']}.",
-        f"Probability of a violation per case: {probability_text(interval.get('estimate'))}, "
-        f"{format_fraction(interval['confidence'])} interval {bounds} by {method}; the limit is {limit}.",
+    basis = {
+        "counting": ", by counting independent cases",
+        "simulation": ", by the interval of the simulations; it assumes a continuous margin",
+    }.get(str(decision["basis"]), "")
+    return [
+        f"{study['requirement']}: {result['verdict']}{basis}.",
+        f"{_counting_sentence(table(decision['counting']))} The limit is {limit}.",
+        _estimate_sentence(study, decision),
+        *filter(None, [str(decision["reason"]), *_remedies(study, decision)]),
+        f"The study ran {count(int(result['cases']), 'case')}; {int(result['violations']):,} of them violate the "
+        "requirement.",
+        str(result["margin_text"]),
     ]
-    if result.get("reason"):
-        sentences.append(str(result["reason"]))
-    counting = result.get("counting_cases")
-    cost = f"The study ran {count(cases, 'case')}; {int(result['violations']):,} of them violate the requirement."
-    if isinstance(counting, int | float) and counting > cases:
-        cost += f" Counting would need about {counting:,.0f} independent cases for an interval of the same width."
-    sentences.append(cost)
-    if not all(replicate["reached"] for replicate in result["replicates"]):
+
+
+def _counting_sentence(counting: Mapping[str, Any]) -> str:
+    """Describe the counting bound."""
+    cases, units = int(counting["cases"]), int(counting["units"])
+    shared = f" on {count(units, 'terrain')}, which are counted instead of cases" if units < cases else ""
+    sentence = (
+        f"Probability of a violation per case by counting: at most {probability_text(counting['upper'])} "
+        f"({format_fraction(counting['upper_confidence'])} confidence), from "
+        f"{count(int(counting['violations']), 'violation')} in {count(cases, 'independent random case')}{shared}."
+    )
+    if counting["lower"] > 0.0:
+        confidence = format_fraction(counting["lower_confidence"])
+        sentence += f" It is at least {probability_text(counting['lower'])} ({confidence} confidence)."
+    return sentence
+
+
+def _estimate_sentence(study: Mapping[str, Any], decision: Mapping[str, Any]) -> str:
+    """Describe the estimate of the simulations."""
+    interval = table(decision["interval"])
+    method = "Subset simulation" if study["method"] == "subset" else "Importance sampling"
+    if interval["estimate"] is None:
+        return f"{method} has no estimate."
+    bounds = f"{probability_text(interval['lower'])} to {probability_text(interval['upper'])}"
+    return (
+        f"{method} estimates {probability_text(interval['estimate'])}, {format_fraction(interval['confidence'])} "
+        f"interval {bounds}. The interval assumes that the margin falls continuously to a violation. Fewer cases than "
+        "counting needs cannot show this, so that no PASS rests on it."
+    )
+
+
+def _remedies(study: Mapping[str, Any], decision: Mapping[str, Any]) -> list[str]:
+    """Describe the additional cases or replicates that would decide the verdict."""
+    random_cases, replicates = decision["additional_random_cases"], decision["additional_replicates"]
+    sentences = []
+    if random_cases:
+        counting = table(decision["counting"])
+        unit = "random cases" if counting["units"] == counting["cases"] else "random cases, each on a new terrain,"
         sentences.append(
-            "Some replicates stopped without a violation, at levels less likely than a hundredth of the limit. The "
-            "probability of their last level is used as an upper limit of their estimate; the lower bound of the "
-            "interval is 0."
+            f"PASS needs about {random_cases:,} additional {unit} without a violation: "
+            f"marsyard append DIR {random_cases} --random."
         )
-    additional = result.get("additional_cases")
-    if additional:
-        per_replicate = cases / len(result["replicates"])
-        replicates = math.ceil(additional / per_replicate)
+    if replicates:
         sentences.append(
-            f"About {additional:,} additional cases ({count(replicates, 'replicate')}) would decide the verdict if the "
-            f"estimate remains: marsyard append DIR {replicates}."
+            f"{count(replicates, 'additional replicate')} would decide the verdict if the estimate remains: "
+            f"marsyard append DIR {replicates}."
         )
-    sentences.append(str(result["margin_text"]))
     return sentences
 
 
@@ -97,20 +134,21 @@ def rare_section(subject: Subject) -> Section | None:
             str(index + 1),
             probability_text(replicate["probability"]),
             str(len(replicate["thresholds"])),
-            "yes" if replicate["reached"] else "no",
+            str(replicate["end"]),
         ]
         for index, replicate in enumerate(replicates)
     ]
-    grid = Grid(["Replicate", "Probability", "Levels", "Violation reached"], rows)
+    grid = Grid(["Replicate", "Probability", "Levels", "End"], rows)
     note = (
-        "Each replicate is an independent subset simulation. A tenth of the cases of each level "
-        "reaches the next one. The standard error within one replicate is too small, since its "
-        "cases are correlated. "
+        "Each replicate is an independent subset simulation. A tenth of the cases of each level reaches the next one. "
+        "The standard error within one replicate is too small, since its cases are correlated. "
         + (
             "The interval comes from the spread of the replicates."
             if study["method"] == "subset"
             else "The interval contains those of importance sampling around the violations, and of the replicates."
         )
+        + " Without an end at violations, the probability is that of the last level."
+        + _continuity_note(table(table(result["decision"]).get("continuity")))
     )
     figure = svg_figure(
         _draw_levels(replicates, float(study["max_probability"])),
@@ -126,6 +164,16 @@ def rare_section(subject: Subject) -> Section | None:
         "method": study["method"],
     }
     return Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
+
+
+def _continuity_note(continuity: Mapping[str, Any]) -> str:
+    """Describe the violations that were reached without intermediate margins; empty without the check."""
+    if not continuity:
+        return ""
+    return (
+        f" Random cases, and levels far above the last one, reached {count(int(continuity['direct']), 'violation')} "
+        f"directly; the interval predicts {continuity['expected_lower']:.2g} to {continuity['expected_upper']:.2g}."
+    )
 
 
 @in_page_style

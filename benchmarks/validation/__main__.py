@@ -23,6 +23,7 @@ from benchmarks.validation import (
     light_checks,
     motion_checks,
     rare_checks,
+    rare_verdicts,
     reference_checks,
     sampling_checks,
     soak,
@@ -45,6 +46,7 @@ CHECKS = (
     *soak.CHECKS,
     *statistics_checks.CHECKS,
     *rare_checks.CHECKS,
+    *rare_verdicts.CHECKS,
 )
 
 

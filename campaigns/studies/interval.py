@@ -1,22 +1,13 @@
-"""Intervals of a small probability from independent simulations (replicates), and the verdict on its upper limit."""
+"""Intervals of a small probability from independent simulations (replicates) and from importance sampling."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
 from scipy.stats import t as student_t
-
-
-class RareVerdict(StrEnum):
-    """Verdict on a probability that must not exceed a limit."""
-
-    PASS = "PASS"  # noqa: S105  (a verdict, not a password)
-    FAIL = "FAIL"
-    INSUFFICIENT = "INSUFFICIENT"
 
 
 @dataclass(frozen=True)
@@ -35,15 +26,17 @@ class ProbabilityInterval:
     log_sd: float
 
 
-def replicate_interval(estimates: Sequence[float], reached: Sequence[bool], confidence: float) -> ProbabilityInterval:
-    """Compute the interval of a probability from independent estimates, at least two.
+def unknown_interval(confidence: float) -> ProbabilityInterval:
+    """Return the interval from 0 to 1, without an estimate."""
+    return ProbabilityInterval(math.nan, 0.0, 1.0, confidence, math.nan)
 
-    reached: whether each replicate reached a violation
+
+def replicate_interval(estimates: Sequence[float], confidence: float) -> ProbabilityInterval:
+    """Compute the interval of a probability from independent estimates, at least two.
 
     Estimates of subset simulations are close to lognormal and unbiased. The interval is Cox's for the mean of a
     lognormal distribution with Student's t quantile (Olsson 2005, Journal of Statistics Education 13): with the mean m
-    and variance v of n logarithms, m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))). If a replicate
-    reached no violation, its estimate is an upper limit, and the lower bound is 0.
+    and variance v of n logarithms, m + v / 2 +- t sqrt(v / n + v^2 / (2 (n - 1))).
     """
     values = np.array(estimates, dtype=np.float64)
     count = values.size
@@ -54,10 +47,8 @@ def replicate_interval(estimates: Sequence[float], reached: Sequence[bool], conf
     centre = float(logarithms.mean()) + 0.5 * variance
     quantile = float(student_t.ppf(0.5 * (1.0 + confidence), count - 1))
     half_width = quantile * math.sqrt(variance / count + variance**2 / (2.0 * (count - 1)))
-    lower = math.exp(centre - half_width) if all(reached) else 0.0
-    return ProbabilityInterval(
-        float(values.mean()), lower, min(math.exp(centre + half_width), 1.0), confidence, math.sqrt(variance)
-    )
+    lower, upper = math.exp(centre - half_width), min(math.exp(centre + half_width), 1.0)
+    return ProbabilityInterval(float(values.mean()), lower, upper, confidence, math.sqrt(variance))
 
 
 def weighted_interval(contributions: Sequence[float], confidence: float) -> ProbabilityInterval:
@@ -85,13 +76,6 @@ def effective_number(weights: Sequence[float]) -> float:
 def enclose(first: ProbabilityInterval, second: ProbabilityInterval) -> ProbabilityInterval:
     """Return the first interval, extended so that it contains the second one."""
     return replace(first, lower=min(first.lower, second.lower), upper=max(first.upper, second.upper))
-
-
-def decide(interval: ProbabilityInterval, max_probability: float) -> RareVerdict:
-    """Compare the bounds of a probability with its limit."""
-    if interval.upper <= max_probability:
-        return RareVerdict.PASS
-    return RareVerdict.FAIL if interval.lower > max_probability else RareVerdict.INSUFFICIENT
 
 
 def additional_replicates(interval: ProbabilityInterval, replicates: int, max_probability: float) -> int | None:

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.special import ndtri
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import Requirement
@@ -16,17 +15,8 @@ from marsyard.campaigns.definition.margins import compute_margin, describe_margi
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.studies.decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.importance import fit_density
-from marsyard.campaigns.studies.interval import (
-    ProbabilityInterval,
-    RareVerdict,
-    additional_replicates,
-    decide,
-    effective_number,
-    enclose,
-    replicate_interval,
-    weighted_interval,
-)
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -54,11 +44,9 @@ KIND = "rare"
 #: Subset simulation alone, or with importance sampling around the violations that it found.
 METHODS = ("subset", "importance")
 #: Subset simulation stops at levels less likely than this fraction of the limit, which cannot change the verdict.
-_MIN_PROBABILITY_FRACTION = 0.01
-#: Minimum number of effective violations (Kish) at which the interval of importance sampling is used.
-MIN_EFFECTIVE_VIOLATIONS = 30.0
-#: Number of importance samples that are evaluated together.
-_IMPORTANCE_BATCH = 100
+MIN_PROBABILITY_FRACTION = 0.01
+#: Number of importance samples, and of random cases, that are evaluated together.
+_IMPORTANCE_BATCH, _RANDOM_BATCH = 100, 1000
 
 
 @dataclass(frozen=True)
@@ -68,9 +56,10 @@ class RareSettings:
     - requirement: id of the requirement; max_probability: limit of the probability that a case violates it
     - method: see `METHODS`
     - samples: cases per level of one subset simulation
-    - replicates: numbers of replicates that run together: those of the first run, and of each continuation
+    - replicates, random_cases: numbers of replicates, and of random cases, of the first run and of each continuation.
+      Random cases are drawn independently for the counting bound, as is the first level of each replicate
     - importance_cases: cases of importance sampling
-    - confidence: two-sided confidence of the interval
+    - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
     """
 
     requirement: str
@@ -78,6 +67,7 @@ class RareSettings:
     method: str = "subset"
     samples: int = 200
     replicates: tuple[int, ...] = (6,)
+    random_cases: tuple[int, ...] = (600,)
     importance_cases: int = 600
     confidence: float = 0.9
 
@@ -87,6 +77,7 @@ class RareSettings:
             f"--method {self.method}: allowed: {', '.join(METHODS)}": self.method in METHODS,
             f"--samples {self.samples}: at least 50": self.samples >= 50,
             f"--replicates {self.replicates[0]}: at least 2": self.replicates[0] >= 2,
+            f"--random-cases {self.random_cases[0]}: at least 0": self.random_cases[0] >= 0,
             f"--importance-cases {self.importance_cases}: at least 50": self.importance_cases >= 50,
             f"--confidence {self.confidence}: allowed: 0.5 to 0.999": 0.5 <= self.confidence <= 0.999,
         }
@@ -97,10 +88,11 @@ class RareSettings:
 
 @dataclass(frozen=True)
 class Replicate:
-    """One subset simulation: estimated probability, whether a violation was reached, and margin threshold per level."""
+    """One subset simulation: estimated probability, whether it is an estimate, reason of its end, level thresholds."""
 
     probability: float
     reached: bool
+    end: str
     thresholds: tuple[float, ...]
 
 
@@ -108,26 +100,18 @@ class Replicate:
 class RareResult:
     """Result of the study.
 
-    - verdict, interval: verdict, and estimate with the interval on which it rests
+    - verdict, decision: verdict, and its evidence
     - cases, violations: numbers of evaluated cases, and of those that violate the requirement
-    - replicates: subset simulations; subset_interval: their interval
-    - effective_violations: effective number of violations of importance sampling; NaN without it
-    - additional_cases: estimated number of further cases until the verdict is decided; None if decided or unknown
-    - counting_cases: number of independent cases that would give an interval of the same relative width
-    - margin_text: definition of the margin; reason: why the verdict is INSUFFICIENT; may be empty
+    - replicates: subset simulations
+    - margin_text: definition of the margin
     """
 
     verdict: RareVerdict
-    interval: ProbabilityInterval
+    decision: Decision
     cases: int
     violations: int
     replicates: tuple[Replicate, ...]
-    subset_interval: ProbabilityInterval
-    effective_violations: float
-    additional_cases: int | None
-    counting_cases: float
     margin_text: str
-    reason: str = ""
 
     @property
     def exit_code(self) -> int:
@@ -143,7 +127,7 @@ def start_rare(
     executor: ExecutorConfig,
     observer: ProgressObserver,
 ) -> RareResult:
-    """Run the study in a new folder.
+    """Run the study in a new folder; `max_cases` limits the cases without the random ones.
 
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
     stored, and `continue_rare` continues.
@@ -152,122 +136,94 @@ def start_rare(
     session = StudySession(
         executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
     )
-    return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(settings)})
+    total_cases = max_cases + sum(settings.random_cases)
+    return start_study(campaign, total_cases, directory, session, {"kind": KIND, **asdict(settings)})
 
 
 def continue_rare(
-    directory: Path, executor: ExecutorConfig, observer: ProgressObserver, additional: int = 0
+    directory: Path, executor: ExecutorConfig, observer: ProgressObserver, replicates: int = 0, random_cases: int = 0
 ) -> RareResult:
-    """Continue an interrupted study, or add replicates to a finished one.
+    """Continue an interrupted study, or add replicates or random cases to a finished one.
 
-    additional: number of replicates to add; at least 1 if the study is finished
+    replicates, random_cases: numbers to add; the result is evaluated again if one of them is not 0
     Raises CampaignError if the folder contains no such study, or the program has changed.
     """
     study = read_study(directory) or {}
     if study.get("kind") != KIND:
         raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
     values = {name: study[name] for name in RareSettings.__dataclass_fields__}
-    settings = RareSettings(**{**values, "replicates": tuple(values["replicates"])})
-    if additional and settings.method == "importance":
-        raise CampaignError(f"{directory}: importance sampling cannot be extended; start a new study with more cases")
-    if additional:
-        settings = replace(settings, replicates=(*settings.replicates, additional))
+    blocks = {name: tuple(values[name]) for name in ("replicates", "random_cases")}
+    settings = RareSettings(**{**values, **blocks})
+    if replicates and settings.method == "importance":
+        raise CampaignError(
+            f"{directory}: no replicates can be added to a study with importance sampling; start a new study with more"
+        )
+    if replicates or random_cases:
+        settings = replace(
+            settings, replicates=(*settings.replicates, replicates), random_cases=(*settings.random_cases, random_cases)
+        )
     session = StudySession(
         executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
     )
-    return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
+    return continue_study(directory, session, {"kind": KIND, **asdict(settings)}, random_cases)
 
 
 class _Study:
-    """State of a running study: its cases so far, and the violations among them."""
+    """State of a running study: number of violations, independent cases, and random cases that are not yet run."""
 
     def __init__(self, campaign: Campaign, settings: RareSettings, runner: PointRunner) -> None:
         self._campaign, self._settings, self._runner = campaign, settings, runner
         self._requirement: Requirement = find_requirement(campaign, settings.requirement)
         self._violations = 0
+        self._is_violation: list[bool] = []
+        self._terrains: list[str | None] = []
+        self._reserved_cases = sum(settings.random_cases)
 
     def run(self, observer: ProgressObserver) -> RareResult:
-        """Run all replicates and the importance sampling; estimate the probability and decide."""
+        """Run random cases, replicates and importance sampling; estimate the probability and decide."""
         settings = self._settings
         results: list[SubsetResult] = []
-        reason, violation_weights = "", list[float]()
-        try:
-            for block in settings.replicates:
-                observer.begin("cases", self._max_cases(block))
-                results += self._run_replicates(range(len(results), len(results) + block))
-            if settings.method == "importance":
-                observer.begin("cases", settings.importance_cases)
-                violation_weights = self._run_importance(results)
-                if not violation_weights:
-                    reason = "The replicates found too few violations to fit a density for importance sampling."
-        except CaseLimitError as error:
-            reason = f"The limit of cases was reached: {error}."
-        if len(results) < 2:
-            unknown_interval = ProbabilityInterval(math.nan, 0.0, 1.0, settings.confidence, math.nan)
-            return self._finish(
-                RareVerdict.INSUFFICIENT, unknown_interval, results, unknown_interval, math.nan, None, reason
-            )
-        estimates, reached = [item.probability for item in results], [item.reached for item in results]
-        # each evaluation after the first uses half of the risk of the previous one: the sum of all risks is below twice
-        # the first, so each one-sided bound has at most the risk 1 - confidence over all evaluations
-        confidence = 1.0 - (1.0 - settings.confidence) / 2.0 ** (len(settings.replicates) - 1)
-        subset_interval = replicate_interval(estimates, reached, confidence)
-        interval, n_effective = subset_interval, math.nan
-        if violation_weights:
-            n_effective = effective_number(violation_weights)
-            # alone, the interval of importance sampling covers the probability too rarely (docs/validation.md)
-            interval = enclose(weighted_interval(violation_weights, settings.confidence), subset_interval)
-            if n_effective < MIN_EFFECTIVE_VIOLATIONS:
-                reason = (
-                    f"Importance sampling has only {n_effective:.0f} effective violations, fewer than "
-                    f"{MIN_EFFECTIVE_VIOLATIONS:.0f}: its interval is not reliable. Use more cases, or --method subset."
-                )
-        verdict = RareVerdict.INSUFFICIENT if reason else decide(interval, settings.max_probability)
+        violation_weights: list[float] | None = None
+        shortfall = ""
+        for block, (replicates, random_cases) in enumerate(
+            zip(settings.replicates, settings.random_cases, strict=True)
+        ):
+            observer.begin("cases", random_cases + self._max_cases(replicates))
+            self._run_random(block, random_cases)
+            first = sum(settings.replicates[:block])
+            try:
+                results += self._run_replicates(range(first, first + replicates))
+                if settings.method == "importance" and block == 0:
+                    observer.begin("cases", settings.importance_cases)
+                    violation_weights = self._run_importance(results)
+                    if not violation_weights:
+                        shortfall = "The replicates found too few violations to fit a density for importance sampling."
+            except CaseLimitError as error:
+                shortfall = f"The limit of cases was reached: {error}."
+        sample = RareSample(
+            results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
+        )
+        evaluations = len(settings.replicates)
+        decision = decide_rare(sample, settings.max_probability, settings.confidence, evaluations)
         evidence = self._runner.evidence
-        if verdict is RareVerdict.PASS and evidence.excludes_pass:
-            verdict, reason = RareVerdict.INSUFFICIENT, f"The verdict would be PASS. {evidence.text}"
-        additional = None
-        if verdict is RareVerdict.INSUFFICIENT and not violation_weights:
-            next_interval = replace(subset_interval, confidence=0.5 * (1.0 + confidence))
-            replicates_needed = additional_replicates(next_interval, len(results), settings.max_probability)
-            cases_per_replicate = self._runner.n_cases / len(results)
-            additional = None if replicates_needed is None else math.ceil(replicates_needed * cases_per_replicate)
-        return self._finish(verdict, interval, results, subset_interval, n_effective, additional, reason)
-
-    def _finish(
-        self,
-        verdict: RareVerdict,
-        interval: ProbabilityInterval,
-        results: Sequence[SubsetResult],
-        subset_interval: ProbabilityInterval,
-        n_effective: float,
-        additional: int | None,
-        reason: str,
-    ) -> RareResult:
-        """Create the result; compute the number of independent cases for an interval of the same relative width."""
-        # the rate of n independent cases has the interval p exp(+-z sqrt((1 - p) / (n p)))
-        width = math.log(interval.upper / interval.lower) if interval.lower > 0.0 else math.inf
-        p = interval.estimate
-        z = float(ndtri(0.5 * (1.0 + interval.confidence)))
-        counting_cases = (2.0 * z / width) ** 2 * (1.0 - p) / p if 0.0 < width < math.inf and p > 0.0 else math.nan
-        replicates = tuple(Replicate(item.probability, item.reached, item.thresholds) for item in results)
+        if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
+            reason = f"The verdict would be PASS. {evidence.text}"
+            decision = replace(decision, verdict=RareVerdict.INSUFFICIENT, basis=Basis.NONE, reason=reason)
+        replicates_run = tuple(
+            Replicate(item.probability, item.reached, item.end.value, item.thresholds) for item in results
+        )
         return RareResult(
-            verdict,
-            interval,
+            decision.verdict,
+            decision,
             self._runner.n_cases,
             self._violations,
-            replicates,
-            subset_interval,
-            n_effective,
-            additional,
-            counting_cases,
+            replicates_run,
             describe_margin(self._requirement),
-            reason,
         )
 
     def _max_cases(self, replicates: int) -> int:
         """Compute the number of cases of replicates that reach their least likely level."""
-        min_probability = _MIN_PROBABILITY_FRACTION * self._settings.max_probability
+        min_probability = MIN_PROBABILITY_FRACTION * self._settings.max_probability
         levels = math.ceil(math.log(min_probability) / math.log(LEVEL_FRACTION))
         return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
 
@@ -275,10 +231,19 @@ class _Study:
         """Create a random generator of the study, which does not depend on the cases."""
         return Streams(self._campaign.configuration.seed, self._campaign.configuration.name, 0).generator(name)
 
+    def _run_random(self, block: int, count: int) -> None:
+        """Run independent cases of the nominal distribution."""
+        rng = self._generator(f"random cases {block}")
+        coordinates = rng.standard_normal((count, len(self._campaign.drawn_paths)))
+        for first in range(0, count, _RANDOM_BATCH):
+            batch = coordinates[first : first + _RANDOM_BATCH]
+            self._reserved_cases -= len(batch)
+            list(self._evaluate([Proposals(batch, [new_blend()] * len(batch), is_independent=True)]))
+
     def _run_replicates(self, numbers: range) -> list[SubsetResult]:
         """Run subset simulations in parallel: the next cases of all of them are evaluated together."""
         settings, dimension = self._settings, len(self._campaign.drawn_paths)
-        min_probability = _MIN_PROBABILITY_FRACTION * settings.max_probability
+        min_probability = MIN_PROBABILITY_FRACTION * settings.max_probability
         simulations = {
             number: subset_simulation(
                 dimension, settings.samples, min_probability, self._generator(f"subset simulation {number}")
@@ -307,9 +272,15 @@ class _Study:
             Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
             for point, blend in zip(coordinates, blends, strict=True)
         ]
-        rows = self._runner.run(candidates)
+        rows = self._runner.run(candidates, self._reserved_cases)
         margins = np.array([compute_margin(row, self._requirement) for row in rows])
         self._violations += int(np.sum(margins < 0.0))
+        is_independent = [group.is_independent for group in proposals for _ in group.blends]
+        for row, margin, is_counted in zip(rows, margins, is_independent, strict=True):
+            if is_counted:
+                terrain = row.get("terrain")
+                self._is_violation.append(bool(margin < 0.0))
+                self._terrains.append(None if terrain is None else str(terrain))
         numbered = [
             tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
             for case, blend in enumerate(blends, start=first)

@@ -113,14 +113,15 @@ class PointRunner:
         """Kind of evidence of the study's seed."""
         return Evidence.read(record.read(self._directory).get("evidence"))
 
-    def run(self, candidates: Sequence[Candidate]) -> list[Row]:
+    def run(self, candidates: Sequence[Candidate], reserved_cases: int = 0) -> list[Row]:
         """Evaluate points in parallel; return their rows in the same order.
 
+        reserved_cases: number of cases, out of the limit, that these points cannot use
         Raises CaseLimitError before the first case beyond the limit, StoreError if a stored row has another point, and
         CampaignError if none of the first cases finished.
         """
         first = self.n_cases
-        limit = self._campaign.configuration.total_cases
+        limit = self._campaign.configuration.total_cases - reserved_cases
         if first + len(candidates) > limit:
             raise CaseLimitError(f"the study needs more than {limit} cases")
         points = {case: item.point(case) for case, item in enumerate(candidates, start=first)}
@@ -222,14 +223,25 @@ def start_study(
         return _run_study(study_campaign, directory, session, settings)
 
 
-def continue_study(directory: Path, session: StudySession[Result], settings: Mapping[str, Any]) -> Result:
-    """Continue a stored study; `settings` replace the stored ones. Raises CampaignError if the program has changed."""
+def continue_study(
+    directory: Path, session: StudySession[Result], settings: Mapping[str, Any], additional_cases: int = 0
+) -> Result:
+    """Continue a stored study; `settings` replace the stored ones, and its limit of cases increases.
+
+    Raises CampaignError if the program has changed.
+    """
     with record.folder_lock(directory):
-        campaign = load_stored_campaign(directory, record.stored_configuration(directory))
+        configuration = record.stored_configuration(directory)
+        if additional_cases:
+            blocks = (*configuration.appended, additional_cases)
+            configuration = configuration.model_copy(update={"appended": blocks})
+        campaign = load_stored_campaign(directory, configuration)
         check_identity(campaign, directory)
         stored = record.read(directory)
         description = record.describe_session("resume", session.executor.describe(), int(stored["cases_finished"]))
-        changes = {"state": "running", "finished_utc": None, "sessions": [*stored["sessions"], description]}
+        changes: dict[str, Any] = {"state": "running", "finished_utc": None}
+        changes["sessions"] = [*stored["sessions"], description]
+        changes.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, {**changes, STUDY_KEY: dict(settings)})
         return _run_study(campaign, directory, session, settings)
 

@@ -9,6 +9,9 @@ the same step: a new stream is blended into the previous ones (`marsyard.sim.str
 
 The estimated coefficient of variation of one run is too small, because its chains are correlated. Intervals therefore
 use the spread of independent replicates (`marsyard.campaigns.studies.interval`).
+
+The chains find a violation only if the margin falls to it through the levels. A violation without intermediate margins
+is found at its own rate per case, as by counting.
 """
 
 from __future__ import annotations
@@ -16,9 +19,10 @@ from __future__ import annotations
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from marsyard.sim.streams import Blend
 
@@ -26,6 +30,8 @@ from marsyard.sim.streams import Blend
 LEVEL_FRACTION = 0.1
 #: Target acceptance rate of the chains, to which their step is adapted, and initial step.
 _TARGET_ACCEPTANCE, _INITIAL_STEP = 0.44, 0.6
+#: Minimum number of cases below a plateau: the fraction of fewer cases is too uncertain for the product of fractions.
+_MIN_CASES_BELOW_PLATEAU = 5
 #: Stream number of a proposed case that gets new random streams.
 NEW_STREAM = -1
 
@@ -35,10 +41,14 @@ Margins = Float64[np.ndarray, " n"]
 
 @dataclass(frozen=True)
 class Proposals:
-    """Cases to be evaluated: coordinates, and components of their random streams; the last one is `NEW_STREAM`."""
+    """Cases to be evaluated: coordinates, and components of their random streams; the last one is `NEW_STREAM`.
+
+    is_independent: whether the cases are independent draws of the nominal distribution, which may be counted
+    """
 
     coordinates: Coordinates
     blends: Sequence[Blend]
+    is_independent: bool = False
 
 
 @dataclass(frozen=True)
@@ -52,20 +62,47 @@ class Evaluated:
     margins: Margins
 
 
+class SubsetEnd(StrEnum):
+    """Reason why a subset simulation ended."""
+
+    VIOLATION = "violations reached"
+    UNLIKELY = "level too unlikely"
+    PLATEAU = "plateau of the margin"
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level: its probability, and the new cases whose parent does not violate the requirement.
+
+    - probability: estimated probability of the level; 1 for the first one, whose cases have no parent
+    - drawn, entered: number of these cases, and of the violations among them
+    """
+
+    probability: float
+    drawn: int
+    entered: int
+
+
 @dataclass(frozen=True)
 class SubsetResult:
     """Result of one subset simulation.
 
-    - probability: estimated probability of a violation; the probability of the last level if `reached` is false
-    - reached: whether a violation was reached; otherwise `probability` is an upper limit
-    - thresholds: margin of each intermediate level
+    - probability: estimated probability of a violation; if the simulation ended early, that of its last level
+    - end: reason why it ended; only `SubsetEnd.VIOLATION` gives an estimate
+    - thresholds: margin of each intermediate level; levels: all levels with the first one
     - violations: coordinates of the violating cases of the last level
     """
 
     probability: float
-    reached: bool
+    end: SubsetEnd
     thresholds: tuple[float, ...]
+    levels: tuple[Level, ...]
     violations: Coordinates
+
+    @property
+    def reached(self) -> bool:
+        """Whether the probability is an estimate."""
+        return self.end is SubsetEnd.VIOLATION
 
 
 #: Coroutine that yields cases to be evaluated, receives their margins, and returns the result.
@@ -78,28 +115,34 @@ def subset_simulation(dimension: int, samples: int, min_probability: float, rng:
     `dimension` is the number of standard normal variables.
     """
     coordinates = rng.standard_normal((samples, dimension))
-    evaluated = yield Proposals(coordinates, [new_blend()] * samples)
+    evaluated = yield Proposals(coordinates, [new_blend()] * samples, is_independent=True)
     blends, margins = list(evaluated.blends), evaluated.margins
     probability, step, thresholds = 1.0, _INITIAL_STEP, list[float]()
+    levels = [Level(1.0, samples, int(np.sum(margins < 0.0)))]
     while True:
         is_violation = margins < 0.0
         threshold = _next_threshold(margins)
-        if threshold is None or is_violation.mean() >= LEVEL_FRACTION or probability < min_probability:
-            reached = bool(is_violation.any())
-            fraction = float(is_violation.mean()) if reached else 1.0
-            return SubsetResult(probability * fraction, reached, tuple(thresholds), coordinates[is_violation])
+        end = _find_end(is_violation, threshold, probability < min_probability)
+        if end is not None:
+            fraction = float(is_violation.mean()) if end is SubsetEnd.VIOLATION else 1.0
+            return SubsetResult(
+                probability * fraction, end, tuple(thresholds), tuple(levels), coordinates[is_violation]
+            )
         thresholds.append(threshold)
         seeds = rng.permutation(np.flatnonzero(margins <= threshold))
         probability *= seeds.size / samples
         # all chains advance together; the cases of the level are the states of the chains, including the seeds
         points, point_blends, point_margins = coordinates[seeds], [blends[seed] for seed in seeds], margins[seeds]
         level_points, level_blends, level_margins = [points], list(point_blends), [point_margins]
+        drawn = entered = 0
         for chain_step in range(1, math.ceil(samples / seeds.size)):
             size = min(seeds.size, samples - chain_step * seeds.size)
             points, point_blends, point_margins = points[:size], point_blends[:size], point_margins[:size]
             proposed_points = math.sqrt(1.0 - step**2) * points + step * rng.standard_normal(points.shape)
             evaluated = yield Proposals(proposed_points, [new_blend(blend, step) for blend in point_blends])
-            is_accepted = evaluated.margins <= threshold
+            is_accepted, has_safe_parent = evaluated.margins <= threshold, point_margins >= 0.0
+            drawn += int(has_safe_parent.sum())
+            entered += int(np.sum(has_safe_parent & (evaluated.margins < 0.0)))
             points = np.where(is_accepted[:, None], proposed_points, points)
             choices = zip(is_accepted, evaluated.blends, point_blends, strict=True)
             point_blends = [proposed if accepted else previous for accepted, proposed, previous in choices]
@@ -110,6 +153,7 @@ def subset_simulation(dimension: int, samples: int, min_probability: float, rng:
             log_step_change = (float(is_accepted.mean()) - _TARGET_ACCEPTANCE) / math.sqrt(chain_step)
             step = min(step * math.exp(log_step_change), 1.0)
         coordinates, blends, margins = np.concatenate(level_points), level_blends, np.concatenate(level_margins)
+        levels.append(Level(probability, drawn, entered))
 
 
 def new_blend(previous: Blend = (), step: float = 1.0) -> Blend:
@@ -119,18 +163,30 @@ def new_blend(previous: Blend = (), step: float = 1.0) -> Blend:
     return (*older, (NEW_STREAM, step if older else 1.0))
 
 
-def _next_threshold(margins: Margins) -> float | None:
-    """Select the threshold of the next level: a quantile of the margins; None if no lower level exists.
+def _find_end(is_violation: Bool[np.ndarray, " n"], threshold: float, is_unlikely: bool) -> SubsetEnd | None:
+    """Return the reason to end the simulation at a level; None to continue.
 
-    Equal margins (infinite ones, for example) may cover the quantile. The threshold is then the next lower margin.
+    threshold: that of the next level. It is below 0 if all cases below a plateau are violations, and NaN if too few
+    cases are below it.
+    """
+    if is_violation.mean() >= LEVEL_FRACTION or threshold < 0.0:
+        return SubsetEnd.VIOLATION
+    if math.isnan(threshold):
+        return SubsetEnd.PLATEAU
+    return SubsetEnd.UNLIKELY if is_unlikely else None
+
+
+def _next_threshold(margins: Margins) -> float:
+    """Select the threshold of the next level: a quantile of the margins.
+
+    On a plateau, equal margins (infinite ones, for example) cover the quantile and all larger margins. The threshold is
+    then the next lower margin, or NaN if too few cases have a lower margin.
     """
     sorted_margins = np.sort(margins)
     index = round(LEVEL_FRACTION * sorted_margins.size)
     below, above = float(sorted_margins[index - 1]), float(sorted_margins[index])
     threshold = 0.5 * (below + above) if math.isfinite(below + above) else below
-    if threshold >= sorted_margins[-1]:
-        lower_margins = sorted_margins[sorted_margins < sorted_margins[-1]]
-        if lower_margins.size == 0:
-            return None
-        threshold = float(lower_margins[-1])
-    return threshold if threshold >= 0.0 else 0.0
+    if threshold < sorted_margins[-1]:
+        return threshold
+    lower_margins = sorted_margins[sorted_margins < sorted_margins[-1]]
+    return float(lower_margins[-1]) if lower_margins.size >= _MIN_CASES_BELOW_PLATEAU else math.nan

@@ -173,8 +173,11 @@ def append(
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
     allow_changed: options.ChangedOption = False,
+    random: Annotated[
+        bool, Option("--random", help="For a study of `marsyard rare`: N are random cases instead of replicates.")
+    ] = False,
 ) -> None:
-    """Add cases to a finished campaign (or replicates to a study of rare violations), run them, and evaluate all."""
+    """Add cases to a finished campaign (or replicates or cases to a study of rare violations), and evaluate all."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.record import stored_configuration
@@ -182,7 +185,9 @@ def append(
     from marsyard.cli.studies import contains_study, continue_study
 
     if contains_study(directory):
-        continue_study(directory, jobs, cluster, cases)
+        continue_study(directory, jobs, cluster, cases, is_random=random)
+    if random:
+        raise CampaignError(f"--random is for studies of `marsyard rare`; {directory} contains a campaign")
     if stored_configuration(directory).max_cases is not None:
         raise CampaignError(f"{directory} was run with --until-decided: cases added afterwards would bias the verdict")
     outcome.print_limits(campaign_with_block(directory, cases))

@@ -72,19 +72,29 @@ class RareOptions(StudyOptions):
     ] = "subset"
     samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
     replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6
+    random_cases: Annotated[
+        int,
+        Option(
+            metavar="N",
+            help="Independent random cases. PASS rests on them and on the first level of each replicate. They do not "
+            "count for --max-cases.",
+        ),
+    ] = 600
     importance_cases: Annotated[
         int, Option(metavar="N", help="Cases of importance sampling, for --method importance.")
     ] = 600
-    confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the interval.")] = 0.9
+    confidence: Annotated[
+        float, Option(metavar="C", help="Two-sided confidence: PASS and FAIL are each wrong at most with (1 - C) / 2.")
+    ] = 0.9
     max_cases: MaxCasesOption = 20_000
 
 
 @options.handle_user_errors
 @options.with_options(RareOptions)
 def rare(arguments: RareOptions) -> None:
-    """Estimate the probability of a rare violation of a requirement by subset simulation, and compare it with a limit.
+    """Compare the probability of a rare violation of a requirement with a limit, by counting and by subset simulation.
 
-    Exit status: 0 if the probability is below the limit, 1 if above, 3 if undecided.
+    Exit status: 0 if the probability is below the limit by counting, 1 if it is above, 3 if undecided.
     """
     from marsyard.campaigns.studies.rare import RareSettings, start_rare
 
@@ -94,6 +104,7 @@ def rare(arguments: RareOptions) -> None:
         arguments.method,
         arguments.samples,
         (arguments.replicates,),
+        (arguments.random_cases,),
         arguments.importance_cases,
         arguments.confidence,
     )
@@ -182,8 +193,13 @@ def contains_study(directory: Path) -> bool:
     return read_study(directory) is not None
 
 
-def continue_study(directory: Path, jobs: int | None, cluster: str | None, additional: int = 0) -> NoReturn:
-    """Continue the study in a folder, with a number of additional replicates; exit with the status of its verdict."""
+def continue_study(
+    directory: Path, jobs: int | None, cluster: str | None, additional: int = 0, *, is_random: bool = False
+) -> NoReturn:
+    """Continue the study in a folder, and exit with the status of its verdict.
+
+    additional: number of replicates to add, or of random cases if `is_random`
+    """
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.studies import budget as budget_study
     from marsyard.campaigns.studies import rare as rare_study
@@ -205,7 +221,8 @@ def continue_study(directory: Path, jobs: int | None, cluster: str | None, addit
             budget_result = budget_study.continue_budget(directory, executor, progress)
         finish_budget(directory, budget_result)
     with show_progress(directory, next_command) as progress:
-        rare_result = rare_study.continue_rare(directory, executor, progress, additional)
+        replicates, random_cases = (0, additional) if is_random else (additional, 0)
+        rare_result = rare_study.continue_rare(directory, executor, progress, replicates, random_cases)
     finish_rare(directory, rare_result)
 
 

@@ -47,7 +47,8 @@ class LimitStateParameters(BaseModel):
     """The load is ``100 + u - beta`` with the standard normal number u; its bound is 100.
 
     ``u = sqrt(1 - noise**2) (loads[0] + loads[1]) / sqrt(2) + noise n``, with a standard normal random number n.
-    `kind` has no effect.
+    `kind` has no effect. `terrain` is the number of a terrain. With `step`, all margins are 1, except those of loads[1]
+    above 6, which are violations: their probability is 1e-9.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -57,6 +58,8 @@ class LimitStateParameters(BaseModel):
     noise: float = 0.0
     beta: float = 3.0
     sleep_s: float = 0.0
+    terrain: int = -1
+    step: bool = False
 
 
 class LimitStateScenario:
@@ -76,5 +79,9 @@ class LimitStateScenario:
         noise = float(streams.generator("noise").standard_normal())
         u = math.sqrt(1.0 - parameters.noise**2) * sum(parameters.loads) / math.sqrt(2.0) + parameters.noise * noise
         margin = parameters.beta - u
+        if parameters.step:
+            margin = -1.0 if parameters.loads[1] > 6.0 else 1.0
         row = {"load": 100.0 - margin, "is_safe": margin >= 0.0, "safety_margin": margin, "noise": noise}
+        if parameters.terrain >= 0:
+            row["terrain"] = parameters.terrain
         return CaseResult("VALID", True, row, {})

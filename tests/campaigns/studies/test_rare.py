@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,14 +18,14 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.studies.interval import RareVerdict
+from marsyard.campaigns.studies.decision import Basis, RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
 
 #: With a confidence of 0.99, the intervals of the fixed seeds contain the true probability norm.sf(3) = 0.00135.
-SETTINGS = RareSettings("LOAD", 5e-2, samples=100, replicates=(4,), confidence=0.99)
+SETTINGS = RareSettings("LOAD", 5e-2, samples=100, replicates=(4,), random_cases=(50,), confidence=0.99)
 #: Columns that differ between repeated runs.
 TIMES = ("wall_time_s", "cpu_time_s")
 
@@ -51,9 +52,13 @@ def rows_without_times(directory: Path) -> list[dict[str, object]]:
 @pytest.mark.parametrize("noise", [0.0, 0.6])
 def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, noise: float) -> None:
     result = run_study(campaign_path, tmp_path / "run", SETTINGS, f"noise={noise}")
-    assert result.interval.lower < norm.sf(3.0) < result.interval.upper
-    is_met = result.interval.upper <= SETTINGS.max_probability
-    assert result.verdict is (RareVerdict.PASS if is_met else RareVerdict.INSUFFICIENT)
+    interval, counting = result.decision.interval, result.decision.counting
+    assert interval.lower < norm.sf(3.0) < interval.upper
+    # 50 random cases, and 100 of the first level of each of 4 replicates
+    assert counting.cases == counting.units == 450
+    assert counting.upper > norm.sf(3.0)
+    assert result.verdict is RareVerdict.PASS
+    assert result.decision.basis is Basis.COUNTING
     assert 0 < result.cases == len(read_case_rows(tmp_path / "run"))
     assert result.violations == sum(row["load"] > 100.0 for row in read_case_rows(tmp_path / "run"))
 
@@ -62,19 +67,21 @@ def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, 
 def test_importance_sampling_interval_contains_the_probability(campaign_path: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, max_probability=1e-2, method="importance", replicates=(3,), importance_cases=300)
     result = run_study(campaign_path, tmp_path / "run", settings)
-    assert result.effective_violations > 30.0
-    with pytest.raises(CampaignError, match="importance sampling cannot be extended"):
-        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=2)
-    assert result.interval.lower < norm.sf(3.0) < result.interval.upper
-    assert result.interval.lower <= result.subset_interval.lower
-    assert result.interval.upper >= result.subset_interval.upper
+    assert result.decision.effective_violations is not None
+    assert result.decision.effective_violations > 30.0
+    with pytest.raises(CampaignError, match="no replicates can be added to a study with importance sampling"):
+        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), replicates=2)
+    assert result.decision.interval.lower < norm.sf(3.0) < result.decision.interval.upper
+    extended = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), random_cases=40)
+    assert extended.decision.counting.cases == result.decision.counting.cases + 40
+    assert extended.decision.effective_violations == result.decision.effective_violations
 
 
 @pytest.mark.slow
 def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: Path) -> None:
     by_bound = run_study(campaign_path, tmp_path / "bound")
     by_margin = run_study(campaign_path, tmp_path / "margin", replace(SETTINGS, requirement="MARGIN"))
-    assert by_margin.interval == by_bound.interval
+    assert by_margin.decision == by_bound.decision
 
 
 @pytest.mark.slow
@@ -82,9 +89,10 @@ def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: 
 def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
     sizes = ["--samples", "50", "--replicates", "2", "--set", "sleep_s=0.03"]
+    sizes += ["--random-cases", "20"]
     arguments = ["rare", str(campaign_path), "--requirement", "LOAD", "--max-probability", "0.1", *sizes]
     resume_result = kill_and_resume(arguments, killed_run, log_bytes=12_000)
-    settings = RareSettings("LOAD", 0.1, samples=50, replicates=(2,))
+    settings = RareSettings("LOAD", 0.1, samples=50, replicates=(2,), random_cases=(20,))
     reference = run_study(campaign_path, reference_run, settings, "sleep_s=0.03", max_cases=20_000)
     assert resume_result.returncode == reference.exit_code, resume_result.stderr
     assert "Probability of a violation per case" in resume_result.stdout
@@ -96,13 +104,15 @@ def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path
 def test_additional_replicates_narrow_the_interval(campaign_path: Path, tmp_path: Path) -> None:
     first = run_study(campaign_path, tmp_path / "run")
     rows = rows_without_times(tmp_path / "run")
-    second = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), additional=5)
+    second = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), replicates=5)
     assert len(second.replicates) == 9
     assert second.replicates[:4] == first.replicates
-    # the second evaluation may spend half of the risk of 1 %
-    assert (first.interval.confidence, second.interval.confidence) == (0.99, 0.995)
+    # the second evaluation may use half of the risk of the first one, which has 0.5 % per side
+    intervals = first.decision.interval, second.decision.interval
+    assert [item.confidence for item in intervals] == pytest.approx([0.995, 0.9975])
+    assert second.decision.counting.cases == first.decision.counting.cases + 500
     assert rows_without_times(tmp_path / "run")[: len(rows)] == rows
-    assert second.interval.upper / second.interval.lower < first.interval.upper / first.interval.lower
+    assert intervals[1].upper / intervals[1].lower < intervals[0].upper / intervals[0].lower
 
 
 @pytest.mark.slow
@@ -117,14 +127,18 @@ def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
 
 
 def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_path: Path) -> None:
-    result = run_study(campaign_path, tmp_path / "run", max_cases=350)
+    settings = replace(SETTINGS, max_probability=1e-3)
+    result = run_study(campaign_path, tmp_path / "run", settings, max_cases=350)
     assert result.verdict is RareVerdict.INSUFFICIENT
-    assert "limit of cases" in result.reason
-    assert len(read_case_rows(tmp_path / "run")) <= 350
+    assert "limit of cases" in result.decision.reason
+    # the random cases are run nevertheless, and those that are added later
+    assert len(read_case_rows(tmp_path / "run")) <= 350 + 50
+    counting = continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch(), random_cases=30).decision.counting
+    assert counting.cases == result.decision.counting.cases + 30
 
 
 def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaign_path: Path, tmp_path: Path) -> None:
-    settings = RareSettings("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,))
+    settings = RareSettings("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,), random_cases=(0,))
     result = run_study(campaign_path, tmp_path / "run", settings)
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert result.exit_code == 3
@@ -153,6 +167,7 @@ def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> Non
         ("FLAG", {}, "only true or false"),
         ("LOAD", {"samples": 10}, "--samples 10"),
         ("LOAD", {"method": "guess"}, "--method guess: allowed: subset, importance"),
+        ("LOAD", {"random_cases": (-1,)}, "--random-cases -1: at least 0"),
         ("LOAD", {"replicates": (1,)}, "--replicates 1: at least 2"),
         ("LOAD", {"max_probability": 0.0}, "--max-probability"),
     ],
@@ -184,10 +199,11 @@ def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Pa
     command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--out", str(tmp_path / "run")]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    assert "LOAD: PASS." in result.stdout
+    assert "LOAD: PASS, by counting independent cases." in result.stdout
+    assert "independent random cases" in result.stdout
     data = json.loads((tmp_path / "run" / "report.json").read_text())
     assert (data["verdict"], data["exit_code"], data["verdicts"]) == ("PASS", 0, [])
-    assert data["sections"]["rare"]["interval"]["lower"] < norm.sf(3.0)
+    assert data["sections"]["rare"]["decision"]["interval"]["lower"] < norm.sf(3.0)
     page = (tmp_path / "run" / "report.html").read_text()
     assert "Probability of a rare violation" in page
     assert "No requirement is evaluated" not in page
@@ -198,4 +214,53 @@ def test_verdict_on_a_calibration_seed_cannot_be_pass(campaign_path: Path, tmp_p
     campaign_path.write_text(f'{CAMPAIGN}\n[calibration]\nnamespace = "test"\n\n{run}\n')
     result = run_study(campaign_path, tmp_path / "run")
     assert result.verdict is RareVerdict.INSUFFICIENT
-    assert result.reason.startswith("The verdict would be PASS. Calibrated on these cases")
+    assert result.decision.reason.startswith("The verdict would be PASS. Calibrated on these cases")
+
+
+def test_estimate_below_the_limit_is_no_pass(campaign_path: Path, tmp_path: Path) -> None:
+    """250 independent cases cannot exclude a violation at random in one of 1,000 cases, although the estimate does."""
+    settings = RareSettings("LOAD", 1e-3, samples=100, replicates=(2,), random_cases=(50,))
+    result = run_study(campaign_path, tmp_path / "run", settings, "beta=3.7")
+    assert result.verdict is RareVerdict.INSUFFICIENT
+    # 1 - 0.05^(1/250)
+    assert result.decision.counting.violations == 0
+    assert result.decision.counting.upper == pytest.approx(0.01191, rel=1e-3)
+
+
+def test_plateau_is_insufficient(campaign_path: Path, tmp_path: Path) -> None:
+    settings = RareSettings("LOAD", 1e-3, samples=50, replicates=(2,), random_cases=(0,))
+    result = run_study(campaign_path, tmp_path / "run", settings, "step=true")
+    assert result.verdict is RareVerdict.INSUFFICIENT
+    assert "2 of 2 replicates reached a plateau" in result.decision.reason
+    assert all(not item.reached for item in result.replicates)
+    assert result.decision.interval.upper == 1.0
+
+
+def test_cases_on_one_terrain_are_not_counted_as_independent(campaign_path: Path, tmp_path: Path) -> None:
+    settings = RareSettings("LOAD", 5e-2, samples=100, replicates=(2,), random_cases=(50,))
+    # without terrains, 250 cases without a violation are enough for a limit of 5 %
+    assert run_study(campaign_path, tmp_path / "cases", settings, "beta=5").verdict is RareVerdict.PASS
+    terrain = 'terrain = { distribution = "integer", low = 0, high = 9 }'
+    campaign_path.write_text(CAMPAIGN.replace("[dispersions]", f"[dispersions]\n{terrain}"))
+    result = run_study(campaign_path, tmp_path / "terrains", settings, "beta=5")
+    assert result.verdict is RareVerdict.INSUFFICIENT
+    assert (result.decision.counting.cases, result.decision.counting.units) == (250, 10)
+    assert result.decision.additional_random_cases is not None
+
+
+@pytest.mark.slow
+def test_printed_number_of_random_cases_decides(campaign_path: Path, tmp_path: Path) -> None:
+    directory = tmp_path / "run"
+    options = ["--max-probability", "1e-2", "--samples", "50", "--replicates", "2", "--random-cases", "50"]
+    command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), "--requirement", "LOAD", *options]
+    command += ["--set", "beta=5", "--jobs", "1", "--max-cases", "1500", "--out", str(directory)]
+    first = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert first.returncode == 3, first.stderr
+    # the second evaluation has a risk of 2.5 %: 367.0 = ln(0.025) / ln(0.99) cases, of which 150 are finished
+    advice = re.search(r"marsyard append DIR (\d+) --random", first.stdout)
+    assert advice is not None
+    assert int(advice[1]) == 368 - 150
+    arguments = [sys.executable, "-m", "marsyard", "append", str(directory), advice[1], "--random", "--jobs", "1"]
+    second = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert second.returncode == 0, second.stderr
+    assert "from 0 violations in 368 independent random cases" in second.stdout

@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from benchmarks.validation.rare_checks import LimitState, linear_margin, run_subset
+from benchmarks.validation.limit_states import LimitState, linear_margin, plateau_margin, run_subset
 from marsyard.campaigns.studies.importance import fit_density
-from marsyard.campaigns.studies.interval import (
-    ProbabilityInterval,
-    additional_replicates,
-    decide,
-    replicate_interval,
-    weighted_interval,
-)
-from marsyard.campaigns.studies.subset import SubsetResult
+from marsyard.campaigns.studies.interval import additional_replicates, replicate_interval, weighted_interval
+from marsyard.campaigns.studies.subset import SubsetEnd, SubsetResult
 from marsyard.sim.streams import Blend
 
 
@@ -49,9 +43,7 @@ def test_intervals_of_replicates_cover_the_probability() -> None:
     margins = linear_margin(10, 1e-3)
     for _ in range(100):
         results = [run_with_random_seed(margins, 10, 100, rng)[0] for _ in range(4)]
-        interval = replicate_interval(
-            [result.probability for result in results], [result.reached for result in results], 0.9
-        )
+        interval = replicate_interval([result.probability for result in results], 0.9)
         n_covering += interval.lower <= 1e-3 <= interval.upper
     # coverage of 90 %: mean 90 of 100, standard deviation sqrt(100 * 0.9 * 0.1) = 3
     assert n_covering >= 82
@@ -77,15 +69,46 @@ def test_cases_outside_the_population_do_not_bias_the_estimate() -> None:
     assert np.mean(estimates) == pytest.approx(0.05 * norm.sf(2.5), rel=0.4)
 
 
-def test_margin_without_intermediate_values_gives_an_upper_limit() -> None:
-    """All cases of the first level have the same margin, so the simulation cannot approach the violations."""
+@pytest.mark.parametrize("plateau", [1.0, 0.0, math.inf])
+def test_plateau_ends_the_simulation_without_an_estimate(plateau: float) -> None:
+    """All cases of the first level have the same margin; a margin of 0 is no violation."""
     rng = np.random.default_rng(5)
     result, cases = run_with_random_seed(
-        lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, 1.0), 2, 100, rng
+        lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, plateau), 2, 100, rng
     )
+    assert result.end is SubsetEnd.PLATEAU
     assert not result.reached
-    assert result.probability == 1.0
     assert cases == 100
+
+
+def test_few_cases_below_a_plateau_give_no_estimate() -> None:
+    """2 of 200 cases are below the plateau on average; their number is too uncertain for an estimate."""
+    rng = np.random.default_rng(15)
+    ends = [run_with_random_seed(plateau_margin(0.99, 1e-4), 2, 200, rng)[0].end for _ in range(50)]
+    # 5 or more of 200 cases have the probability 5 %: 2.6 of 50 simulations continue on average
+    assert ends.count(SubsetEnd.PLATEAU) >= 40
+
+
+def test_step_with_a_tenth_of_a_level_is_an_estimate() -> None:
+    """Violations are the only cases below a plateau, and have the probability 7 % (1.476: 93 % quantile)."""
+    rng = np.random.default_rng(16)
+    result, cases = run_with_random_seed(
+        lambda coordinates, _: np.where(coordinates[:, 0] > 1.476, -1.0, 0.0), 2, 400, rng
+    )
+    assert result.reached
+    assert result.probability == pytest.approx(0.07, abs=0.04)
+    assert cases == 400
+
+
+def test_levels_count_violations_whose_parent_is_safe() -> None:
+    rng = np.random.default_rng(17)
+    result, _ = run_with_random_seed(linear_margin(5, 1e-3), 5, 200, rng)
+    first, *later = result.levels
+    assert (first.probability, first.drawn) == (1.0, 200)
+    assert len(later) == len(result.thresholds)
+    assert [level.probability for level in later] == pytest.approx([0.1 ** (n + 1) for n in range(len(later))])
+    assert all(0 <= level.entered <= level.drawn <= 180 for level in later)
+    assert later[-1].entered > 0
 
 
 @pytest.mark.parametrize("dimension", [2, 20])
@@ -116,28 +139,13 @@ def test_too_few_violations_have_no_density() -> None:
     assert fit_density(np.ones((9, 2))) is None
 
 
-def test_replicate_without_violation_has_no_lower_bound() -> None:
-    """Arguments: estimates of two replicates, whether each reached a violation, and the confidence."""
-    interval = replicate_interval([1e-4, 1e-5], [True, False], 0.9)
-    assert interval.lower == 0.0
-    assert interval.upper >= 1e-4
-
-
 def test_interval_needs_two_replicates() -> None:
     with pytest.raises(ValueError, match="at least 2 replicates"):
-        replicate_interval([1e-4], [True], 0.9)
-
-
-@pytest.mark.parametrize(
-    ("lower", "upper", "verdict"), [(1e-6, 1e-4, "PASS"), (2e-4, 1e-3, "FAIL"), (5e-5, 5e-4, "INSUFFICIENT")]
-)
-def test_verdict_compares_the_bounds_with_the_limit(lower: float, upper: float, verdict: str) -> None:
-    interval = ProbabilityInterval(math.sqrt(lower * upper), lower, upper, confidence=0.9, log_sd=0.4)
-    assert decide(interval, 1e-4) == verdict
+        replicate_interval([1e-4], 0.9)
 
 
 def test_more_replicates_are_needed_near_the_limit() -> None:
-    interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], [True] * 4, 0.9)
+    interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], 0.9)
     near_limit, far_from_limit = (
         additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4)
     )
