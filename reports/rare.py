@@ -111,7 +111,7 @@ def _remedies(study: Mapping[str, Any], decision: Mapping[str, Any]) -> list[str
         counting = table(decision["counting"])
         unit = "random cases" if counting["units"] == counting["cases"] else "random cases, each on a new terrain,"
         sentences.append(
-            f"PASS needs about {random_cases:,} additional {unit} without a violation: "
+            f"PASS needs {random_cases:,} additional {unit} without a violation: "
             f"marsyard append DIR {random_cases} --random."
         )
     if replicates:

@@ -20,6 +20,7 @@ from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.decision import Basis, RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
+from marsyard.reports.evaluation import evaluate_run
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
@@ -264,3 +265,23 @@ def test_printed_number_of_random_cases_decides(campaign_path: Path, tmp_path: P
     second = subprocess.run(arguments, capture_output=True, text=True, check=False)
     assert second.returncode == 0, second.stderr
     assert "from 0 violations in 368 independent random cases" in second.stdout
+
+
+def test_verdict_of_an_earlier_version_is_not_kept(campaign_path: Path, tmp_path: Path) -> None:
+    """Results without a counting bound assumed a continuous margin."""
+    assert run_study(campaign_path, tmp_path / "run").exit_code == 0
+    assert evaluate_run(tmp_path / "run").exit_code == 0
+    study = record.read(tmp_path / "run")["study"]
+    result = {name: value for name, value in study["result"].items() if name != "decision"}
+    record.update(tmp_path / "run", {"study": {**study, "result": result}})
+    assert evaluate_run(tmp_path / "run").exit_code == 3
+
+
+def test_random_cases_are_rejected_for_a_campaign(campaign_path: Path, tmp_path: Path) -> None:
+    directory = str(tmp_path / "run")
+    run = ["marsyard", "run", str(campaign_path), "--cases", "5", "--jobs", "1", "--out", directory]
+    subprocess.run([sys.executable, "-m", *run], capture_output=True, check=False)
+    command = [sys.executable, "-m", "marsyard", "append", directory, "10", "--random"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert "--random is for studies" in " ".join(result.stderr.split())

@@ -1,0 +1,77 @@
+"""Tests of the sentences on a study of rare violations."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marsyard.campaigns.studies.decision import RareSample, decide_rare
+from marsyard.campaigns.studies.runner import convert_to_json
+from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
+from marsyard.reports.rare import read_result, result_sentences
+
+
+def create_study(limit: float, violations: int, cases: int, terrains: int = 0, probability: float = 1e-4) -> Any:
+    """Create the stored settings and the result of a study with four replicates around a probability."""
+    replicates = [
+        SubsetResult(factor * probability, SubsetEnd.VIOLATION, (2.0, 1.0), (Level(1.0, 50, 0),), np.zeros((1, 2)))
+        for factor in (0.8, 1.0, 1.3, 0.9)
+    ]
+    names = [f"terrain {case % terrains}" if terrains else None for case in range(cases)]
+    decision = decide_rare(RareSample(replicates, np.arange(cases) < violations, names), limit, 0.9)
+    result = {"verdict": decision.verdict, "decision": asdict(decision), "cases": 3000, "violations": 40}
+    result |= {"replicates": [], "margin_text": "The margin is 5 - |error|."}
+    return {
+        "kind": "rare", "requirement": "VEL", "method": "subset", "max_probability": limit,
+        "result": convert_to_json(result),
+    }  # fmt: skip
+
+
+def test_pass_states_the_counting_bound() -> None:
+    sentences = result_sentences(create_study(1e-2, 0, 1000))
+    assert sentences[0] == "VEL: PASS, by counting independent cases."
+    # 1 - 0.05^(1/1000) = 0.0030
+    assert sentences[1] == (
+        "Probability of a violation per case by counting: at most 0.003 (95 % confidence), from 0 violations in 1,000 "
+        "independent random cases. The limit is 0.01."
+    )
+    assert not any("marsyard append" in sentence for sentence in sentences)
+
+
+def test_estimate_below_the_limit_states_the_random_cases_that_decide() -> None:
+    text = " ".join(result_sentences(create_study(1e-3, 0, 1000)))
+    assert "VEL: INSUFFICIENT." in text
+    assert "Subset simulation estimates 0.0001" in text
+    assert "no PASS rests on it" in text
+    # ln(0.025) / ln(0.999) = 3,687.04 cases at half of the risk, without the 1,000 finished ones
+    assert "PASS needs 2,688 additional random cases without a violation: marsyard append DIR 2688 --random." in text
+
+
+def test_estimate_above_the_limit_states_the_replicates_that_decide() -> None:
+    text = " ".join(result_sentences(create_study(8e-5, 0, 1000)))
+    assert "would decide the verdict if the estimate remains: marsyard append DIR" in text
+    assert "--random" not in text
+
+
+def test_fail_states_its_assumption() -> None:
+    sentences = result_sentences(create_study(1e-5, 0, 1000))
+    assert sentences[0] == "VEL: FAIL, by the interval of the simulations; it assumes a continuous margin."
+
+
+def test_shared_terrains_are_stated() -> None:
+    text = " ".join(result_sentences(create_study(1e-2, 0, 1000, terrains=50)))
+    assert "1,000 independent random cases on 50 terrains, which are counted instead of cases" in text
+    assert "each on a new terrain" in text
+
+
+@pytest.mark.parametrize("study", [{}, {"kind": "search", "result": {"violations": 1}}])
+def test_other_studies_have_no_sentences(study: dict[str, Any]) -> None:
+    assert result_sentences(read_result({"study": study})) == []
+
+
+def test_result_without_a_counting_bound_is_not_read() -> None:
+    study = {"kind": "rare", "requirement": "VEL", "max_probability": 1e-2, "result": {"verdict": "PASS"}}
+    assert read_result({"study": study}) == {}
