@@ -6,7 +6,7 @@ with the known probability, so that only the replicates evaluate margins.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,6 +16,7 @@ from benchmarks.validation.limit_states import KnownState, discontinuous_states,
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.counting import find_units_needed
 from marsyard.campaigns.studies.decision import Decision, RareSample, RareVerdict, decide_rare
+from marsyard.campaigns.studies.interval import replicate_interval
 from marsyard.campaigns.studies.rare import MIN_PROBABILITY_FRACTION, RareSettings
 from marsyard.campaigns.studies.subset import SubsetResult
 
@@ -53,51 +54,70 @@ def simulate_study(state: KnownState, limit: float, seed: int) -> SimulatedStudy
     return SimulatedStudy(results, first_violations, np.random.default_rng((seed, 53)))
 
 
-def count_verdicts(
-    state: KnownState, ratio: float, trials: int, first_seed: int
-) -> tuple[dict[RareVerdict, float], dict[RareVerdict, float]]:
-    """Return the rate of each verdict at a limit of `ratio` times the true probability.
+@dataclass(frozen=True)
+class VerdictRates:
+    """Rates of the verdicts of simulated studies.
 
-    The rates of the first table are for the default number of random cases. Those of the second are for the number with
-    which the counting bound without a violation reaches the limit.
+    - default: with the default number of random cases
+    - counting: with as many random cases as the counting bound needs without a violation
+    - interval_pass: rate of an upper bound of the simulations' interval below the limit, on which no PASS rests
     """
+
+    default: Mapping[RareVerdict, float]
+    counting: Mapping[RareVerdict, float]
+    interval_pass: float
+
+
+def measure_rates(state: KnownState, ratio: float, trials: int, first_seed: int) -> VerdictRates:
+    """Measure the rates at a limit of `ratio` times the true probability."""
     limit = ratio * state.probability
     counting_cases = find_units_needed(0, limit, NOMINAL_RISK)
-    verdicts: tuple[list[RareVerdict], list[RareVerdict]] = ([], [])
+    decisions: tuple[list[Decision], list[Decision]] = ([], [])
+    interval_passes = 0
     for seed in range(first_seed, first_seed + trials):
         study = simulate_study(state, limit, seed)
-        verdicts[0].append(study.decide(state, limit, DEFAULTS.random_cases[0]).verdict)
-        verdicts[1].append(study.decide(state, limit, counting_cases).verdict)
-    rates = [{verdict: names.count(verdict) / trials for verdict in RareVerdict} for names in verdicts]
-    return rates[0], rates[1]
+        decisions[0].append(study.decide(state, limit, DEFAULTS.random_cases[0]))
+        decisions[1].append(study.decide(state, limit, counting_cases))
+        # replicates without a violation have the probability of their last level
+        estimates = [result.probability for result in study.replicates]
+        interval_passes += replicate_interval(estimates, DEFAULTS.confidence).upper <= limit
+    few, many = (
+        {verdict: sum(item.verdict is verdict for item in group) / trials for verdict in RareVerdict}
+        for group in decisions
+    )
+    return VerdictRates(few, many, interval_passes / trials)
 
 
 def run_verdicts(quick: bool) -> Iterator[Measure]:
     """Measure the rates of wrong and right verdicts on each limit state."""
     trials = 20 if quick else 200
     for state in discontinuous_states():
-        few, many = count_verdicts(state, FALSE_PASS_RATIO, trials, first_seed=1)
+        half = measure_rates(state, FALSE_PASS_RATIO, trials, first_seed=1)
         how = f"{trials} studies, limit half of the true probability"
-        for budget, rates in (("default number of cases", few), ("as many random cases as counting needs", many)):
+        interval_how = f"{how}; by the 90 % interval of the simulations it would be {half.interval_pass:.2g}"
+        for budget, rates, method in (
+            ("default number of cases", half.default, interval_how),
+            ("as many random cases as counting needs", half.counting, how),
+        ):
             claim = f"rare violations, false PASS, {budget}: {state.name}"
-            yield Measure(claim, rates[RareVerdict.PASS], "", NOMINAL_RISK, how)
-        double, _ = count_verdicts(state, FALSE_FAIL_RATIO, trials, first_seed=1 + trials)
+            yield Measure(claim, rates[RareVerdict.PASS], "", NOMINAL_RISK, method)
+        double = measure_rates(state, FALSE_FAIL_RATIO, trials, first_seed=1 + trials)
         how = f"{trials} studies, limit twice the true probability, default number of cases"
         claim = f"rare violations, false FAIL: {state.name}"
-        yield Measure(claim, double[RareVerdict.FAIL], "", NOMINAL_RISK, how)
-        tenfold_few, tenfold_many = count_verdicts(state, 10.0, trials, first_seed=1 + 2 * trials)
+        yield Measure(claim, double.default[RareVerdict.FAIL], "", NOMINAL_RISK, how)
+        tenfold = measure_rates(state, 10.0, trials, first_seed=1 + 2 * trials)
         how = (
-            "limit ten times the true probability, as many random cases as counting needs; "
-            f"default number of cases: {tenfold_few[RareVerdict.PASS]:.2g}"
+            "limit ten times the true probability, as many random cases as counting needs; limit twice the true "
+            f"probability: {double.counting[RareVerdict.PASS]:.2g}"
         )
         claim = f"rare violations, rate of PASS: {state.name}"
-        yield Measure(claim, tenfold_many[RareVerdict.PASS], "", None, how)
-        tenth, _ = count_verdicts(state, 0.1, trials, first_seed=1 + 3 * trials)
+        yield Measure(claim, tenfold.counting[RareVerdict.PASS], "", None, how)
+        tenth = measure_rates(state, 0.1, trials, first_seed=1 + 3 * trials)
         how = (
             "limit a tenth of the true probability, default number of cases; "
-            f"limit half of the true probability: {few[RareVerdict.FAIL]:.2g}"
+            f"limit half of the true probability: {half.default[RareVerdict.FAIL]:.2g}"
         )
-        yield Measure(f"rare violations, rate of FAIL: {state.name}", tenth[RareVerdict.FAIL], "", None, how)
+        yield Measure(f"rare violations, rate of FAIL: {state.name}", tenth.default[RareVerdict.FAIL], "", None, how)
 
 
 CHECKS = (Check("rare-verdicts", "Statistics", run_verdicts),)

@@ -7,13 +7,20 @@ import itertools
 import numpy as np
 import pytest
 
-from benchmarks.validation.limit_states import KnownState, discontinuous_states, linear_margin, outlier_margin
-from benchmarks.validation.rare_verdicts import DEFAULTS, NOMINAL_RISK, count_verdicts, simulate_study
+from benchmarks.validation.limit_states import (
+    KnownState,
+    cliff_margin,
+    discontinuous_states,
+    linear_margin,
+    outlier_margin,
+)
+from benchmarks.validation.rare_verdicts import DEFAULTS, NOMINAL_RISK, measure_rates, simulate_study
 from marsyard.campaigns.studies.counting import find_units_needed
 from marsyard.campaigns.studies.decision import Basis, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
 
 STATES = tuple(discontinuous_states())
+OPPOSITE = KnownState("step in the opposite direction", cliff_margin(1e-4, is_opposite=True), 2, 1e-4)
 
 
 def create_replicate(probability: float, end: SubsetEnd = SubsetEnd.VIOLATION, jumps: int = 0) -> SubsetResult:
@@ -41,11 +48,11 @@ def test_no_study_passes_with_gross_errors_at_twice_the_limit() -> None:
 @pytest.mark.parametrize("state", STATES, ids=[state.name for state in STATES])
 def test_false_verdicts_are_not_more_frequent_than_nominal(state: KnownState) -> None:
     """At half of the true probability a PASS is wrong, at twice the probability a FAIL; each has a risk of 5 %."""
-    half = count_verdicts(state, 0.5, 8, first_seed=8_000)
-    double = count_verdicts(state, 2.0, 8, first_seed=9_000)
+    half = measure_rates(state, 0.5, 8, first_seed=8_000)
+    double = measure_rates(state, 2.0, 8, first_seed=9_000)
     # 8 studies at a rate of 5 %: three or more wrong verdicts have a probability of 0.6 %
-    assert max(rates[RareVerdict.PASS] for rates in half) <= 2 / 8
-    assert max(rates[RareVerdict.FAIL] for rates in double) <= 2 / 8
+    assert max(half.default[RareVerdict.PASS], half.counting[RareVerdict.PASS]) <= 2 / 8
+    assert max(double.default[RareVerdict.FAIL], double.counting[RareVerdict.FAIL]) <= 2 / 8
 
 
 @pytest.mark.slow
@@ -64,8 +71,14 @@ def test_probabilities_of_the_limit_states_are_the_known_ones() -> None:
 
 def test_violations_are_found_where_the_margin_is_continuous() -> None:
     state = KnownState("linear", linear_margin(20, 1e-4), 20, 1e-4)
-    few, _ = count_verdicts(state, 0.1, 10, first_seed=10_000)
-    assert few[RareVerdict.FAIL] >= 0.9
+    assert measure_rates(state, 0.1, 10, first_seed=10_000).default[RareVerdict.FAIL] >= 0.9
+
+
+def test_steps_would_pass_by_the_interval_of_the_simulations() -> None:
+    """The chains move towards small margins, so that they never reach the step; only counting gives no PASS."""
+    rates = measure_rates(OPPOSITE, 0.5, 10, first_seed=11_000)
+    assert rates.interval_pass >= 0.5
+    assert rates.default[RareVerdict.PASS] == 0.0
 
 
 def test_pass_rests_on_counting_and_fail_on_either_bound() -> None:
