@@ -26,6 +26,7 @@ REASONS_FOR_WIDE_LIMITS = {
     "stereo range error": "the ratio of 55 pairs has a standard error of 10 %",
     "false PASS": "the guaranteed error rate",
     "false FAIL": "the guaranteed error rate",
+    "rare violations, false": "the guaranteed error rate",
     "nights with a false alarm": "the guaranteed rate",
     "refused templates": "the 95 % confidence interval of 1 in 4 templates of flight images",
 }
