@@ -49,7 +49,7 @@ STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget
 _MAX_NAMES = 24
 
 #: Version of the layout of `report.json` and its JSON Schema. A removed field, or a new meaning, increases the version.
-SCHEMA = 6
+SCHEMA = 7
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict that `report.json` contains next to its fields.
 _VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "consumer_risk", "margin")
@@ -226,8 +226,6 @@ def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: 
         "sampling": {**asdict(sampling), "independent": sampling.independent, "text": sampling.text},
         "evidence": {
             **evaluation.evidence.to_table(),
-            # former key of `algorithm_confirmations`, until version 0.2
-            "of_algorithm": evaluation.evidence.algorithm_confirmations,
             "title": evaluation.evidence.title,
             "text": evaluation.evidence.text,
         },
@@ -253,6 +251,16 @@ def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
     return [] if column not in frame else [str(value) for value in frame[column].dropna().unique()[:_MAX_NAMES]]
 
 
+def status_class(word: object) -> str:
+    """Return the name of the style of a verdict; a PASS with a qualification has that of MET BY RATE.
+
+    >>> [status_class(word) for word in ("PASS", "PASS (unregistered)", "NO REQUIREMENT")]
+    ['pass', 'met-by-rate', 'no-requirement']
+    """
+    text = str(word)
+    return "met-by-rate" if text.startswith("PASS (") else text.lower().replace(" ", "-")
+
+
 @cache
 def page_environment() -> Environment:
     """Create a Jinja environment that escapes all values; its filter `code` marks words in backticks as code."""
@@ -263,6 +271,7 @@ def page_environment() -> Environment:
         trim_blocks=True,
         undefined=StrictUndefined,
     )
+    environment.filters["status_class"] = status_class
     environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
     return environment
 

@@ -5,6 +5,7 @@ A study is a run of `marsyard rare`, `search` or `budget`; its verdict does not 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,10 @@ from typing import Any
 
 import pandas as pd
 
+from marsyard.campaigns.definition.claims import requirement_key
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
+from marsyard.campaigns.store.confirmations import add_result
+from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import (
@@ -23,12 +27,18 @@ from marsyard.reports.statistics.proportions import (
     proportion_upper,
 )
 from marsyard.reports.stored import StoredRun, read_run, table
-from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, evaluate_requirements
-from marsyard.reports.wording import count, format_fraction, percent
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, collect_evidence, evaluate_requirements
+from marsyard.reports.wording import count
 from marsyard.scenarios.systems import RowColumns, row_columns
 
 #: Headline of a study that decides no requirement.
 _NO_VERDICT = "NO VERDICT"
+#: Headline of an exploration that meets all requirements: it is no confirmation.
+EXPLORATORY_PASS = "PASS (exploration)"  # noqa: S105  (a verdict, not a password)
+#: Statuses that need a decision of a person: PASS with a qualification.
+_QUALIFIED = (Status.UNREGISTERED, Status.OTHER_CLAIMS)
+#: Exit status of PASS with a qualification.
+QUALIFIED_EXIT_CODE = 4
 
 
 @dataclass(frozen=True)
@@ -39,16 +49,20 @@ class OverallVerdict:
     - crashed: number of crashed cases
     - sentence: explanation
     - without_status: headline if `status` is None
+    - is_exploration: whether the run is an exploration, which the headline of PASS states
     """
 
     status: Status | None
     crashed: int
     sentence: str
     without_status: str = "NO REQUIREMENT"
+    is_exploration: bool = False
 
     @property
     def word(self) -> str:
         """The headline."""
+        if self.status is Status.PASS and self.is_exploration:
+            return EXPLORATORY_PASS
         return self.without_status if self.status is None else str(self.status)
 
 
@@ -58,13 +72,13 @@ def combine_verdicts(
     sampling: SamplingDesign = INDEPENDENT,
     evidence: Evidence | None = None,
 ) -> OverallVerdict:
-    """Return the worst of the verdicts, in the order FAIL, INSUFFICIENT, MET BY RATE, PASS."""
+    """Return the worst of the verdicts: FAIL, INSUFFICIENT, MET BY RATE, PASS with a qualification, PASS."""
     crashed = int(engine_failed(frame).sum())
     statuses = [verdict.status for verdict in verdicts]
     crash_text = f" {count(crashed, 'case')} crashed." if crashed else ""
     if not statuses:
         return OverallVerdict(None, crashed, "The campaign has no requirement." + crash_text)
-    order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE)
+    order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE, *_QUALIFIED)
     worst = next((status for status in order if status in statuses), Status.PASS)
     if not sampling.independent:
         rate_statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
@@ -86,21 +100,26 @@ def combine_verdicts(
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
+        Status.UNREGISTERED: f"{fraction} met, but no registered record shows the earlier runs.",
+        Status.OTHER_CLAIMS: f"{fraction} met, after other claims about this campaign that did not pass.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",
         Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {subject}.{_remedy_text(verdicts)}",
     }[worst]
-    return OverallVerdict(worst, crashed, sentence + crash_text)
+    is_exploration = evidence is not None and evidence.kind is EvidenceKind.EXPLORATION
+    return OverallVerdict(worst, crashed, sentence + crash_text, is_exploration=is_exploration)
 
 
 def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     """Return the exit code: 1 for a failed requirement or a crashed case, 3 for an undecided one, 0 otherwise.
 
-    MET BY RATE results in 3, unless the requirement has `accept_rate`.
+    MET BY RATE results in 3, unless the requirement has `accept_rate`; PASS with a qualification results in 4.
     """
     if crashed or any(verdict.status is Status.FAIL for verdict in verdicts):
         return 1
     has_rate_verdict = any(verdict.status is Status.MET_BY_RATE and not verdict.accept_rate for verdict in verdicts)
-    return 3 if has_rate_verdict or any(verdict.status is Status.INSUFFICIENT for verdict in verdicts) else 0
+    if has_rate_verdict or any(verdict.status is Status.INSUFFICIENT for verdict in verdicts):
+        return 3
+    return QUALIFIED_EXIT_CODE if any(verdict.status in _QUALIFIED for verdict in verdicts) else 0
 
 
 def _remedy_text(verdicts: Sequence[Verdict]) -> str:
@@ -126,6 +145,7 @@ class Evaluation:
     - evidence: kind of evidence; a confirmation is a run with a new seed after the algorithm was frozen, a calibration
       allows no PASS
     - verdicts: verdict of each requirement; empty for a study
+    - is_qualified: whether a met requirement needs a decision of a person (`marsyard.reports.joint`)
     """
 
     run: StoredRun
@@ -133,13 +153,15 @@ class Evaluation:
     evidence: Evidence
     verdicts: Sequence[Verdict]
     overall_verdict: OverallVerdict
+    is_qualified: bool = False
 
     @property
     def exit_code(self) -> int:
         """The exit status of the verdicts, or of the study."""
         if not self.verdicts and self.overall_verdict.status is not None:
             return {Status.PASS: 0, Status.FAIL: 1}.get(self.overall_verdict.status, 3)
-        return compute_exit_code(self.verdicts, bool(self.overall_verdict.crashed))
+        exit_code = compute_exit_code(self.verdicts, bool(self.overall_verdict.crashed))
+        return exit_code or (QUALIFIED_EXIT_CODE if self.is_qualified else 0)
 
 
 def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
@@ -150,15 +172,64 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     if study:
         return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(study, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
+    joint = read_joint_evidence(evidence)
+    evidence = replace(evidence, notes=joint.notes)
     columns = _read_columns(str(run.configuration.get("scenario") or ""))
     # columns that are computed from the truth, and columns that the configuration of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
-    verdicts = evaluate_requirements(run.all_cases, run.requirements, sampling, from_truth, configured)
-    verdicts = [withhold_verdict(verdict, evidence) for verdict in verdicts]
-    if evidence.kind is EvidenceKind.CONFIRMATION and evidence.algorithm_confirmations > 1:
-        verdicts = _add_joint_verdicts(verdicts, run, sampling, evidence.algorithm_confirmations)
+    design = sampling.with_open_end if evidence.is_confirmation else sampling
+    earlier = [joint.earlier_evidence(requirement) for requirement in run.requirements]
+    verdicts = evaluate_requirements(run.all_cases, run.requirements, design, from_truth, configured, earlier)
+    unfinished_reason = _describe_unfinished(run)
+    if unfinished_reason:
+        verdicts = [_withhold_unfinished(verdict, unfinished_reason) for verdict in verdicts]
+        overall = combine_verdicts(verdicts, run.all_cases)
+        overall = overall if not verdicts else replace(overall, sentence=unfinished_reason)
+        return Evaluation(run, sampling, evidence, verdicts, overall)
+    verdicts = [
+        _qualify(withhold_verdict(verdict, evidence), requirement, run, design, joint)
+        for verdict, requirement in zip(verdicts, run.requirements, strict=True)
+    ]
     overall = combine_verdicts(verdicts, run.all_cases, sampling, evidence)
-    return Evaluation(run, sampling, evidence, verdicts, overall)
+    is_qualified = joint.is_confirmation and any(joint.is_qualified(verdict.requirement_id) for verdict in verdicts)
+    return Evaluation(run, sampling, evidence, verdicts, overall, is_qualified)
+
+
+def _qualify(
+    verdict: Verdict, requirement: Mapping[str, Any], run: StoredRun, sampling: SamplingDesign, joint: JointEvidence
+) -> Verdict:
+    """Add what the record of confirmations shows to the verdict of a confirmation."""
+    if not joint.is_confirmation:
+        return verdict
+    own = collect_evidence(run.all_cases, requirement, sampling, has_own_terrains=True)
+    verdict = describe_contribution(verdict, own, joint)
+    return qualify_verdict(verdict, joint, len(run.all_cases))
+
+
+def _describe_unfinished(run: StoredRun) -> str:
+    """Describe that not all cases of a campaign have run; empty for a finished campaign, or one without a record."""
+    state = run.recorded("state")
+    if state in (None, "finished"):
+        return ""
+    cases = f"{len(run.all_cases):,} of {count(int(run.recorded('cases') or 0), 'case')}"
+    return f"The campaign is not finished ({cases}): a verdict needs all cases."
+
+
+def _withhold_unfinished(verdict: Verdict, reason: str) -> Verdict:
+    """Replace the verdict and the bounds of an unfinished campaign: its number of cases depends on earlier looks."""
+    return replace(
+        verdict,
+        status=Status.INSUFFICIENT,
+        reason=reason,
+        further_cases=None,
+        advice="",
+        all_cases=None,
+        clustered=None,
+        lower=math.nan,
+        upper=math.nan,
+        plain_lower=math.nan,
+        plain_upper=math.nan,
+    )
 
 
 def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
@@ -195,7 +266,7 @@ def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool
     the campaign are evaluated.
     """
     evidence = Evidence.read(record.get("evidence"))
-    if evidence.kind is not EvidenceKind.CONFIRMATION:
+    if not evidence.is_confirmation:
         return evidence
     stored_changes = record.get("changes")
     changes = [str(text) for change in stored_changes or () for text in change.get("in") or ()]
@@ -219,21 +290,21 @@ def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
     )
 
 
-def _add_joint_verdicts(
-    verdicts: Sequence[Verdict], run: StoredRun, sampling: SamplingDesign, confirmations: int
-) -> list[Verdict]:
-    """Add the verdicts at the confidence of all confirmations of an algorithm together (Bonferroni)."""
-    strict_requirements = [
-        {**requirement, "confidence": 1.0 - (1.0 - verdict.confidence) / confirmations}
-        for requirement, verdict in zip(run.requirements, verdicts, strict=True)
-    ]
-    joint_verdicts = evaluate_requirements(run.all_cases, strict_requirements, sampling)
-    texts = [
-        f"At {format_fraction(verdict.confidence)} confidence for all {confirmations} confirmations together (each at "
-        f"{percent(joint_verdict.confidence)}): {joint_verdict.status}."
-        for verdict, joint_verdict in zip(verdicts, joint_verdicts, strict=True)
-    ]
-    return [replace(verdict, joint_text=text) for verdict, text in zip(verdicts, texts, strict=True)]
+def record_look(evaluation: Evaluation) -> None:
+    """Append the result of a finished confirmation to its record, if the record contains the run."""
+    evidence, run = evaluation.evidence, evaluation.run
+    if evidence.kind is not EvidenceKind.CONFIRMATION:
+        return
+    own = read_joint_evidence(evidence).own
+    if own is None:  # stated in the verdict
+        return
+    design, counts = evaluation.sampling.with_open_end, {}
+    for requirement in run.requirements:
+        part = collect_evidence(run.all_cases, requirement, design, has_own_terrains=bool(own.bank_seeds))
+        if part is not None:
+            counts[requirement_key(requirement)] = part.to_table()
+    results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
+    add_result(evidence, len(run.all_cases), results, counts)
 
 
 def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int) -> int | None:

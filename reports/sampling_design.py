@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,16 @@ class SamplingDesign:
             f"No probability statement: the design is {describe_design(self.design, self.grids, nominal=False)}, and "
             f"only independent random samples allow one. {remedy[:1].upper()}{remedy[1:]}, and run it again."
         )
+
+    @property
+    def with_open_end(self) -> SamplingDesign:
+        """The design of a confirmation, which later confirmations extend.
+
+        All looks after the first use `SequentialTest`, also those that `--until-decided` has planned.
+        """
+        if self.max_cases is None:
+            return self
+        return replace(self, max_cases=None, first_look=planned_looks(self.max_cases)[0].cases)
 
     def risk_fraction_at(self, cases: int) -> float:
         """Fraction of the risk of a wrong verdict (1 - confidence) that a look at `cases` cases may use."""

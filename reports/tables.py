@@ -6,7 +6,6 @@ Cells of terminal tables are `Text` objects, so that brackets in names are not r
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 
 import pandas as pd
@@ -36,6 +35,8 @@ _STYLES = {
     Status.MET_BY_RATE: "bold cyan",
     Status.FAIL: "bold red",
     Status.INSUFFICIENT: "bold yellow",
+    Status.UNREGISTERED: "bold cyan",
+    Status.OTHER_CLAIMS: "bold cyan",
 }
 
 
@@ -137,20 +138,20 @@ def confirmations_table(entries: Sequence[Confirmation]) -> Table:
     """Create a table of confirmations (`marsyard run --confirm`) for terminals.
 
     A confirmation is a run with a new seed after the algorithm was frozen. The column Number counts the confirmations
-    of one algorithm on one campaign.
+    of one claim.
     """
     table = Table(title="Confirmations", box=box.SIMPLE_HEAD, title_justify="left")
-    for heading in ("Campaign", "Algorithm"):
+    for heading in ("Campaign", "Algorithm", "Claim"):
         table.add_column(heading, overflow="fold")
     for heading in ("Number", "Date", "Cases"):
         table.add_column(heading, no_wrap=True)
     table.add_column("Results", min_width=14)
-    counts = Counter[tuple[str, str]]()
     for entry in entries:
-        key = (entry.campaign, entry.frozen.algorithm)
-        counts[key] += 1
         results = "not finished"
-        if entry.results is not None:
-            results = "\n".join(f"{name}: {status}" for name, status in entry.results.items()) or "no requirement"
-        table.add_row(*map(Text, (*key, str(counts[key]), entry.started_utc[:10], str(entry.cases), results)))
+        if not entry.is_unfinished:
+            results = "\n".join(f"{name}: {status}" for name, status in (entry.results or {}).items())
+            results = results or "no requirement"
+        claim = entry.claim[:8] if entry.is_chained else NOTHING
+        cells = (entry.campaign, entry.frozen.algorithm, claim, str(entry.number), entry.started_utc[:10])
+        table.add_row(*map(Text, (*cells, str(entry.cases), results)))
     return table

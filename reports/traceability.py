@@ -84,7 +84,7 @@ def _algorithms_from_parameters(parameters: Mapping[str, Any]) -> list[Algorithm
 
 
 #: Verdicts of requirements that are neither met nor failed at their confidence; JUnit tests with them are skipped.
-_UNDECIDED = (Status.INSUFFICIENT, Status.MET_BY_RATE)
+_UNDECIDED = (Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS)
 #: Characters that XML 1.0 does not allow.
 _INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -154,7 +154,8 @@ def junit_xml(
 ) -> str:
     """Format the verdicts as JUnit XML: a test for each requirement, and one for the completion of all cases.
 
-    FAIL is a failure; INSUFFICIENT and MET BY RATE are skipped. Properties of the suite: the tested algorithm.
+    FAIL is a failure; INSUFFICIENT, MET BY RATE and PASS with a qualification are skipped. Properties of the suite: the
+    tested algorithm.
     """
     statuses = [verdict.status for verdict in verdicts]
     suite = Xml.Element(

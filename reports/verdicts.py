@@ -17,14 +17,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from fnmatch import fnmatchcase
+from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool, Int
 
 from marsyard.reports import rates
+from marsyard.reports.case_evidence import CaseEvidence, Groups, RequirementEvidence, Success
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.proportions import (
@@ -49,6 +50,10 @@ class Status(StrEnum):
     MET_BY_RATE = "MET BY RATE"
     FAIL = "FAIL"
     INSUFFICIENT = "INSUFFICIENT"
+    #: PASS of a confirmation whose record of earlier runs is missing, broken or not registered.
+    UNREGISTERED = "PASS (unregistered)"
+    #: PASS of a confirmation after other claims about the same campaign without PASS.
+    OTHER_CLAIMS = "PASS (other claims)"
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,7 @@ class Verdict:
     - withheld_status: status without regard to the kind of evidence, if it was replaced by INSUFFICIENT; otherwise None
     - all_cases: result of the same requirement on all cases; None if its population is all cases
     - definitions: definitions of the columns of the population that the flight system cannot know; may be empty
-    - joint_text: verdict at the confidence of all confirmations of the algorithm together, as a sentence; may be empty
+    - joint_text: contribution of this run to the joint evidence of all confirmations, as a sentence; may be empty
     - terrains: number of distinct terrains of the population; None if unknown
     - clustered: evidence from shared terrains; None if no terrain is shared
     - plain_lower, plain_upper: bounds for independent cases
@@ -169,7 +174,7 @@ class Verdict:
         """Explanation of the verdict and of its limitations, in sentences; may be empty."""
         all_cases_text = "" if self.all_cases is None or self.all_cases.n == self.n else self.all_cases.text
         definitions = f"{self.definitions}." if self.definitions else ""
-        texts: tuple[str, ...] = (definitions, self.reason, all_cases_text)
+        texts: tuple[str, ...] = (definitions, self.reason, all_cases_text, self.joint_text)
         if not self.reason:
             decision, terrains = self._decision_text(), self._terrain_text()
             texts = (definitions, decision, all_cases_text, terrains, self._look_text(), self.advice, self.joint_text)
@@ -217,10 +222,6 @@ class Verdict:
             f"The campaign is evaluated more than once. Its lower bound is at {lower} confidence and its upper bound "
             f"at {upper} confidence, {joint_note}."
         )
-
-
-Success = Bool[np.ndarray, " n"]  #: Whether each case is a success.
-Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
 
 
 @dataclass(frozen=True)
@@ -299,6 +300,7 @@ def evaluate_requirements(
     sampling: SamplingDesign = INDEPENDENT,
     from_truth: Mapping[str, str] = MappingProxyType({}),
     configured: Sequence[str] = (),
+    earlier: Sequence[RequirementEvidence | None] = (),
 ) -> list[Verdict]:
     """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
 
@@ -307,11 +309,12 @@ def evaluate_requirements(
       requirement
     - configured: columns, or patterns of names, that the configuration of a case determines; they remain conditions
       over all cases
+    - earlier: evidence of other confirmations of the same claim for each requirement; may be empty
     """
     frame = sampling.exclude_nominal_case(frame)
     verdicts = []
-    for requirement in requirements:
-        verdict = _evaluate(frame, requirement, sampling)
+    for requirement, earlier_evidence in zip_longest(requirements, earlier):
+        verdict = _evaluate(frame, requirement, sampling, earlier_evidence)
         names = [name for name in verdict.population.split(" and ") if name in from_truth]
         if names:
             title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
@@ -341,7 +344,56 @@ def _evaluate_all_cases(
     )
 
 
-def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign) -> Verdict:
+def collect_evidence(
+    frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, *, has_own_terrains: bool
+) -> RequirementEvidence | None:
+    """Collect the results of the cases of a requirement; None if it cannot be evaluated.
+
+    has_own_terrains: whether no other confirmation uses the terrains
+    """
+    frame, verdict = sampling.exclude_nominal_case(frame), _empty_verdict(requirement)
+    if _describe_problem(frame, verdict):
+        return None
+    try:
+        masks = [mask(frame, verdict.population) for mask in (rates.population_mask, rates.population_mask_if_answered)]
+    except ValueError:
+        return None
+    evidence = [
+        _case_evidence(verdict, frame[mask], sampling, frame, has_own_terrains=has_own_terrains) for mask in masks
+    ]
+    return RequirementEvidence(*evidence)
+
+
+def _case_evidence(
+    verdict: Verdict,
+    population: pd.DataFrame,
+    sampling: SamplingDesign,
+    frame: pd.DataFrame,
+    *,
+    has_own_terrains: bool = True,
+) -> CaseEvidence:
+    """Collect the results of the cases of a population."""
+    _, has_unknown_flag = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
+    success = np.asarray(
+        rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag, dtype=np.bool_
+    )
+    in_first_look = sampling.mask_first_look(frame, population)
+    if in_first_look is None:
+        in_first_look = np.ones(success.size, dtype=np.bool_)
+    groups = rates.terrain_groups(population) if success.size else None
+    if groups is None or has_own_terrains:
+        return CaseEvidence(success, groups, in_first_look)
+    first_rows = np.unique(groups, return_index=True)[1]
+    labels = tuple(f"terrain {value}" for value in population["terrain"].iloc[first_rows])
+    return CaseEvidence(success, groups, in_first_look, labels)
+
+
+def _evaluate(
+    frame: pd.DataFrame,
+    requirement: Mapping[str, Any],
+    sampling: SamplingDesign,
+    earlier: RequirementEvidence | None = None,
+) -> Verdict:
     verdict = _empty_verdict(requirement)
     problem = _describe_problem(frame, verdict)
     if problem:
@@ -356,7 +408,12 @@ def _evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: Sam
         needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
-    verdicts = (_decide(verdict, cases, sampling, frame) for cases in (population, population_and_unfinished))
+    earlier_parts = (None, None) if earlier is None else (earlier.population, earlier.with_unfinished)
+    populations = (population, population_and_unfinished)
+    verdicts = [
+        _decide(verdict, cases, sampling, frame, earlier_part)
+        for cases, earlier_part in zip(populations, earlier_parts, strict=True)
+    ]
     return _withhold_if_uncertain(*verdicts)
 
 
@@ -377,21 +434,35 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
-def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
-    """Decide the verdict from the cases of its population (at least one) and from all cases (`frame`)."""
-    _, has_unknown_flag = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
-    success = np.asarray(
-        rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag
-    )
-    n, failures, groups = success.size, int((~success).sum()), rates.terrain_groups(population)
+def _decide(
+    verdict: Verdict,
+    population: pd.DataFrame,
+    sampling: SamplingDesign,
+    frame: pd.DataFrame,
+    earlier: CaseEvidence | None = None,
+) -> Verdict:
+    """Decide the verdict from the cases of its population (at least one).
+
+    - frame: all cases of the campaign
+    - earlier: cases of other confirmations of the same claim
+    """
+    has_own_terrains = earlier is None or earlier.labels is None
+    evidence = _case_evidence(verdict, population, sampling, frame, has_own_terrains=has_own_terrains)
+    if earlier is not None:
+        evidence = earlier.join(evidence)
+    success, groups = evidence.success, evidence.groups
+    n, failures = success.size, int((~success).sum())
     rate, decides_by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
     terrains = None if groups is None else int(population["terrain"].nunique())
+    if earlier is not None and groups is not None:
+        terrains = int(groups.max()) + 1
     with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=terrains)
     if not sampling.independent:
         reason = f"{'Decided by the rate of these cases. ' if decides_by_rate else ''}{sampling.no_probability}"
         status = _status_by_rate(rate, n, verdict.probability) if decides_by_rate else verdict.status
         return replace(with_counts, status=status, reason=reason)
-    looks = Looks(sampling.mask_first_look(frame, population), sampling.risk_fraction_at(len(frame)))
+    in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look
+    looks = Looks(in_first_look, sampling.risk_fraction_at(len(frame)))
     verdict_with_bounds, additional = add_bounds(with_counts, success, groups, looks)
     status = verdict_with_bounds.confident_status
     decides_by_rate = decides_by_rate and status is not Status.PASS
@@ -403,8 +474,8 @@ def _decide(verdict: Verdict, population: pd.DataFrame, sampling: SamplingDesign
     if decides_by_rate:
         return replace(verdict_with_bounds, further_cases=min_cases_for_rate(verdict.probability) - n)
     # number of additional cases, or advice if the campaign has too few terrains for them
-    evidence, terrain_supply = verdict_with_bounds.clustered, sampling.terrains
-    counts_terrains = evidence is not None and evidence.method is ClusterMethod.TERRAIN_COUNT
+    clustered, terrain_supply = verdict_with_bounds.clustered, sampling.terrains
+    counts_terrains = clustered is not None and clustered.method is ClusterMethod.TERRAIN_COUNT
     if not counts_terrains or terrain_supply is None or (terrains or 0) + additional <= terrain_supply.terrains:
         return replace(verdict_with_bounds, further_cases=additional)
     needed_terrains = proportions.minimum_sample_size(verdict.probability, verdict.confidence)

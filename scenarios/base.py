@@ -59,6 +59,16 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         bank.terrain(number)
 
+    @abstractmethod
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """Return the shared inputs of a case with these sampled parameters."""
+
+    def terrain_identities(self, parameters: BaseModel, case: int) -> tuple[str, ...]:
+        """Return the identities of the terrains of a case with these sampled parameters."""
+        p = self.check_parameters(parameters)
+        banks = (self.input_terrain(p, shared_input) for shared_input in self.case_inputs(p, case))
+        return tuple(bank.identity(number) for bank, number in banks)
+
     def missing_bytes(self, parameters: BaseModel, shared_input: int) -> int:
         """Return the size in bytes of a terrain that is not yet in the cache on disk; 0 if it is."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)

@@ -126,6 +126,14 @@ class SelectsInputs(Protocol):
 
 
 @runtime_checkable
+class IdentifiesTerrains(Protocol):
+    """A scenario whose terrains have an identity: two cases with equal identities use the same terrain."""
+
+    def terrain_identities(self, parameters: BaseModel, case: int) -> tuple[str, ...]:
+        """Return the identities of the terrains of a case with these sampled parameters."""
+
+
+@runtime_checkable
 class HasAlgorithms(Protocol):
     """A scenario whose algorithms are selected in the campaign file.
 

@@ -46,6 +46,7 @@ class Campaign:
     - command: words of the command that repeats the campaign; empty if no command started it
     - confirms: whether the run is a confirmation (`marsyard.campaigns.definition.evidence`)
     - confirmations: record of confirmations
+    - calibration_overlap: fraction of the cases of a confirmation on terrains of calibration runs; None if unknown
     """
 
     configuration: CampaignConfiguration
@@ -53,6 +54,7 @@ class Campaign:
     command: tuple[str, ...] = ()
     confirms: bool = False
     confirmations: Path = Path(CONFIRMATIONS_FILE)
+    calibration_overlap: float | None = None
 
     def _repr_html_(self) -> str:
         """Table of the campaign's settings for notebooks."""

@@ -1,32 +1,24 @@
-"""Kind of evidence of a run (calibration, confirmation or exploration), determined from its seed and its algorithm.
+"""Kind of evidence of a run (calibration, confirmation or exploration), determined from its seed and its content.
 
 Options that were set by looking at results fit the cases of these results. Only new cases, drawn once after the
-algorithm was frozen, can confirm it. `marsyard run --confirm` draws the seed of such a run from a namespace, and
-appends the run to a record of confirmations (`marsyard.campaigns.store.confirmations`).
+algorithm was frozen, can confirm it. `marsyard run --confirm` derives the seed of such a run from its claim
+(`marsyard.campaigns.definition.claims`), and appends the run to a record of confirmations
+(`marsyard.campaigns.store.confirmations`).
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any, Self
 
-from marsyard.campaigns.definition.campaign import Campaign, leaves
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
-from marsyard.campaigns.definition.identity import create_identity, describe_algorithms
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.claims import FrozenAlgorithm, bank_seeds, confirmation_seed
 
-#: Namespace of the seeds of confirmations without a table `[calibration]` in the campaign file.
-NAMESPACE = "confirmation"
-#: Keys that the hash `configuration` of a frozen algorithm does not contain: the seed, the number of cases, texts,
-#: limits of the run, and the requirements, which have their own hash.
-_KEYS_NOT_HASHED = frozenset(
-    {"appended", "calibration", "cases", "description", "limits", "max_cases", "requirements", "retain", "seed"}
-)
-#: Maximum number of a confirmation whose seed is recognised although the record has no entry of it.
-_MAX_RESERVED_NUMBER = 1000
+#: Maximum fraction of the cases of a confirmation on terrains of calibration runs.
+MAX_CALIBRATION_OVERLAP = 0.1
 
 
 class EvidenceKind(StrEnum):
@@ -46,89 +38,24 @@ KINDS_WITHOUT_PASS = frozenset({EvidenceKind.CALIBRATION, EvidenceKind.REUSED_SE
 
 
 @dataclass(frozen=True)
-class FrozenAlgorithm:
-    """All choices that a confirmation freezes.
-
-    - algorithm: name of the algorithm under test
-    - options: options of all algorithms of the campaign, under the algorithm's name, and values under `parameters`
-    - hashes: SHA-256 (16 digits) of `sources` (of the algorithms), `configuration` (parameters, dispersions, sampling
-      design, input files), `requirements`, and `code` (of the simulation)
-    """
-
-    algorithm: str
-    options: Mapping[str, Any]
-    hashes: Mapping[str, str]
-
-    @classmethod
-    def read(cls, stored: Mapping[str, Any]) -> Self:
-        """Read from the record of confirmations."""
-        return cls(str(stored["algorithm"]), dict(stored["options"]), dict(stored["hashes"]))
-
-    def differences(self, other: FrozenAlgorithm) -> list[str]:
-        """Describe the differences from another frozen algorithm, each in a few words."""
-        texts = []
-        if self.algorithm != other.algorithm:
-            texts.append(f"algorithm ({self.algorithm}, now {other.algorithm})")
-        for name in sorted({*self.options, *other.options}):
-            old, new = self.options.get(name), other.options.get(name)
-            if old != new:
-                texts.append(f"{name} ({json.dumps(old)}, now {json.dumps(new)})")
-        names = sorted({*self.hashes, *other.hashes})
-        changed_hashes = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
-        if texts and "configuration" in changed_hashes:
-            changed_hashes.remove("configuration")  # it includes the named parameters
-        return [*texts, *changed_hashes]
-
-
-def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
-    """Describe all choices that a confirmation of a campaign freezes."""
-    configuration = campaign.configuration
-    algorithms = describe_algorithms(campaign)
-    algorithm = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
-    options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
-    values = configuration.model_dump(mode="json")
-    options |= dict(leaves(values["parameters"], "parameters"))
-    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_HASHED}
-    identity = create_identity(configuration)
-    contents = {
-        "sources": [(entry["spec"], entry["source_hash"]) for entry in algorithms],
-        "configuration": [frozen_values, identity.inputs],
-        "requirements": values["requirements"],
-        "code": identity.code,
-    }
-    return FrozenAlgorithm(algorithm, options, {name: _hash(content) for name, content in contents.items()})
-
-
-def _hash(content: Any) -> str:
-    """Compute the first 16 digits of the SHA-256 of a content in JSON."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def confirmation_namespace(configuration: CampaignConfiguration) -> str:
-    """Return the namespace of the seeds of a campaign's confirmations."""
-    return NAMESPACE if configuration.calibration is None else configuration.calibration.namespace
-
-
-def confirmation_seed(namespace_text: str, campaign: str, number: int) -> int:
-    """Compute the seed of a campaign's confirmation, numbered from 1: 48 bits of a SHA-256.
-
-    >>> confirmation_seed("confirmation", "dimes-gusev", 1)
-    86360033277001
-    """
-    digest = hashlib.sha256(f"{namespace_text}\0{campaign}\0{number}".encode()).digest()
-    return int.from_bytes(digest[:6])
-
-
-@dataclass(frozen=True)
 class Confirmation:
-    """One entry of the record of confirmations.
+    """A confirmation in the record of confirmations.
 
-    - number: number of the confirmation of this campaign and namespace, from 1; it determines the seed
-    - results: status of each requirement; None while the run is not finished
+    - claim: identity of its content (`FrozenAlgorithm.claim`)
+    - number: number of the confirmation of its claim, from 1
+    - seed, bank_seeds: seed of the draws, and seeds of the terrain banks by parameter path
+    - cases: number of cases that it has announced, with appended ones
+    - first_cases: number of cases of its first look
+    - max_cases: maximum number of cases of a run with `--until-decided`; otherwise None
+    - overlap: see `Evidence`
+    - requirements: name of each requirement, by `requirement_key`
+    - results: status of each requirement at the latest look, by name; None before the first look
+    - counted_cases, counts: number of cases and evidence of the latest look (`marsyard.reports.joint`)
+    - failed: names of the requirements that were FAIL at any look
+    - is_chained: False for an entry of an earlier version, which is not part of the chain of hashes
     """
 
     campaign: str
-    namespace: str
     number: int
     seed: int
     frozen: FrozenAlgorithm
@@ -137,6 +64,21 @@ class Confirmation:
     folder: str = ""
     cases: int = 0
     results: Mapping[str, str] | None = None
+    claim: str = ""
+    bank_seeds: Mapping[str, int] = field(default_factory=dict)
+    first_cases: int = 0
+    max_cases: int | None = None
+    overlap: float | None = None
+    requirements: Mapping[str, str] = field(default_factory=dict)
+    counted_cases: int = 0
+    counts: Mapping[str, Any] = field(default_factory=dict)
+    failed: tuple[str, ...] = ()
+    is_chained: bool = True
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether the record announces more cases than it has results of."""
+        return self.results is None or (self.is_chained and self.counted_cases < self.cases)
 
 
 @dataclass(frozen=True)
@@ -144,27 +86,32 @@ class Evidence:
     """Kind of evidence of a run, stored in its record.
 
     - number: number of the confirmation whose seed the run uses; 0 without one
-    - algorithm_confirmations: number of confirmations of the algorithm (by name) on this campaign, including this one
+    - claim: identity of the content that is confirmed; empty for other kinds
     - record: file of the record of confirmations; empty for other kinds
+    - registration: why the record was not registered when the run started; empty if it was
+    - overlap: fraction of the cases of a confirmation on terrains of calibration runs; None if unknown
+    - imported_terrain: whether the cases are on an imported DTM, so that no confirmation can use fresh terrains
     - changes: differences from the frozen algorithm, if the seed was reused; or the options set on these cases
+    - notes: what the record of confirmations shows; determined at each evaluation, not stored
     """
 
     kind: EvidenceKind = EvidenceKind.EXPLORATION
-    namespace: str = ""
     number: int = 0
-    algorithm_confirmations: int = 0
+    claim: str = ""
     record: str = ""
+    registration: str = ""
+    overlap: float | None = None
+    imported_terrain: bool = False
     changes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, stored: object) -> Self:
         """Read from the record of a run; runs of earlier versions are explorations."""
         if not isinstance(stored, Mapping):
             return cls()
-        # name of `algorithm_confirmations` in records before version 0.2
-        previous_name = {"algorithm_confirmations": stored["of_algorithm"]} if "of_algorithm" in stored else {}
-        names = ("namespace", "number", "algorithm_confirmations", "record")
-        values = previous_name | {name: stored[name] for name in names if name in stored}
+        names = ("number", "claim", "record", "registration", "overlap", "imported_terrain")
+        values = {name: stored[name] for name in names if name in stored}
         try:
             return cls(
                 EvidenceKind(str(stored.get("kind"))), changes=tuple(map(str, stored.get("changes") or ())), **values
@@ -173,13 +120,21 @@ class Evidence:
             return cls()
 
     def to_table(self) -> dict[str, Any]:
-        """Return the fields as JSON types."""
-        return {**asdict(self), "kind": str(self.kind), "changes": list(self.changes)}
+        """Return the stored fields as JSON types."""
+        values = {**asdict(self), "kind": str(self.kind), "changes": list(self.changes)}
+        del values["notes"]
+        return values
+
+    @property
+    def is_confirmation(self) -> bool:
+        """Whether the run is a confirmation of its claim, or repeats one."""
+        return self.kind in (EvidenceKind.CONFIRMATION, EvidenceKind.REPETITION)
 
     @property
     def excludes_pass(self) -> bool:
-        """Whether this kind of evidence allows no PASS, see `KINDS_WITHOUT_PASS`."""
-        return self.kind in KINDS_WITHOUT_PASS
+        """Whether this evidence allows no PASS: by its kind, or because its terrains were used for calibration."""
+        overlaps = self.overlap is not None and self.overlap > MAX_CALIBRATION_OVERLAP
+        return self.kind in KINDS_WITHOUT_PASS or (self.is_confirmation and overlaps)
 
     @property
     def title(self) -> str:
@@ -190,14 +145,14 @@ class Evidence:
 
     @property
     def text(self) -> str:
-        """Meaning of the kind of evidence for the verdicts, in a sentence or two."""
+        """Meaning of the kind of evidence for the verdicts, in sentences."""
         changes = "; ".join(self.changes)
         parameter_names = ", ".join(name if "." in name else f"{name}.*" for name in self.changes)
-        return {
-            EvidenceKind.CONFIRMATION: f"Confirmation {self.number} in the namespace '{self.namespace}': the seed was "
-            f"drawn after the algorithm was frozen. {self._multiplicity_text()}",
-            EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} without a change; it is no new "
-            "evidence.",
+        text = {
+            EvidenceKind.CONFIRMATION: f"Confirmation {self.number} of claim {self.claim[:8]}: the seed was derived "
+            "from the frozen content and the record.",
+            EvidenceKind.REPETITION: f"The run repeats confirmation {self.number} of claim {self.claim[:8]} without a "
+            "change; it is no new evidence.",
             EvidenceKind.CALIBRATION: f"Calibrated on these cases: the parameters {parameter_names} were set by "
             f"looking at the results of these cases. PASS is possible only on new cases (`marsyard run --confirm`).",
             EvidenceKind.EXPLORATION: "Exploration: the seed was chosen freely. A confirmation is a run with "
@@ -206,16 +161,21 @@ class Evidence:
             f"{changes}. PASS needs a run with --confirm, which draws a new seed.",
             EvidenceKind.CHANGED: f"Not the frozen evaluation: {changes}. PASS needs a run with --confirm.",
         }[self.kind]
+        return " ".join((text, *self._terrain_texts(), *self.notes))
 
-    def _multiplicity_text(self) -> str:
-        """Describe the effect of repeated confirmations: up to n times the risk of a false PASS (union bound)."""
-        number = self.algorithm_confirmations
-        if number <= 1:
-            return "It is the first confirmation of this algorithm on this campaign."
-        return (
-            f"It is confirmation {number} of this algorithm on this campaign, counting all its options: "
-            f"the probability that at least one of them is wrongly PASS is up to {number} times that of one."
-        )
+    def _terrain_texts(self) -> list[str]:
+        """Describe the terrains that the cases share with calibration runs or with all confirmations."""
+        texts: list[str] = []
+        if self.kind is not EvidenceKind.CONFIRMATION:
+            return texts
+        if self.imported_terrain:
+            texts.append("The terrain is an imported DTM: all confirmations are on the same ground.")
+        if self.overlap is None:
+            texts.append("It is unknown whether its terrains were used for calibration.")
+        elif self.overlap > 0.0:
+            limit = f"more than {100.0 * MAX_CALIBRATION_OVERLAP:.0f} % allow no PASS"
+            texts.append(f"{100.0 * self.overlap:.0f} % of its cases are on terrains of calibration runs; {limit}.")
+        return texts
 
 
 def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:
@@ -225,21 +185,24 @@ def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation],
     """
     configuration = campaign.configuration
     name, seed = configuration.name, configuration.seed
-    same_seed_entries = [entry for entry in confirmations if (entry.campaign, entry.seed) == (name, seed)]
-    if same_seed_entries:
-        entry = same_seed_entries[0]
+    for entry in confirmations:
+        if entry.seed != seed or (not entry.is_chained and entry.campaign != name):
+            continue
+        own_bank_seeds = bank_seeds(configuration)
         changes = entry.frozen.differences(frozen)
+        changes += [
+            f"{path} ({json.dumps(value)}, now {json.dumps(own_bank_seeds.get(path))})"
+            for path, value in entry.bank_seeds.items()
+            if own_bank_seeds.get(path) != value
+        ]
         kind = EvidenceKind.REUSED_SEED if changes else EvidenceKind.REPETITION
-        return Evidence(kind, entry.namespace, entry.number, changes=tuple(changes))
+        return Evidence(kind, entry.number, entry.claim, overlap=entry.overlap, changes=tuple(changes))
     runs = () if configuration.calibration is None else configuration.calibration.runs
     calibration_runs = [run for run in runs if (run.campaign, run.seed) == (name, seed)]
     if calibration_runs:
         options = dict.fromkeys(option for run in calibration_runs for option in run.options)
         return Evidence(EvidenceKind.CALIBRATION, changes=tuple(options))
-    # the seed of a confirmation that was not recorded
-    own_namespace = confirmation_namespace(configuration)
-    for number in range(1, _MAX_RESERVED_NUMBER + 1):
-        if confirmation_seed(own_namespace, name, number) == seed:
-            reason = "it was run without --confirm, so the seed is not in the record of confirmations"
-            return Evidence(EvidenceKind.REUSED_SEED, own_namespace, number, changes=(reason,))
+    if seed == confirmation_seed(frozen.claim, ""):
+        reason = "it was run without --confirm, so the seed is not in the record of confirmations"
+        return Evidence(EvidenceKind.REUSED_SEED, 1, frozen.claim, changes=(reason,))
     return Evidence()

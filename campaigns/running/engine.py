@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
-from marsyard.campaigns.definition.evidence import classify_evidence, freeze_algorithm
+from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
@@ -26,7 +26,7 @@ from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_ex
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.confirmations import read_confirmations, reserve_confirmation
+from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
 from marsyard.campaigns.store.products import ProductStore, create_product_selection
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
@@ -88,12 +88,7 @@ def run_campaign(
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.configuration})
         command, configuration = campaign.command, campaign.configuration
-        if campaign.confirms:
-            evidence = reserve_confirmation(campaign, directory)
-        else:
-            evidence = classify_evidence(
-                campaign, read_confirmations(campaign.confirmations), freeze_algorithm(campaign)
-            )
+        evidence = reserve_confirmation(campaign, directory) if campaign.confirms else classify_run(campaign)
         record.write_first_record(
             directory,
             configuration,
@@ -209,6 +204,9 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
         if not retries and is_complete and not _list_missing_cases(run, store):
             observer.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return
+        evidence = Evidence.read(stored.get("evidence"))
+        if evidence.kind is EvidenceKind.CONFIRMATION and evidence.claim:
+            extend_confirmation(evidence, configuration.total_cases)
         session = record.describe_session(command, run.executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         updates["sessions"] = [*stored["sessions"], session]

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import Requirement
-from marsyard.campaigns.definition.evidence import Evidence, classify_evidence, freeze_algorithm
+from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
@@ -29,7 +29,7 @@ from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.confirmations import read_confirmations
+from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
@@ -193,8 +193,7 @@ def check_margin(requirement: Requirement) -> None:
 def create_study(campaign: Campaign, directory: Path, executor: str, settings: dict[str, Any]) -> None:
     """Create the folder of a study; `settings` are stored in its record. Raises StoreError like a campaign's folder."""
     identity = create_identity(campaign.configuration)
-    confirmations = read_confirmations(campaign.confirmations)
-    evidence = classify_evidence(campaign, confirmations, freeze_algorithm(campaign))
+    evidence = classify_run(campaign)
     create_store(directory / ROWS_FILE, {"identity": identity.configuration})
     record.write_first_record(
         directory,

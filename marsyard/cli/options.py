@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 
 
 class Exit(IntEnum):
-    """Exit status of the program; if several apply, the order of precedence is 2, 1, 3."""
+    """Exit status of the program; if several apply, the order of precedence is 2, 1, 3, 4."""
 
     MET = 0  #: all requirements are met, or there are none
     FAILED = 1  #: a requirement failed, or a case crashed
     INVALID = 2  #: the command or a file is invalid
     INSUFFICIENT = 3  #: not enough cases for a verdict
+    QUALIFIED = 4  #: all requirements are met, but the evidence has a qualification, such as "PASS (unregistered)"
     INTERRUPTED = 130  #: by Ctrl-C or SIGTERM
 
 

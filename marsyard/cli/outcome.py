@@ -28,7 +28,6 @@ from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import find_renamed_columns, update_stored_rows
-from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import ProgressObserver, append_cases, run_campaign
@@ -36,7 +35,6 @@ from marsyard.campaigns.running.preparation import estimate_campaign
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.confirmations import add_result
 from marsyard.campaigns.store.products import case_directory, save_packed
 from marsyard.campaigns.store.record import is_locked, stored_configuration
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
@@ -44,13 +42,13 @@ from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
-from marsyard.reports.evaluation import Evaluation, evaluate_run, next_look
+from marsyard.reports.evaluation import Evaluation, evaluate_run, next_look, record_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
-from marsyard.reports.verdicts import ESTIMATE, Verdict, evaluate_requirements
+from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import count, format_fraction, primary_metric
 
 #: Browsers that can print pages, in order of preference, and the time limit of printing.
@@ -62,8 +60,8 @@ Requirements: TypeAlias = Sequence[Mapping[str, Any]]
 def evaluate_and_report(directory: Path, console: Console, requirements: Requirements | None = None) -> int:
     """Evaluate a campaign, write its report, print the verdicts, and return the exit status.
 
-    The status of an unfinished campaign is never 0; its verdict uses the rows stored so far. `requirements` replace the
-    requirements of the campaign; in this case the record of the campaign is not changed.
+    An unfinished campaign has no verdict, and its status is never 0. `requirements` replace the requirements of the
+    campaign; in this case the record of the campaign is not changed.
     Raises StoreError if the folder contains no campaign with rows, or the report cannot be written.
     """
     stored = record.read(directory)
@@ -102,9 +100,7 @@ def evaluate_and_store(directory: Path, requirements: Requirements | None = None
     evaluation = evaluate_run(directory, requirements)
     if requirements is None and evaluation.run.recorded("state") == "finished":
         record.update(directory, {"exit_code": evaluation.exit_code})
-        if evaluation.evidence.kind is EvidenceKind.CONFIRMATION:
-            results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
-            add_result(evaluation.evidence, evaluation.run.name, len(evaluation.run.all_cases), results)
+        record_look(evaluation)
     with report_write_errors("the report"):
         return evaluation, write_evaluation(evaluation)
 
@@ -281,10 +277,10 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, observer: 
         configuration = record.stored_configuration(directory)
         if configuration.max_cases is None:
             return
-        settings = configuration.model_dump(mode="json")
-        design, cases = read_sampling_design(settings), configuration.total_cases
-        verdicts = evaluate_requirements(read_frame(directory), settings["requirements"], design)
-        next_cases = next_look(verdicts, design, cases)
+        evaluation, cases = evaluate_run(directory), configuration.total_cases
+        # a decided verdict that is withheld for its kind of evidence needs no further cases
+        verdicts = [replace(item, status=item.withheld_status or item.status) for item in evaluation.verdicts]
+        next_cases = next_look(verdicts, evaluation.sampling, cases)
         if next_cases is None:
             observer.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return

@@ -67,20 +67,27 @@ def report(
 @handle_user_errors
 def confirmations(
     file: Annotated[Path, Argument(metavar="FILE", help="Record of the confirmations.")] = CONFIRMATIONS,
+    create: Annotated[bool, Option("--create", help="Create an empty record, to be committed to git.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List confirmations: evaluations of frozen algorithms on unseen seeds (`run --confirm`), with their results."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.store.confirmations import read_confirmations
+    from marsyard.campaigns.store.confirmations import create_record, read_confirmations
+    from marsyard.campaigns.store.registration import find_registration_problem
     from marsyard.reports.tables import confirmations_table
 
+    if create:
+        create_record(file)
+        typer.echo(f"record: {file}; to register it: git add {file} && git commit")
+        return
     if not file.is_file():
-        raise CampaignError(f"{file}: no such file; `marsyard run CAMPAIGN --confirm` creates it")
+        raise CampaignError(f"{file}: no such file; `marsyard confirmations --create` creates it")
     entries = read_confirmations(file)
     if as_json:
         typer.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
     else:
         console().print(confirmations_table(entries))
+        typer.echo(f"record: {find_registration_problem(file) or 'registered'}")
 
 
 @handle_user_errors

@@ -17,7 +17,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.reports.campaign import REPORT_JSON, SCHEMA, write_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import Algorithm, format_tested_algorithms, read_algorithms
-from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH
+from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import find_system
 
@@ -305,7 +305,12 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
 
 
 #: Order of the requirements by their latest verdict.
-_SEVERITY = ("FAIL", "INSUFFICIENT", "MET BY RATE", "PASS")
+_SEVERITY = tuple(
+    map(
+        str,
+        (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS, Status.PASS),
+    )
+)
 
 
 def _severity(row: RequirementRow) -> int:

@@ -36,7 +36,8 @@
     add(figure, "circle", {cx: points[points.length - 1][0], cy: points[points.length - 1][1], r: 2.6});
     return [figure];
   };
-  const statusClass = (status) => `status-${status.toLowerCase().replaceAll(" ", "-")}`;
+  const statusClass = (status) =>
+    status.startsWith("PASS (") ? "status-met-by-rate" : `status-${status.toLowerCase().replaceAll(" ", "-")}`;
   const updateRow = (row, cells) => {
     const verdict = row.querySelector(".verdict");
     if (!verdict) return;

@@ -23,6 +23,8 @@ from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNI
 
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py")
+#: Beginning of the identity of a terrain on an imported DTM.
+IMPORTED_TERRAIN = "DTM"
 #: Samples of the terrains that this process uses, by file: the cache does not evict these files.
 _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
 
@@ -141,14 +143,25 @@ class TerrainBank:
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))
 
+    def identity(self, number: int) -> str:
+        """Return the identity of a terrain; all terrains of a bank on one imported DTM are the same ground."""
+        source = self.parameters.source
+        if source is not None:
+            return f"{IMPORTED_TERRAIN} {self._hash_source()}"
+        return f"{self.parameters.model_dump_json(exclude={'rocks'})} {self.seed} {number}"
+
+    def _hash_source(self) -> str:
+        """Compute the hashes of the files of the imported DTM; files with the same name can have other contents."""
+        source = self.parameters.source
+        paths = [Path(name) for name in source.input_files()] if source else []
+        return " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.exists())
+
     def _path(self, number: int) -> Path:
-        # the name contains hashes of the DTM's files: files with the same name can have other contents
-        source, rocks = self.parameters.source, self.parameters.rocks
+        rocks = self.parameters.rocks
         has_tails = rocks is not None and rocks.tails is not None
         parameters = self.parameters.model_dump_json(exclude=None if has_tails else {"rocks"})
-        paths = [Path(name) for name in source.input_files()] if source else []
-        hashes = " ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths if path.exists())
-        identity = f"{parameters} {self.seed} {number} {_code_version(has_tails=has_tails)} {hashes}"
+        version = _code_version(has_tails=has_tails)
+        identity = f"{parameters} {self.seed} {number} {version} {self._hash_source()}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
     def _sides(self) -> list[int]:

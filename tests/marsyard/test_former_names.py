@@ -247,10 +247,8 @@ def test_deprecated_module_of_section_kinds_is_importable() -> None:
 
 
 def test_stored_results_with_deprecated_keys_are_read() -> None:
-    stored = Evidence(EvidenceKind.CONFIRMATION, "confirmation", 2, 3).to_table()
-    assert Evidence.read(stored).algorithm_confirmations == 3
-    stored["of_algorithm"] = stored.pop("algorithm_confirmations")
-    assert Evidence.read(stored).algorithm_confirmations == 3
+    stored = {"kind": "confirmation", "namespace": "confirmation", "number": 2, "of_algorithm": 3, "record": "c.jsonl"}
+    assert Evidence.read(stored) == Evidence(EvidenceKind.CONFIRMATION, 2, record="c.jsonl")
     result = {"searched": 20, "failures": [{"case": 7, "found_case": 4}]}
     study = read_search({"study": {"kind": "search", "requirement": "V", "result": result}})
     assert study["result"] == {"search_cases": 20, "failures": [{"case": 7, "original_case": 4}]}

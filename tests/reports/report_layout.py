@@ -6,7 +6,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-VerdictName = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE"]
+VerdictName = Literal[
+    "PASS", "FAIL", "INSUFFICIENT", "MET BY RATE", "PASS (unregistered)", "PASS (other claims)"
+]
 
 
 class _Model(BaseModel):
@@ -53,11 +55,12 @@ class Evidence(_Model):
         "reused confirmation seed",
         "not the frozen evaluation",
     ]
-    namespace: str = Field(description="namespace of the seeds of confirmations")
-    number: int = Field(description="number of the confirmation; 0 for other kinds")
-    algorithm_confirmations: int = Field(description="number of confirmations of the algorithm up to this one")
-    of_algorithm: int = Field(description="former key of `algorithm_confirmations`, until version 0.2")
+    number: int = Field(description="number of the confirmation of its claim; 0 for other kinds")
+    claim: str = Field(description="hash of the confirmed content; empty for other kinds")
     record: str = Field(description="file of the record of confirmations")
+    registration: str = Field(description="why the record was not registered when the run started; empty if it was")
+    overlap: float | None = Field(description="fraction of the cases on terrains of calibration runs; null if unknown")
+    imported_terrain: bool = Field(description="true if the cases are on an imported DTM")
     changes: list[str]
     title: str
     text: str
@@ -107,7 +110,7 @@ class RequirementVerdict(_Model):
         description="definitions of the population's columns that the flight system cannot know; may be empty"
     )
     joint_text: str = Field(
-        description="sentence: verdict if the confidence applies to all confirmations of the algorithm; may be empty"
+        description="sentence: contribution of this run to the joint evidence of its claim; may be empty"
     )
     note: str
 
@@ -185,7 +188,7 @@ class StudyDescription(_Model):
 class CampaignReport(_Model):
     """Content of `report.json`: the results of a campaign's report."""
 
-    report_schema: Literal[6] = Field(alias="schema")
+    report_schema: Literal[7] = Field(alias="schema")
     campaign: str
     state: Any = Field(description="copied from `campaign.json`, as are seed, git_commit, started_utc and finished_utc")
     seed: Any
@@ -201,7 +204,7 @@ class CampaignReport(_Model):
     )
     sampling: SamplingDescription
     evidence: Evidence
-    verdict: VerdictName | Literal["NO REQUIREMENT", "NO VERDICT"]
+    verdict: VerdictName | Literal["PASS (exploration)", "NO REQUIREMENT", "NO VERDICT"]
     sentence: str
     study: StudyDescription | None = None
     exit_code: Literal[0, 1, 3]

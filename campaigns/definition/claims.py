@@ -1,0 +1,236 @@
+"""Identity of what a confirmation confirms: the content of a campaign and its algorithms, without their names.
+
+A claim is "this algorithm meets these requirements in these cases". Its identity is a hash of the parameters,
+dispersions and sampling design, the requirements, the options and sources of the algorithms, the code of the simulation
+and the input files. Names of the campaign, of a requirement, or of the module of an algorithm are no part of it.
+Confirmations of one claim are evaluated together (`marsyard.reports.joint`). Their seeds are derived from the claim, so
+that a user cannot choose them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from marsyard.algorithms.exchange import parse_command
+from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, replace_values
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.identity import (
+    custom_sources,
+    describe_algorithms,
+    hash_code,
+    hash_inputs,
+    list_parts,
+)
+from marsyard.scenarios.imports import import_object
+from marsyard.scenarios.interface import HasAlgorithms, IdentifiesTerrains
+from marsyard.scenarios.systems import scenario_source
+from marsyard.sim.terrain.bank import IMPORTED_TERRAIN
+
+#: Keys that the hash `configuration` of a frozen algorithm does not contain: names and texts, the seed, the number of
+#: cases, limits of the run, and the requirements, which have their own hash.
+_KEYS_NOT_HASHED = frozenset(
+    {"appended", "calibration", "cases", "description", "limits", "max_cases", "name", "requirements", "retain", "seed"}
+)
+#: Keys of a requirement that determine its verdict.
+_REQUIREMENT_KEYS = ("metric", "bound", "probability", "confidence", "population", "decide_by", "accept_rate", "scale")
+#: Name of the parameters that seed the terrains of a bank; a confirmation derives them.
+_BANK_SEED = "bank_seed"
+
+
+@dataclass(frozen=True)
+class FrozenAlgorithm:
+    """All choices that a confirmation freezes.
+
+    - algorithm: name of the algorithm under test
+    - options: options of all algorithms of the campaign, under the algorithm's name, and values under `parameters`
+    - hashes: SHA-256 of `sources` (of the algorithms, with their options), `configuration` (parameters, dispersions,
+      sampling design, input files), `requirements`, and `code` (of the simulation)
+    """
+
+    algorithm: str
+    options: Mapping[str, Any]
+    hashes: Mapping[str, str]
+
+    @classmethod
+    def read(cls, stored: Mapping[str, Any]) -> Self:
+        """Read from the record of confirmations."""
+        return cls(str(stored["algorithm"]), dict(stored["options"]), dict(stored["hashes"]))
+
+    @property
+    def claim(self) -> str:
+        """Identity of the claim: SHA-256 of the hashes."""
+        return hash_json(dict(self.hashes))
+
+    def differences(self, other: FrozenAlgorithm) -> list[str]:
+        """Describe the differences from another frozen algorithm, each in a few words; empty for the same claim."""
+        if self.claim == other.claim:
+            return []
+        texts = []
+        if self.algorithm != other.algorithm:
+            texts.append(f"algorithm ({self.algorithm}, now {other.algorithm})")
+        for name in sorted({*self.options, *other.options}):
+            old, new = self.options.get(name), other.options.get(name)
+            if old != new:
+                texts.append(f"{name} ({json.dumps(old)}, now {json.dumps(new)})")
+        names = sorted({*self.hashes, *other.hashes})
+        changed_hashes = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
+        if texts and "configuration" in changed_hashes:
+            changed_hashes.remove("configuration")  # it includes the named parameters
+        return [*texts, *changed_hashes]
+
+
+def hash_json(content: Any) -> str:
+    """Compute the SHA-256 of a content in JSON."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
+    """Describe all choices that a confirmation of a campaign freezes."""
+    configuration = campaign.configuration
+    algorithms = describe_algorithms(campaign)
+    algorithm = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
+    options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
+    values = configuration.model_dump(mode="json")
+    options |= dict(leaves(values["parameters"], "parameters"))
+    frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_HASHED}
+    frozen_values["parameters"] = _remove_names(campaign, values["parameters"])
+    contents = {
+        "sources": [[entry["role"], _algorithm_content(campaign, entry), entry["options"]] for entry in algorithms],
+        "configuration": [frozen_values, sorted(hash_inputs(configuration).values())],
+        "requirements": sorted(map(requirement_key, values["requirements"])),
+        "code": hash_code((scenario_source(configuration.scenario), *list_parts(configuration))),
+    }
+    return FrozenAlgorithm(algorithm, options, {name: hash_json(content) for name, content in contents.items()})
+
+
+def _remove_names(campaign: Campaign, parameters: Mapping[str, Any]) -> Any:
+    """Remove the names of the algorithms and the seeds of the terrain banks from the parameters."""
+    removed = {path: None for path, _ in leaves(parameters) if path.rpartition(".")[2] == _BANK_SEED}
+    if isinstance(campaign.scenario, HasAlgorithms):
+        paths = (".".join((*campaign.scenario.algorithm_table, name)) for name in ("algorithm", "compared"))
+        removed |= {path: None for path in paths if find_value(parameters, path) != ()}
+    return replace_values(parameters, removed)
+
+
+def _algorithm_content(campaign: Campaign, entry: Mapping[str, Any]) -> Any:
+    """Describe an algorithm by the contents of its files.
+
+    An included algorithm keeps its name, since it selects one of several in the same sources. For the same reason, the
+    content of a Python algorithm includes the name of its class and the hash of the file that defines it.
+    """
+    spec = str(entry["spec"])
+    sources = _hash_contents(path for _, path in custom_sources(spec))
+    if isinstance(campaign.scenario, HasAlgorithms) and spec in campaign.scenario.task.shipped:
+        return [spec, entry["source_hash"]]
+    command = parse_command(spec)
+    if command is not None:
+        words = [shutil.which(command.words[0]) or command.words[0], *command.words[1:]]
+        contents = [_hash_contents([Path(word)]) if Path(word).is_file() else word for word in words]
+        return [spec.partition(":")[0], contents]
+    path = str(entry["path"])
+    if ":" not in path:  # a table of answers
+        return sources
+    return [path.rpartition(":")[2], _hash_contents(_defining_file(path)), sources]
+
+
+def _defining_file(path: str) -> list[Path]:
+    """Return the source file of the object at ``module:name``; empty if it has none."""
+    target = import_object(path)
+    try:
+        file = inspect.getsourcefile(target if inspect.isclass(target) or callable(target) else type(target))
+    except TypeError:
+        return []
+    return [] if file is None or not Path(file).is_file() else [Path(file)]
+
+
+def _hash_contents(paths: Iterable[Path]) -> list[str]:
+    """Compute the SHA-256 of the contents of files, sorted, without their names."""
+    return sorted(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths)
+
+
+def requirement_key(requirement: Mapping[str, Any]) -> str:
+    """Compute the identity of a requirement from all values that determine its verdict: 16 digits of a SHA-256."""
+    return hash_json([requirement.get(name) for name in _REQUIREMENT_KEYS])[:16]
+
+
+def confirmation_seed(claim: str, head: str) -> int:
+    """Compute the seed of a confirmation: 48 bits of a SHA-256.
+
+    head: hash of the record of confirmations at the start of the run; empty for the first confirmation of a claim
+
+    >>> confirmation_seed("0f", "") == confirmation_seed("0f", "1b")
+    False
+    """
+    return _derive("seed", claim, head)
+
+
+def bank_seeds(configuration: CampaignConfiguration) -> dict[str, int]:
+    """Return the seeds of the terrain banks of a campaign by parameter path, except dispersed ones."""
+    values = leaves(configuration.parameters)
+    return {
+        path: value
+        for path, value in values
+        if path.rpartition(".")[2] == _BANK_SEED and path not in configuration.dispersions
+    }
+
+
+def confirmation_bank_seeds(configuration: CampaignConfiguration, claim: str, head: str) -> dict[str, int]:
+    """Compute the seeds of the terrain banks of a confirmation, by parameter path; see `confirmation_seed`."""
+    return {path: _derive(path, claim, head) for path in bank_seeds(configuration)}
+
+
+def _derive(purpose: str, claim: str, head: str) -> int:
+    """Derive 48 bits from a claim and the head of the record."""
+    return int.from_bytes(hashlib.sha256(f"{purpose}\0{claim}\0{head}".encode()).digest()[:6])
+
+
+def calibration_overlap(campaign: Campaign, original_bank_seeds: Mapping[str, int]) -> float | None:
+    """Compute the fraction of cases on terrains of the declared calibration runs; None if terrains have no identity.
+
+    - campaign: a confirmation, with its seed and the seeds of its terrain banks
+    - original_bank_seeds: seeds of the terrain banks of the campaign file, which its calibration runs used
+
+    Calibration runs are assumed to have as many cases as the campaign.
+    """
+    configuration, calibration = campaign.configuration, campaign.configuration.calibration
+    runs = () if calibration is None else calibration.runs
+    seeds = {run.seed for run in runs if run.campaign == configuration.name}
+    if not isinstance(campaign.scenario, IdentifiesTerrains):
+        return None if seeds else 0.0
+    parameters = replace_values(configuration.parameters, original_bank_seeds)
+    known_terrains: set[str] = set()
+    for seed in seeds:
+        changes = {"seed": seed, "parameters": parameters}
+        calibration_run = Campaign(configuration.model_copy(update=changes), campaign.scenario)
+        known_terrains.update(*_list_terrains(calibration_run))
+    if not known_terrains:
+        return 0.0
+    cases = _list_terrains(campaign)
+    return sum(not known_terrains.isdisjoint(terrains) for terrains in cases) / len(cases)
+
+
+def uses_imported_terrain(campaign: Campaign) -> bool:
+    """Whether the cases are on an imported DTM, which a new seed of the terrain bank does not change."""
+    if not isinstance(campaign.scenario, IdentifiesTerrains):
+        return False
+    identities = campaign.scenario.terrain_identities(campaign.base_parameters(), 0)
+    return any(identity.startswith(IMPORTED_TERRAIN) for identity in identities)
+
+
+def _list_terrains(campaign: Campaign) -> list[tuple[str, ...]]:
+    """List the identities of the terrains of each case; a case with invalid draws has none."""
+    assert isinstance(campaign.scenario, IdentifiesTerrains)  # noqa: S101  (checked by the caller)
+    terrains = []
+    for case in range(campaign.configuration.total_cases):
+        try:
+            terrains.append(campaign.scenario.terrain_identities(campaign.parameters(case), case))
+        except ValueError:
+            terrains.append(())
+    return terrains

@@ -1,0 +1,123 @@
+"""Results of the cases of a requirement: joined over confirmations, and counted for their record.
+
+A confirmation is evaluated together with the earlier ones of its claim. The record of confirmations contains the number
+of cases and failures of each terrain, so that the folders of the earlier runs are not needed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+Success = Bool[np.ndarray, " n"]  #: Whether each case is a success.
+Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
+
+
+@dataclass(frozen=True)
+class CaseEvidence:
+    """Results of the cases of a population.
+
+    - success: whether each case meets the requirement
+    - groups: terrain of each case, numbered from 0; None if unknown
+    - in_first_look: mask of the cases of the first look
+    - labels: name of each terrain, if other confirmations can use the same terrains; None if each has its own
+    """
+
+    success: Success
+    groups: Groups | None
+    in_first_look: Success
+    labels: tuple[str, ...] | None = None
+
+    @property
+    def terrain_groups(self) -> Groups:
+        """Terrain of each case; a case with an unknown terrain has its own."""
+        return np.arange(self.success.size) if self.groups is None else self.groups
+
+    def join(self, other: CaseEvidence) -> CaseEvidence:
+        """Join with the cases of another confirmation."""
+        if not self.success.size or not other.success.size:
+            return self if self.success.size else other
+        groups = [self.terrain_groups, other.terrain_groups]
+        labels = None
+        if self.labels is not None and other.labels is not None:
+            labels = tuple(dict.fromkeys((*self.labels, *other.labels)))
+            index = {label: number for number, label in enumerate(labels)}
+            groups = [
+                np.array([index[label] for label in part_labels], dtype=np.int64)[part_groups]
+                for part_labels, part_groups in zip((self.labels, other.labels), groups, strict=True)
+            ]
+        else:
+            groups[1] = groups[1] + int(groups[0].max(initial=-1)) + 1
+        is_unknown = self.groups is None and other.groups is None
+        return CaseEvidence(
+            np.concatenate([self.success, other.success]),
+            None if is_unknown else np.concatenate(groups),
+            np.concatenate([self.in_first_look, other.in_first_look]),
+            labels,
+        )
+
+    def to_rows(self) -> list[list[Any]]:
+        """Count the cases of each terrain for the record of confirmations.
+
+        A row contains the cases and failures of the first look, those of later looks, and the number of terrains with
+        these values, or the name of a terrain that other confirmations can use.
+        """
+        groups, terrains = self.terrain_groups, int(self.terrain_groups.max(initial=-1)) + 1
+        first, failed = self.in_first_look, ~self.success
+        masks = (first, first & failed, ~first, ~first & failed)
+        counts = np.stack([np.bincount(groups[mask], minlength=terrains) for mask in masks], axis=1).tolist()
+        if self.labels is not None:
+            return [[*values, label] for values, label in zip(counts, self.labels, strict=True)]
+        return [[*values, number] for values, number in sorted(Counter(map(tuple, counts)).items())]
+
+    @classmethod
+    def from_rows(cls, rows: Sequence[Sequence[Any]], *, is_first: bool) -> CaseEvidence:
+        """Create the results from the rows of `to_rows`; `is_first`: whether the first look was a look at them."""
+        labels = tuple(str(row[4]) for row in rows) if rows and isinstance(rows[0][4], str) else None
+        terrains = [row[:4] for row in rows for _ in range(1 if labels is not None else int(row[4]))]
+        counts = np.array(terrains, dtype=np.int64).reshape(-1, 4)
+        # successes and failures of the first look and of later looks, terrain by terrain
+        first, first_failures, later, later_failures = counts.T
+        cells = np.stack([first - first_failures, first_failures, later - later_failures, later_failures], axis=1)
+        repeated = cells.ravel()
+        n_terrains = len(counts)
+        return cls(
+            np.repeat(np.tile([True, False, True, False], n_terrains), repeated),
+            np.repeat(np.repeat(np.arange(n_terrains), 4), repeated),
+            np.repeat(np.tile([True, True, False, False], n_terrains), repeated) & is_first,
+            labels,
+        )
+
+
+@dataclass(frozen=True)
+class RequirementEvidence:
+    """Results of the cases of a requirement: of its population, and with the unfinished cases that it excludes."""
+
+    population: CaseEvidence
+    with_unfinished: CaseEvidence
+
+    def join(self, other: RequirementEvidence) -> RequirementEvidence:
+        """Join with the cases of another confirmation."""
+        return RequirementEvidence(
+            self.population.join(other.population), self.with_unfinished.join(other.with_unfinished)
+        )
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the counts for the record of confirmations."""
+        population, with_unfinished = self.population.to_rows(), self.with_unfinished.to_rows()
+        unfinished = {} if population == with_unfinished else {"with_unfinished": with_unfinished}
+        return {"n": self.population.success.size, "failures": int((~self.population.success).sum())} | {
+            "terrains": population,
+            **unfinished,
+        }
+
+    @classmethod
+    def from_table(cls, stored: Mapping[str, Any], *, is_first: bool) -> RequirementEvidence:
+        """Create the results from the record of confirmations; see `CaseEvidence.from_rows`."""
+        rows = (stored["terrains"], stored.get("with_unfinished", stored["terrains"]))
+        return cls(*(CaseEvidence.from_rows(part, is_first=is_first) for part in rows))

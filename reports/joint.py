@@ -1,0 +1,183 @@
+"""Joint evidence of all confirmations of a claim, from their record (`marsyard.campaigns.store.confirmations`).
+
+A confirmation is a look at the cases of all confirmations of its claim. The first look of the first confirmation uses
+the ordinary bounds, every later look uses `SequentialTest`. The probability that a wrong PASS ever occurs is therefore
+at most 1 - confidence, for any number of confirmations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from marsyard.campaigns.definition.claims import requirement_key
+from marsyard.campaigns.definition.evidence import Confirmation, Evidence
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.confirmations import (
+    ConfirmationRecord,
+    find_own_entry,
+    is_variant,
+    list_related_claims,
+    read_record,
+)
+from marsyard.campaigns.store.registration import UNKNOWN, find_registration_problem
+from marsyard.reports.case_evidence import RequirementEvidence
+from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.wording import count
+
+#: Statuses that a claim can have passed with.
+_PASSED = frozenset({Status.PASS, Status.UNREGISTERED, Status.OTHER_CLAIMS})
+#: Maximum number of related claims that are listed in a verdict.
+_MAX_LISTED = 10
+
+
+@dataclass(frozen=True)
+class JointEvidence:
+    """Contents of the record of confirmations about the claim of a run.
+
+    - is_confirmation: whether the run is a confirmation, or repeats one
+    - registration: why the record does not show all earlier runs; empty if it does
+    - own: entry of the run; None if the record does not contain it
+    - others: other confirmations of the claim, by number
+    - related: confirmations of other claims that began earlier, by claim (`list_related_claims`)
+    """
+
+    is_confirmation: bool = False
+    registration: str = ""
+    own: Confirmation | None = None
+    others: Sequence[Confirmation] = field(default_factory=tuple)
+    related: Sequence[Sequence[Confirmation]] = field(default_factory=tuple)
+
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of all confirmations whose cases are joined."""
+        own = [] if self.own is None else [self.own.number]
+        return sorted([*own, *(entry.number for entry in self.others if entry.counts)])
+
+    def earlier_evidence(self, requirement: Mapping[str, Any]) -> RequirementEvidence | None:
+        """Join the evidence of the other confirmations for a requirement; None if there is none."""
+        key, joined = requirement_key(requirement), None
+        for entry in self.others:
+            if key not in entry.counts:
+                continue
+            part = RequirementEvidence.from_table(entry.counts[key], is_first=entry.number == 1)
+            joined = part if joined is None else joined.join(part)
+        return joined
+
+    def find_block(self, cases: int) -> str:
+        """Describe an unfinished confirmation, which blocks PASS; empty if all are finished.
+
+        cases: number of cases of the run
+        """
+        if self.own is not None and cases < self.own.cases:
+            return (
+                f"The record announces {count(self.own.cases, 'case')} of confirmation {self.own.number}; this folder "
+                f"contains {cases:,}. PASS needs all of them."
+            )
+        unfinished = next((entry for entry in self.others if entry.is_unfinished), None)
+        if unfinished is None:
+            return ""
+        return (
+            f"Confirmation {unfinished.number} was started on {unfinished.started_utc[:10]} in the folder "
+            f"{unfinished.folder} and is not finished. PASS needs its result: `marsyard resume`, or --confirm again."
+        )
+
+    def find_failure(self, requirement_id: str) -> Confirmation | None:
+        """Return the first confirmation of the claim at which a requirement was FAIL; None without one."""
+        entries = [*self.others, *([] if self.own is None else [self.own])]
+        failed = [entry for entry in entries if requirement_id in entry.failed]
+        return min(failed, key=lambda entry: entry.number, default=None)
+
+    def is_qualified(self, requirement_id: str) -> bool:
+        """Whether PASS of a requirement needs a decision of a person."""
+        return bool(self.registration) or self.has_failed_variant(requirement_id)
+
+    def has_failed_variant(self, requirement_id: str) -> bool:
+        """Whether an earlier claim about the same campaign has not passed a requirement."""
+        variants = [
+            entries[-1] for entries in self.related if self.own is not None and is_variant(entries[-1], self.own)
+        ]
+        return any(
+            entry.is_unfinished or (entry.results or {}).get(requirement_id) not in _PASSED for entry in variants
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The state of the record, and other claims with their results, in sentences."""
+        texts = [self.registration] if self.registration else []
+        if len(self.numbers) > 1:
+            numbers = ", ".join(map(str, self.numbers))
+            texts.append(f"The verdicts are those of the joint evidence of the confirmations {numbers} of this claim.")
+        if self.related:
+            claims = "; ".join(_describe_claim(entries) for entries in self.related[-_MAX_LISTED:])
+            omitted = f", the last {_MAX_LISTED} of them" if len(self.related) > _MAX_LISTED else ""
+            texts.append(f"Other claims: {len(self.related)}{omitted}: {claims}.")
+        return tuple(texts)
+
+
+def _describe_claim(entries: Sequence[Confirmation]) -> str:
+    """Describe a claim by its campaign, its algorithm and its latest results."""
+    entry = entries[-1]
+    results = ", ".join(f"{name} {status}" for name, status in (entry.results or {}).items()) or "no requirement"
+    results = "not finished" if entry.is_unfinished else results
+    claim = f"claim {entry.claim[:8]}" if entry.is_chained else "an earlier version"
+    return f"{entry.campaign} with {entry.frozen.algorithm} ({claim}, {entry.started_utc[:10]}): {results}"
+
+
+def read_joint_evidence(evidence: Evidence) -> JointEvidence:
+    """Read what the record of confirmations contains about the claim of a run."""
+    if not evidence.is_confirmation:
+        return JointEvidence()
+    if not evidence.claim:
+        return JointEvidence(True, f"{UNKNOWN}: an earlier version recorded this confirmation.")
+    path = Path(evidence.record)
+    try:
+        record = read_record(path)
+    except StoreError as error:
+        return JointEvidence(True, f"{UNKNOWN}: {error}.")
+    registration = find_registration_problem(path)
+    own = find_own_entry(record, evidence)
+    if own is None:
+        return JointEvidence(True, registration or f"{UNKNOWN}: {path} does not contain this run.")
+    return _joint_evidence(record, own, evidence.registration or registration)
+
+
+def _joint_evidence(record: ConfirmationRecord, own: Confirmation, registration: str) -> JointEvidence:
+    """Collect the confirmations of the claim, and related claims."""
+    entries = record.of_claim(own.claim)
+    others = [entry for entry in entries if entry.number != own.number]
+    return JointEvidence(True, registration, own, others, list_related_claims(record, entries))
+
+
+def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdict:
+    """Replace the status of a verdict where the record of confirmations shows more than the numbers.
+
+    FAIL of an earlier look remains; an unfinished confirmation results in INSUFFICIENT. PASS is marked if the record is
+    not registered, or if other claims about the campaign have not passed.
+    """
+    failure = joint.find_failure(verdict.requirement_id)
+    if failure is not None and verdict.status is not Status.FAIL:
+        reason = (
+            f"Confirmation {failure.number} of this claim resulted in FAIL, which is final: a changed algorithm is a "
+            "new claim."
+        )
+        return replace(verdict, status=Status.FAIL, reason=reason, further_cases=None)
+    block = joint.find_block(cases)
+    if block and verdict.status in (Status.PASS, Status.MET_BY_RATE):
+        return replace(verdict, status=Status.INSUFFICIENT, reason=block, further_cases=None)
+    if verdict.status is not Status.PASS:
+        return verdict
+    if joint.registration:
+        return replace(verdict, status=Status.UNREGISTERED)
+    return replace(verdict, status=Status.OTHER_CLAIMS) if joint.has_failed_variant(verdict.requirement_id) else verdict
+
+
+def describe_contribution(verdict: Verdict, own: RequirementEvidence | None, joint: JointEvidence) -> Verdict:
+    """Add the numbers of the run itself to a verdict that joins several confirmations."""
+    if own is None or len(joint.numbers) < 2:
+        return verdict
+    failures, cases = int((~own.population.success).sum()), own.population.success.size
+    text = f"This run alone: {failures:,} of {count(cases, 'case')} failed."
+    return replace(verdict, joint_text=text)
