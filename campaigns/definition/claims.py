@@ -163,7 +163,7 @@ def requirement_key(requirement: Mapping[str, Any]) -> str:
 def confirmation_seed(claim: str, head: str) -> int:
     """Compute the seed of a confirmation: 48 bits of a SHA-256.
 
-    head: hash of the record of confirmations at the start of the run; empty for the first confirmation of a claim
+    head: hash of the record up to the latest entry of the claim; empty for the first confirmation of a claim
 
     >>> confirmation_seed("0f", "") == confirmation_seed("0f", "1b")
     False

@@ -52,6 +52,7 @@ class Confirmation:
     - results: status of each requirement at the latest look, by name; None before the first look
     - counted_cases, counts: number of cases and evidence of the latest look (`marsyard.reports.joint`)
     - failed: names of the requirements that were FAIL at any look
+    - head: SHA-256 of the record up to the latest entry of the confirmation; the next confirmation depends on it
     - is_chained: False for an entry of an earlier version, which is not part of the chain of hashes
     """
 
@@ -73,6 +74,7 @@ class Confirmation:
     counted_cases: int = 0
     counts: Mapping[str, Any] = field(default_factory=dict)
     failed: tuple[str, ...] = ()
+    head: str = ""
     is_chained: bool = True
 
     @property

@@ -112,7 +112,7 @@ def _parse_record(path: Path, content: bytes) -> ConfirmationRecord:
             raise StoreError(f"{location}: the chain of hashes is broken: an earlier entry was changed or removed")
         is_chained = True
         try:
-            _add_entry(entries, kind, stored, head)
+            _add_entry(entries, kind, stored, digest.hexdigest())
         except (ValueError, KeyError, TypeError) as error:
             raise StoreError(f"{location} is not an entry of a record of confirmations: {error}") from error
     return ConfirmationRecord(tuple(entries.values()), digest.hexdigest(), is_chained)
@@ -130,21 +130,24 @@ def _add_former_entry(entries: dict[object, Confirmation], stored: Mapping[str, 
 
 
 def _add_entry(entries: dict[object, Confirmation], kind: str, stored: Mapping[str, Any], head: str) -> None:
-    """Add an entry of the chain. Raises ValueError if it contradicts the entries before it."""
+    """Add an entry of the chain; `head` is the hash with this entry.
+
+    Raises ValueError if the entry contradicts those before it.
+    """
     if kind == "chain":
         return
     key = (str(stored["claim"]), int(stored["number"]))
     if kind == "start":
         values = {name: stored[name] for name in (*_START_KEYS, *_CHAINED_KEYS)}
-        entry = Confirmation(frozen=FrozenAlgorithm.read(stored["frozen"]), **values)
+        entry = Confirmation(frozen=FrozenAlgorithm.read(stored["frozen"]), head=head, **values)
         claim_entries = [item for item in entries.values() if item.is_chained and item.claim == entry.claim]
         if entry.claim != entry.frozen.claim or entry.number != len(claim_entries) + 1:
             raise ValueError("the claim or its number does not agree with the content")
-        if entry.seed != confirmation_seed(entry.claim, head if claim_entries else ""):
+        if entry.seed != confirmation_seed(entry.claim, claim_entries[-1].head if claim_entries else ""):
             raise ValueError("the seed does not follow from the claim and the entries before it")
         entries[key] = entry
     elif kind == "extension":
-        entries[key] = replace(entries[key], cases=int(stored["cases"]))
+        entries[key] = replace(entries[key], cases=int(stored["cases"]), head=head)
     else:
         entry, results = entries[key], dict(stored["results"])
         failed = (*entry.failed, *(name for name, status in results.items() if status == "FAIL"))
@@ -155,6 +158,7 @@ def _add_entry(entries: dict[object, Confirmation], kind: str, stored: Mapping[s
             counted_cases=int(stored["cases"]),
             counts=dict(stored["counts"]),
             failed=tuple(dict.fromkeys(failed)),
+            head=head,
         )
 
 
@@ -171,13 +175,15 @@ class _Seeds:
 def _derive_seeds(campaign: Campaign, claim: str, record: ConfirmationRecord) -> _Seeds:
     """Derive the seeds of the next confirmation of a claim.
 
-    An unfinished confirmation is repeated: to stop a run and to start it again gives the same cases.
+    The first confirmation depends on the claim alone, a later one on the record up to the latest entry of the claim: a
+    record that lost its last entries, or has entries of other claims, gives the same seeds. An unfinished confirmation
+    is repeated: a run that is stopped and started again has the same cases.
     """
     entries = record.of_claim(claim)
     if entries and entries[-1].is_unfinished:
         entry = entries[-1]
         return _Seeds(entry.number, entry.seed, entry.bank_seeds, entry)
-    head = record.head if entries else ""
+    head = entries[-1].head if entries else ""
     banks = confirmation_bank_seeds(campaign.configuration, claim, head)
     return _Seeds(len(entries) + 1, confirmation_seed(claim, head), banks)
 

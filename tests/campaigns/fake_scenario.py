@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.cache import CacheWarning
 from marsyard.sim.streams import Streams
+from marsyard.sim.terrain.bank import IMPORTED_TERRAIN
 
 
 class Wind(BaseModel):
@@ -30,6 +32,7 @@ class FakeParameters(BaseModel):
 
     - *_cases: numbers of the cases with this fault
     - shared: number of shared inputs; fail_prepare: their preparation fails; cache: folder with a file per input
+    - bank_seed: seed of the terrains; is_imported: all terrains are on one imported DTM
     - table: path of an input file; products: "good", or "bad" for products that cannot be stored
     - error_scale: standard deviation of each velocity error component, m/s; sleep_s: duration of a case
     """
@@ -38,7 +41,9 @@ class FakeParameters(BaseModel):
 
     altitude_m: float = Field(default=2000.0, gt=0.0)
     lowest_altitude_m: float = Field(default=0.0, ge=0.0)
-    terrain: int = Field(default=0, ge=0, le=9)
+    terrain: int = Field(default=0, ge=0, le=99)
+    bank_seed: int = Field(default=1, ge=0)
+    is_imported: bool = False
     kind: str = Field(default="plain", pattern="^[a-z]+$")
     wind: Wind = Wind()
     heights_m: tuple[float, float] = (1.0, 2.0)
@@ -105,6 +110,11 @@ class FakeScenario:
             raise OSError("the disk is full")
         Path(parameters.cache, f"shared-{shared_input}").touch()
 
+    def terrain_identities(self, parameters: FakeParameters, case: int) -> tuple[str, ...]:
+        if parameters.is_imported:
+            return (f"{IMPORTED_TERRAIN} file",)
+        return (f"{parameters.bank_seed} {parameters.terrain}",)
+
     def run(self, parameters: FakeParameters, streams: Streams) -> CaseResult:
         time.sleep(parameters.sleep_s)
         if streams.case in parameters.raising_cases:
@@ -115,6 +125,9 @@ class FakeScenario:
         has_answer = streams.case not in parameters.unanswered_cases
         # the environment variable imitates a change of the algorithm's code
         scale = parameters.error_scale * float(os.environ.get("FAKE_ERROR_SCALE", "1"))
+        # the environment variable imitates a bad result by chance
+        if str(streams.case) in os.environ.get("FAKE_FAILING_CASES", "").split():
+            scale *= 1e9
         error = scale * streams.generator("noise").normal(size=2) if has_answer else np.full(2, np.nan)
         row = {
             "velocity_error_m_s": np.hypot(*error),
@@ -145,3 +158,23 @@ class SelectingScenario(FakeScenario):
 
     def missing_bytes(self, parameters: FakeParameters, shared_input: int) -> int:
         return 0 if Path(parameters.cache, f"shared-{shared_input}").exists() else 1_000_000
+
+
+class TestedParameters(FakeParameters):
+    """Parameters of `TestedScenario`; `algorithm` is the path ``module:Class`` of a class in the current folder."""
+
+    __test__ = False
+
+    algorithm: str
+    compared: tuple[str, ...] = ()
+
+
+class TestedScenario(FakeScenario):
+    """A scenario with an algorithm under test, which it does not call."""
+
+    __test__ = False
+
+    name = "tested"
+    parameters_type = TestedParameters
+    task = VELOCITY
+    algorithm_table: tuple[str, ...] = ()

@@ -1,200 +1,258 @@
-"""Tests of confirmations: runs on calibration seeds give no PASS; confirmation runs are recorded and shown.
+"""Tests of confirmations: runs on calibration seeds give no PASS; confirmations are recorded, joined and shown.
 
-A confirmation (`marsyard run --confirm`) evaluates fixed options on a new seed. The seed is computed from namespace,
-campaign and number of the confirmation. Algorithm, options and requirements are frozen: with others there is no PASS.
+A confirmation (`marsyard run --confirm`) evaluates frozen content on a seed that is derived from it. The record of
+confirmations is committed to git; `test_confirmation_attacks.py` contains attempts to obtain PASS without evidence.
 """
 
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind, confirmation_seed
+from marsyard.campaigns.definition.claims import confirmation_seed, freeze_algorithm
+from marsyard.campaigns.definition.evidence import EvidenceKind
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.confirmations import read_confirmations
-from marsyard.cli import app as cli
-from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, write_campaign
+from marsyard.campaigns.store.confirmations import create_record, read_confirmations, read_record
+from marsyard.campaigns.store.registration import find_registration_problem
+from marsyard.sim.terrain.bank import TerrainBank
+from tests.marsyard.confirmation_project import (
+    BAD_LUCK,
+    CALIBRATION,
+    CAMPAIGN,
+    RECORD,
+    Command,
+    commit_all,
+    create_project,
+    git,
+    make_command,
+    read_evidence,
+    read_statuses,
+)
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
-Command = Callable[..., tuple[int, str, str]]
-#: The lower bound of 10 cases without failure is 0.1^(1/10) = 79 % at 90 % confidence (PASS), and 0.05^(1/10) = 74 % at
-#: 95 % (INSUFFICIENT for two confirmations together).
-REQUIREMENT = """
-[[requirements]]
-id = "VELOCITY"
-statement = "The error is small."
-metric = "velocity_error_m_s"
-bound = 1000.0
-probability = 0.75
-confidence = 0.9
-"""
-CALIBRATION = """
-[calibration]
-namespace = "review-board"
-
-[[calibration.runs]]
-options = ["error_scale"]
-campaign = "fake"
-seed = 5
-note = "the scale was adjusted to these cases"
-"""
+SHIPPED_RECORD = Path(__file__).parents[2] / "benchmarks" / "results" / RECORD
+FAILING_CASES = "FAKE_FAILING_CASES"
 
 
 @pytest.fixture
 def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Return a function that runs the command line in an empty folder: exit code, standard output and error."""
-    monkeypatch.chdir(tmp_path)
-
-    def run_command(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        captured = capfd.readouterr()
-        return int(error_info.value.code or 0), captured.out, captured.err
-
-    return run_command
+    """Create a repository with a campaign of 10 cases, and return a function that runs the command line in it."""
+    create_project(tmp_path)
+    return make_command(capfd, monkeypatch, tmp_path)
 
 
-@pytest.fixture
-def campaign(tmp_path: Path) -> Path:
-    """Write a campaign of 10 cases that all meet the requirement; the option `error_scale` is calibrated on seed 5."""
-    return write_campaign(
-        tmp_path,
-        top_level_keys=TOP_LEVEL_KEYS.replace("cases = 12", "cases = 10"),
-        dispersions='[dispersions]\nterrain = { distribution = "in-turn", low = 0, high = 9 }\n',
-        requirement=REQUIREMENT,
-        extra_tables=CALIBRATION,
-    )
+def confirm(marsyard: Command, name: str, *arguments: object) -> tuple[int, list[str]]:
+    """Run a confirmation in the folder `name`; return its exit status and the statuses of its requirements."""
+    output = marsyard("run", "fake.toml", "--confirm", "--jobs", 1, "--out", name, *arguments)
+    return output.status, read_statuses(Path(name)) if Path(name, "report.json").exists() else []
 
 
-def _read_evidence(directory: Path) -> Evidence:
-    return Evidence.read(json.loads((directory / "campaign.json").read_text())["evidence"])
+def test_run_on_a_seed_used_for_calibration_cannot_pass(marsyard: Command, tmp_path: Path) -> None:
+    (tmp_path / "fake.toml").write_text(CAMPAIGN + CALIBRATION)
+    output = marsyard("run", "fake.toml", "--out", "calibration", "--jobs", 1)
+    assert (output.status, read_statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
+    assert "The verdict would be PASS. Calibrated on these cases" in output.text
+    assert "error_scale" in output.out
+    assert read_evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
 
 
-def _read_statuses(directory: Path) -> list[str]:
-    return [verdict["status"] for verdict in json.loads((directory / "report.json").read_text())["verdicts"]]
+def test_exploration_states_in_its_headline_that_it_is_no_confirmation(marsyard: Command, tmp_path: Path) -> None:
+    output = marsyard("run", "fake.toml", "--out", "run", "--jobs", 1)
+    assert (output.status, "verdict: PASS (exploration)" in output.out) == (0, True)
+    assert "evidence: Exploration" in output.out
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["verdict"] == "PASS (exploration)"
 
 
-def test_run_on_a_seed_used_for_calibration_cannot_pass(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    status, out, _ = marsyard("run", campaign, "--out", tmp_path / "calibration", "--jobs", 1)
-    assert (status, _read_statuses(tmp_path / "calibration")) == (3, ["INSUFFICIENT"])
-    assert "The verdict would be PASS. Calibrated on these cases" in " ".join(out.split())
-    assert "error_scale" in out
-    assert _read_evidence(tmp_path / "calibration").kind is EvidenceKind.CALIBRATION
-    # a seed on which no option was calibrated can pass
-    status, out, _ = marsyard("run", campaign, "--seed", 6, "--out", tmp_path / "unused-seed", "--jobs", 1)
-    assert (status, _read_statuses(tmp_path / "unused-seed")) == (0, ["PASS"])
-    assert "evidence: Exploration" in out
+def test_first_confirmation_with_a_committed_record_passes(marsyard: Command, tmp_path: Path) -> None:
+    campaign = load_campaign("fake.toml")
+    claim = freeze_algorithm(campaign).claim
+    assert confirm(marsyard, "run-1") == (0, ["PASS"])
+    (entry,) = read_confirmations(tmp_path / RECORD)
+    assert (entry.claim, entry.number, entry.cases, entry.results) == (claim, 1, 10, {"VELOCITY": "PASS"})
+    stored = json.loads((tmp_path / "run-1" / "campaign.json").read_text())
+    # seed and seed of the terrains follow from the content alone
+    assert stored["seed"] == entry.seed == confirmation_seed(claim, "") != campaign.configuration.seed
+    assert stored["configuration"]["parameters"]["bank_seed"] == entry.bank_seeds["bank_seed"] > 1
+    assert marsyard("confirmations").out.endswith("record: registered\n")
+    # the recorded command repeats the run with the same terrains
+    words = stored["command"]["words"]
+    assert [f"bank_seed={entry.bank_seeds['bank_seed']}" in words, str(entry.seed) in words] == [True, True]
 
 
-def test_run_on_a_seed_used_for_calibration_can_fail(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    arguments = ("run", campaign, "--set", "error_scale=1e9", "--out", out, "--jobs", 1)
-    assert (marsyard(*arguments)[0], _read_statuses(out)) == (1, ["FAIL"])
-
-
-def test_confirmation_passes_and_its_seed_cannot_be_used_for_other_options(
-    campaign: Path, marsyard: Command, tmp_path: Path
+def test_second_confirmation_adds_its_cases_to_the_first(
+    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folders = {name: tmp_path / name for name in ("first", "changed", "repeated", "second")}
-    seed = confirmation_seed("review-board", "fake", 1)
-    status, out, _ = marsyard("run", campaign, "--confirm", "--out", folders["first"], "--jobs", 1)
-    assert (status, _read_statuses(folders["first"])) == (0, ["PASS"])
-    assert "evidence: Confirmation 1 in the namespace 'review-board'" in out
-    assert json.loads((folders["first"] / "campaign.json").read_text())["seed"] == seed
-    (entry,) = read_confirmations(tmp_path / "confirmations.jsonl")
-    assert (entry.seed, entry.number, entry.cases, entry.results) == (seed, 1, 10, {"VELOCITY": "PASS"})
-
-    # a run with another option on the same seed is marked as reuse of the seed and cannot be PASS
-    arguments = ("run", campaign, "--set", "error_scale=0.5")
-    status, out, _ = marsyard(*arguments, "--seed", seed, "--out", folders["changed"], "--jobs", 1)
-    assert (status, _read_statuses(folders["changed"])) == (3, ["INSUFFICIENT"])
-    assert "parameters.error_scale (1.0, now 0.5)" in " ".join(out.split())
-    assert _read_evidence(folders["changed"]).kind is EvidenceKind.REUSED_SEED
-    page = (folders["changed"] / "report.html").read_text()
-    assert "reused confirmation seed 1" in page
-    assert "parameters.error_scale (1.0, now 0.5)" in page
-
-    # a second run with the same options is a repetition
-    assert marsyard("run", campaign, "--seed", seed, "--out", folders["repeated"], "--jobs", 1)[0] == 0
-    assert _read_evidence(folders["repeated"]).kind is EvidenceKind.REPETITION
-
-    # the changed option needs a new confirmation seed; the output states the correction for two confirmations
-    status, out, _ = marsyard(*arguments, "--confirm", "--out", folders["second"], "--jobs", 1)
-    output = " ".join(out.split())
-    assert (status, _read_evidence(folders["second"]).algorithm_confirmations) == (0, 2)
-    assert "up to 2 times that of one" in output
-    assert "for all 2 confirmations together (each at 95.00 %): INSUFFICIENT" in output
-    second = json.loads((folders["second"] / "campaign.json").read_text())
-    assert second["seed"] == confirmation_seed("review-board", "fake", 2)
-    status, out, _ = marsyard("confirmations", "--json")
-    assert (status, [entry["results"] for entry in json.loads(out)]) == (0, [{"VELOCITY": "PASS"}] * 2)
-    assert marsyard("confirmations")[1].count("PASS") == 2
-
-    # requirements that were not frozen with the confirmation give no PASS
-    requirements = tmp_path / "requirements.toml"
-    requirements.write_text(REQUIREMENT.replace("0.75", "0.7") + 'campaigns = ["fake"]\n')
-    status, out, _ = marsyard("report", folders["second"], "--requirements", requirements)
-    assert (status, "requirements other than those of the campaign" in " ".join(out.split())) == (3, True)
-
-    # the dashboard shows the kind of evidence
-    assert marsyard("dashboard", tmp_path, "--out", tmp_path / "site")[0] == 0
-    index = (tmp_path / "site" / "index.html").read_text()
-    assert all(
-        title in index for title in ("confirmation 1", "not the frozen evaluation", "reused confirmation seed 1")
-    )
-    assert "not the frozen evaluation" in (tmp_path / "site" / "verification.csv").read_text()
+    with monkeypatch.context() as context:
+        context.setenv(FAILING_CASES, "4 6")
+        assert confirm(marsyard, "run-1") == (3, ["INSUFFICIENT"])
+    commit_all(tmp_path)
+    # 10 cases without failure would be PASS; 20 with two failures are not
+    assert confirm(marsyard, "run-2") == (3, ["INSUFFICIENT"])
+    report = json.loads((tmp_path / "run-2" / "report.json").read_text())
+    assert [report["verdicts"][0][name] for name in ("n", "failures", "terrains")] == [20, 2, 20]
+    assert "This run alone: 0 of 10 cases failed." in report["verdicts"][0]["note"]
+    assert "joint evidence of the confirmations 1, 2" in report["evidence"]["text"]
+    first, second = read_confirmations(tmp_path / RECORD)
+    assert second.seed == confirmation_seed(second.claim, first.head) != first.seed
+    assert second.bank_seeds != first.bank_seeds
+    # 50 cases with two failures are PASS, and so is the report of the first run
+    assert confirm(marsyard, "run-3", "-n", 30) == (0, ["PASS"])
+    assert marsyard("report", "run-1").status == 0
+    assert json.loads((tmp_path / "run-1" / "report.json").read_text())["verdicts"][0]["n"] == 50
+    assert len(read_confirmations(tmp_path / RECORD)) == 3
 
 
-@pytest.mark.slow
-def test_run_on_the_seed_of_a_later_confirmation_is_recognised(
-    campaign: Path, marsyard: Command, tmp_path: Path
+def test_unregistered_record_is_stated(marsyard: Command, tmp_path: Path) -> None:
+    git(tmp_path, "rm", "-q", "--cached", RECORD)
+    git(tmp_path, "commit", "-q", "-m", "no record")
+    (tmp_path / RECORD).unlink()
+    assert confirm(marsyard, "run-1") == (4, ["PASS (unregistered)"])
+    output = marsyard("report", "run-1")
+    assert (output.status, "No record of earlier runs is known here" in output.text) == (4, True)
+    page = (tmp_path / "run-1" / "report.html").read_text()
+    assert "No record of earlier runs is known here" in page
+    assert "PASS (unregistered)" in page
+    assert marsyard("dashboard", tmp_path, "--out", "site").status == 0
+    assert "PASS (unregistered)" in (tmp_path / "site" / "index.html").read_text()
+    # without the record there is no entry of the run
+    (tmp_path / RECORD).unlink()
+    assert marsyard("report", "run-1").status == 4
+
+
+def test_stopped_confirmation_is_repeated_with_the_same_cases(marsyard: Command, tmp_path: Path) -> None:
+    confirm(marsyard, "run-1")
+    path = tmp_path / RECORD
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))  # as if the run had been killed
+    assert read_confirmations(path)[0].is_unfinished
+    output = marsyard("run", "fake.toml", "--confirm", "--out", "run-2", "-n", 9)
+    assert (output.status, "repeat it with all its cases: --confirm -n 10" in output.err) == (2, True)
+    assert confirm(marsyard, "run-3") == (0, ["PASS"])
+    (entry,) = read_confirmations(path)
+    assert (entry.number, entry.is_unfinished) == (1, False)
+    rows = [json.loads((tmp_path / name / "campaign.json").read_text())["seed"] for name in ("run-1", "run-3")]
+    assert rows[0] == rows[1]
+
+
+def test_appended_cases_are_announced_in_the_record(
+    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seed = confirmation_seed("review-board", "fake", 3)
-    status, out, _ = marsyard("run", campaign, "--seed", seed, "--out", tmp_path / "early", "--jobs", 1)
-    assert (status, "run without --confirm" in " ".join(out.split())) == (3, True)
+    confirm(marsyard, "run-1")
+    (tmp_path / "copy").mkdir()
+    for name in ("campaign.json", "cases.parquet", "cases.sqlite"):
+        (tmp_path / "copy" / name).write_bytes((tmp_path / "run-1" / name).read_bytes())
+    monkeypatch.setenv(*BAD_LUCK)
+    assert marsyard("append", "run-1", 10, "--jobs", 1).status == 3
+    (entry,) = read_confirmations(tmp_path / RECORD)
+    assert (entry.cases, entry.counted_cases, entry.first_cases) == (20, 20, 10)
+    (counts,) = entry.counts.values()
+    assert counts["terrains"] == [[0, 0, 1, 1, 10], [1, 0, 0, 0, 10]]
+    # a copy of the folder before the appended cases is not the confirmation
+    output = marsyard("report", "copy")
+    reason = "The record announces 20 cases of confirmation 1; this folder contains 10."
+    assert (output.status, reason in output.text) == (3, True)
 
 
-def test_changed_code_invalidates_a_confirmation(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    directory = tmp_path / "run"
-    marsyard("run", campaign, "--confirm", "--out", directory, "--jobs", 1)
-    path = directory / "campaign.json"
+def test_changed_code_invalidates_a_confirmation(marsyard: Command, tmp_path: Path) -> None:
+    confirm(marsyard, "run-1")
+    path = tmp_path / "run-1" / "campaign.json"
     record = json.loads(path.read_text())
     record["changes"] = [{"utc": "", "cases_before": 3, "in": ["code (abc, now def)"]}]
     path.write_text(json.dumps(record))
-    status, out, _ = marsyard("report", directory)
-    assert (status, "code (abc, now def)" in " ".join(out.split())) == (3, True)
+    output = marsyard("report", "run-1")
+    assert (output.status, "code (abc, now def)" in output.text) == (3, True)
 
 
-def test_errors_are_reported_before_the_first_case(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    status, _, err = marsyard("run", campaign, "--confirm", "--seed", 3)
-    assert (status, "--confirm and --seed cannot be combined" in err) == (2, True)
-    (tmp_path / "confirmations.jsonl").write_text("{}\n")
-    status, _, err = marsyard("run", campaign, "--confirm", "--out", tmp_path / "run")
-    assert (status, "confirmations.jsonl:1 is not an entry" in err) == (2, True)
+def test_other_requirements_invalidate_a_confirmation(marsyard: Command, tmp_path: Path) -> None:
+    confirm(marsyard, "run-1")
+    text = CAMPAIGN[CAMPAIGN.index("[[requirements]]") :].replace("0.75", "0.7")
+    (tmp_path / "requirements.toml").write_text(text + 'campaigns = ["fake"]\n')
+    output = marsyard("report", "run-1", "--requirements", "requirements.toml")
+    assert (output.status, "requirements other than those of the campaign" in output.text) == (3, True)
+
+
+def test_seed_of_the_first_confirmation_is_recognised_without_record(marsyard: Command) -> None:
+    seed = confirmation_seed(freeze_algorithm(load_campaign("fake.toml")).claim, "")
+    output = marsyard("run", "fake.toml", "--seed", seed, "--out", "early", "--jobs", 1)
+    assert (output.status, "run without --confirm" in output.text) == (3, True)
+
+
+def test_errors_are_reported_before_the_first_case(marsyard: Command, tmp_path: Path) -> None:
+    output = marsyard("run", "fake.toml", "--confirm", "--seed", 3)
+    assert (output.status, "--confirm and --seed cannot be combined" in output.err) == (2, True)
+    (tmp_path / RECORD).write_text("{}\n")
+    output = marsyard("run", "fake.toml", "--confirm", "--out", "run")
+    assert (output.status, f"{RECORD}:1 is not an entry" in output.err) == (2, True)
     with pytest.raises(StoreError, match="not an entry"):
-        read_confirmations(tmp_path / "confirmations.jsonl")
-    status, _, err = marsyard("confirmations", tmp_path / "none.jsonl")
-    assert (status, "no such file" in err) == (2, True)
-    text = campaign.read_text().replace('options = ["error_scale"]', 'options = ["eror_scale"]')
-    campaign.write_text(text)
-    status, _, err = marsyard("run", campaign)
-    assert (status, "calibration.runs[0].options[0]" in err, "error_scale" in err) == (2, True, True)
+        read_confirmations(tmp_path / RECORD)
+    output = marsyard("confirmations", "none.jsonl")
+    assert (output.status, "no such file" in output.err) == (2, True)
+    output = marsyard("confirmations", "--create")
+    assert (output.status, "exists" in output.err) == (2, True)
+    (tmp_path / "fake.toml").write_text(CAMPAIGN + CALIBRATION.replace("error_scale", "eror_scale"))
+    output = marsyard("run", "fake.toml")
+    assert (output.status, "calibration.runs[0].options[0]" in output.err) == (2, True)
 
 
-@pytest.mark.slow
-def test_interrupted_confirmation_stays_in_the_record(campaign: Path, marsyard: Command, tmp_path: Path) -> None:
-    """A run that stopped after it had reserved its seed counts in the correction of the next confirmation."""
-    marsyard("run", campaign, "--confirm", "--out", tmp_path / "first", "--jobs", 1)
-    path = tmp_path / "confirmations.jsonl"
-    path.write_text(path.read_text().splitlines()[0] + "\n")
-    marsyard("run", campaign, "--confirm", "--out", tmp_path / "second", "--jobs", 1)
-    first, second = read_confirmations(path)
-    assert (first.results, second.number, _read_evidence(tmp_path / "second").algorithm_confirmations) == (None, 2, 2)
+def test_chain_contains_the_hash_of_all_earlier_bytes(tmp_path: Path) -> None:
+    path = tmp_path / RECORD
+    create_record(path)
+    assert read_record(path).is_chained
+    line = path.read_text()
+    path.write_text(line.replace("created_utc", "created_at") + line)
+    with pytest.raises(StoreError, match=f"{RECORD}:2: the chain of hashes is broken"):
+        read_record(path)
+    path.write_text(line.rstrip("\n"))
+    with pytest.raises(StoreError, match="not an entry"):
+        read_record(path)
+
+
+def test_record_of_the_catalogue_is_valid_and_keeps_its_earlier_entries() -> None:
+    record = read_record(SHIPPED_RECORD)
+    assert record.is_chained
+    former_entries = [entry for entry in record.confirmations if not entry.is_chained]
+    assert len(former_entries) == 62
+    assert former_entries[-1].results == {
+        "HDA-SAFE": "INSUFFICIENT",
+        "HDA-CONVERGE": "INSUFFICIENT",
+        "HDA-FIND": "FAIL",
+    }
+
+
+def test_record_in_a_shallow_clone_is_unregistered(marsyard: Command, tmp_path: Path) -> None:
+    assert find_registration_problem(tmp_path / RECORD) == ""
+    (tmp_path / "clone").mkdir()
+    git(tmp_path / "clone", "clone", "-q", "--depth", "1", f"file://{tmp_path}", "shallow")
+    assert "shallow clone" in find_registration_problem(tmp_path / "clone" / "shallow" / RECORD)
+
+
+@pytest.mark.parametrize("name", ["dimes-smoke", "hda-benign", "vtt-montecarlo", "loc-smoke"])
+def test_confirmations_of_each_system_use_other_terrains_than_the_campaign(name: str, tmp_path: Path) -> None:
+    """A new seed of the bank gives every terrain of a case another identity; the record contains the seed."""
+    from dataclasses import replace
+
+    from marsyard.campaigns.store.confirmations import select_confirmation_seed
+    from marsyard.scenarios.interface import IdentifiesTerrains
+
+    campaign = replace(load_campaign(name, cases=8), confirmations=tmp_path / RECORD)
+    confirmation = select_confirmation_seed(campaign)
+    identities = []
+    for item in (campaign, confirmation):
+        assert isinstance(item.scenario, IdentifiesTerrains)
+        cases = [item.scenario.terrain_identities(item.parameters(case), case) for case in range(4)]
+        identities.append({identity for case in cases for identity in case})
+    assert identities[0]
+    assert identities[0].isdisjoint(identities[1])
+    assert confirmation.calibration_overlap == 0.0
+
+
+def test_terrains_of_one_dtm_have_one_identity() -> None:
+    campaign = load_campaign("hda-benign")
+    parameters = campaign.scenario.input_terrain(campaign.base_parameters(), 0)[0].parameters  # type: ignore[attr-defined]
+    assert TerrainBank(parameters, 1).identity(0) != TerrainBank(parameters, 2).identity(0)
+    assert TerrainBank(parameters, 1).identity(0) != TerrainBank(parameters, 1).identity(1)

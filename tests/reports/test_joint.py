@@ -1,0 +1,146 @@
+"""Tests of the joint evidence of confirmations, and of campaigns that are not finished.
+
+The simulations have a true success rate exactly at the limit of the requirement: every PASS is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marsyard.cli.outcome import evaluate_and_report
+from marsyard.cli.options import console
+from marsyard.reports.case_evidence import CaseEvidence, RequirementEvidence
+from marsyard.reports.dashboard.entries import read_entries
+from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
+from marsyard.reports.statistics.proportions import proportion_lower
+from marsyard.reports.verdicts import Status, collect_evidence, evaluate_requirements
+from marsyard.result import open_result
+from tests.reports.conftest import VELOCITY
+
+MakeRun = Callable[..., Path]
+RATE, CONFIDENCE = 0.9, 0.9
+REQUIREMENT = {**VELOCITY, "population": "all", "probability": RATE, "confidence": CONFIDENCE}
+
+
+def make_frame(rng: np.random.Generator, cases: int, terrain_size: int = 1) -> pd.DataFrame:
+    """Draw rows of which each meets the requirement with the required rate, or each terrain of `terrain_size` cases."""
+    fails = np.repeat(rng.random(-(-cases // terrain_size)) >= RATE, terrain_size)[:cases]
+    return pd.DataFrame(
+        {
+            "case": np.arange(cases),
+            "outcome": "VALID",
+            "answered": True,
+            "terrain": np.arange(cases) // terrain_size,
+            "velocity_error_m_s": np.where(fails, 9.0, 1.0),
+        }
+    )
+
+
+@pytest.mark.parametrize("terrain_size", [1, 4])
+def test_repeated_confirmations_pass_wrongly_in_at_most_ten_percent(terrain_size: int) -> None:
+    """Up to 20 confirmations of 60 cases, repeated until one passes; FAIL is final."""
+    studies, rng = 250, np.random.default_rng(53)
+    passed = 0
+    for _ in range(studies):
+        earlier: RequirementEvidence | None = None
+        for _number in range(20):
+            frame = make_frame(rng, 60, terrain_size)
+            (verdict,) = evaluate_requirements(frame, [REQUIREMENT], earlier=[earlier])
+            if verdict.status is not Status.INSUFFICIENT:
+                break
+            part = collect_evidence(frame, REQUIREMENT, INDEPENDENT, has_own_terrains=True)
+            assert part is not None
+            part = RequirementEvidence.from_table(part.to_table(), is_first=earlier is None)
+            earlier = part if earlier is None else earlier.join(part)
+        passed += verdict.status is Status.PASS
+    # three standard deviations of the simulation
+    assert passed / studies <= 1.0 - CONFIDENCE + 3.0 * np.sqrt(0.09 / studies)
+
+
+def test_separate_confirmations_would_pass_wrongly_in_most_studies() -> None:
+    """Twenty confirmations that are evaluated separately: the reason for their joint evaluation."""
+    failures = np.random.default_rng(53).binomial(60, 1.0 - RATE, size=(2000, 20))
+    lower = np.array([proportion_lower(60 - count, 60, CONFIDENCE) for count in range(61)])
+    assert (lower[failures] >= RATE).any(axis=1).mean() > 0.5
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.integers(0, 5), st.booleans()), min_size=1, max_size=40),
+    st.booleans(),
+)
+def test_counts_in_the_record_keep_the_evidence(cases: list[tuple[bool, int, bool]], is_labelled: bool) -> None:
+    success, terrain, in_first_look = (np.array(values) for values in zip(*cases, strict=True))
+    names, groups = np.unique(terrain, return_inverse=True)
+    labels = tuple(f"terrain {name}" for name in names) if is_labelled else None
+    evidence = CaseEvidence(success, groups, in_first_look, labels)
+    rows = json.loads(json.dumps(evidence.to_rows()))
+    restored = CaseEvidence.from_rows(rows, is_first=True)
+    assert sorted(restored.to_rows()) == sorted(rows)
+    assert (restored.success.size, int(restored.success.sum())) == (success.size, int(success.sum()))
+    joined = evidence.join(restored)
+    assert len(np.unique(joined.terrain_groups)) == len(names) * (1 if is_labelled else 2)
+    assert not CaseEvidence.from_rows(rows, is_first=False).in_first_look.any()
+
+
+def test_later_confirmations_use_the_sequential_test() -> None:
+    """The first look keeps the ordinary bounds; the same cases after an earlier look need more evidence."""
+    frame = make_frame(np.random.default_rng(1), 30)
+    frame["velocity_error_m_s"] = 1.0
+    (first,) = evaluate_requirements(frame, [REQUIREMENT])
+    part = collect_evidence(frame.head(5), REQUIREMENT, INDEPENDENT, has_own_terrains=True)
+    (later,) = evaluate_requirements(frame.tail(25), [REQUIREMENT], earlier=[part])
+    assert (first.n, later.n, first.status, later.status) == (30, 30, Status.PASS, Status.INSUFFICIENT)
+    assert later.bounds_confidence > first.bounds_confidence == CONFIDENCE
+
+
+def test_confirmation_until_decided_has_an_open_end() -> None:
+    design = SamplingDesign(max_cases=1000).with_open_end
+    assert (design.max_cases, design.first_look) == (None, 31)
+    assert INDEPENDENT.with_open_end is INDEPENDENT
+
+
+@pytest.mark.parametrize("state", ["running", "interrupted", "shard"])
+def test_unfinished_campaign_is_insufficient_everywhere(make_run: MakeRun, state: str) -> None:
+    frame = make_frame(np.random.default_rng(1), 60)
+    frame["velocity_error_m_s"] = 1.0
+    directory = make_run(frame, [REQUIREMENT])
+    assert evaluate_run(directory).overall_verdict.status is Status.PASS
+    path = directory / "campaign.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"state": state, "cases": 400}))
+    evaluation = evaluate_run(directory)
+    assert (evaluation.overall_verdict.word, evaluation.exit_code) == ("INSUFFICIENT", 3)
+    (verdict,) = evaluation.verdicts
+    assert (verdict.status, np.isnan(verdict.lower)) == (Status.INSUFFICIENT, True)
+    assert verdict.reason == "The campaign is not finished (60 of 400 cases): a verdict needs all cases."
+    assert open_result(directory).verdict == "INSUFFICIENT"
+    (entry,), problems = read_entries([directory])
+    assert (entry.verdict, entry.requirements[0].status, problems) == ("INSUFFICIENT", "INSUFFICIENT", [])
+
+
+def test_looks_at_an_unfinished_campaign_never_pass(make_run: MakeRun) -> None:
+    """A look after every 50 of 1,000 cases at full confidence passes wrongly in about a third of the campaigns."""
+    rng = np.random.default_rng(8)
+    failures = np.cumsum(rng.random((2000, 1000)) >= RATE, axis=1)[:, 49::50]
+    cases = np.arange(50, 1001, 50)
+    bounds = [[proportion_lower(n - count, n, CONFIDENCE) for count in range(n + 1)] for n in map(int, cases)]
+    passed = np.array([np.asarray(bounds[look])[failures[:, look]] >= RATE for look in range(20)]).T
+    assert 0.3 < passed.any(axis=1).mean() < 0.45
+    # the first campaign that passes at a look before its end: the look at the stored rows gives no verdict
+    study, look = np.argwhere(passed[:, :-1])[0]
+    frame = make_frame(rng, int(cases[look]))
+    frame["velocity_error_m_s"] = np.where(np.arange(len(frame)) < failures[study, look], 9.0, 1.0)
+    directory = make_run(frame, [REQUIREMENT])
+    assert evaluate_run(directory).exit_code == 0
+    path = directory / "campaign.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"state": "interrupted", "cases": 1000}))
+    assert evaluate_run(directory).exit_code == 3
+    assert evaluate_and_report(directory, console()) == 3
