@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,7 @@ class CaseEvidence:
     - success: whether each case meets the requirement
     - groups: terrain of each case, numbered from 0; None if unknown
     - in_first_look: mask of the cases of the first look
+    - contains_first: whether the first look of the claim was a look at some of these cases
     - labels: name of each terrain, if other confirmations can use the same terrains; None if each has its own
     """
 
@@ -32,6 +33,7 @@ class CaseEvidence:
     groups: Groups | None
     in_first_look: Success
     labels: tuple[str, ...] | None = None
+    contains_first: bool = False
 
     @property
     def terrain_groups(self) -> Groups:
@@ -41,7 +43,8 @@ class CaseEvidence:
     def join(self, other: CaseEvidence) -> CaseEvidence:
         """Join with the cases of another confirmation."""
         if not self.success.size or not other.success.size:
-            return self if self.success.size else other
+            part = self if self.success.size else other
+            return replace(part, contains_first=self.contains_first or other.contains_first)
         groups = [self.terrain_groups, other.terrain_groups]
         labels = None
         if self.labels is not None and other.labels is not None:
@@ -59,6 +62,7 @@ class CaseEvidence:
             None if is_unknown else np.concatenate(groups),
             np.concatenate([self.in_first_look, other.in_first_look]),
             labels,
+            self.contains_first or other.contains_first,
         )
 
     def to_rows(self) -> list[list[Any]]:
@@ -77,7 +81,7 @@ class CaseEvidence:
 
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]], *, is_first: bool) -> CaseEvidence:
-        """Create the results from the rows of `to_rows`; `is_first`: whether the first look was a look at them."""
+        """Create the results from the rows of `to_rows`; `is_first`: whether they are of the first confirmation."""
         labels = tuple(str(row[4]) for row in rows) if rows and isinstance(rows[0][4], str) else None
         terrains = [row[:4] for row in rows for _ in range(1 if labels is not None else int(row[4]))]
         counts = np.array(terrains, dtype=np.int64).reshape(-1, 4)
@@ -91,6 +95,7 @@ class CaseEvidence:
             np.repeat(np.repeat(np.arange(n_terrains), 4), repeated),
             np.repeat(np.tile([True, True, False, False], n_terrains), repeated) & is_first,
             labels,
+            is_first,
         )
 
 

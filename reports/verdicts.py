@@ -449,6 +449,8 @@ def _decide(
     has_own_terrains = earlier is None or earlier.labels is None
     evidence = _case_evidence(verdict, population, sampling, frame, has_own_terrains=has_own_terrains)
     if earlier is not None:
+        if earlier.contains_first:
+            evidence = replace(evidence, in_first_look=np.zeros(evidence.success.size, dtype=np.bool_))
         evidence = earlier.join(evidence)
     success, groups = evidence.success, evidence.groups
     n, failures = success.size, int((~success).sum())

@@ -144,7 +144,7 @@ def _read_entry(path: Path) -> Entry:
     report: Mapping[str, Any] = {}
     with suppress(OSError, ValueError):
         report = table(json.loads(file.read_text(encoding="utf-8")))
-    if report.get("schema") != SCHEMA or file.stat().st_mtime < (path / TABLE_FILE).stat().st_mtime:
+    if report.get("schema") != SCHEMA or _is_outdated(file, path, report):
         write_report(path)
         report = table(json.loads(file.read_text(encoding="utf-8")))
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
@@ -173,6 +173,15 @@ def _read_entry(path: Path) -> Entry:
         outcomes={str(key): int(value) for key, value in table(report.get("outcomes")).items()},
         study=Study(*(str(study.get(name)) for name in ("kind", "requirement", "sentence"))) if study else None,
     )
+
+
+def _is_outdated(file: Path, path: Path, report: Mapping[str, Any]) -> bool:
+    """Whether a report is older than the rows, or than the record of the confirmations that it joins."""
+    evidence, written_s = table(report.get("evidence")), file.stat().st_mtime
+    confirmations = Path(str(evidence.get("record") or ""))
+    if evidence.get("claim") and (not confirmations.is_file() or confirmations.stat().st_mtime > written_s):
+        return True
+    return written_s < (path / TABLE_FILE).stat().st_mtime
 
 
 def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:

@@ -100,7 +100,7 @@ def inject_faults(parameters: FakeParameters, case: int) -> None:
 
 class FakeScenario:
     name = "fake"
-    parameters_type = FakeParameters
+    parameters_type: type[FakeParameters] = FakeParameters
 
     def shared_inputs(self, parameters: FakeParameters) -> tuple[int, ...]:
         return tuple(range(parameters.shared))

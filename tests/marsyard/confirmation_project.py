@@ -62,7 +62,11 @@ class Output:
         """Whether the exit status is 0, or the headline or a requirement is PASS without a qualification."""
         lines = [line.strip() for line in self.out.splitlines()]
         rows = [line.split() for line in lines if line.startswith("VELOCITY")]
-        return self.status == 0 or "verdict: PASS" in lines or any("PASS" in row[1:2] and "(" not in row[2] for row in rows)
+        return (
+            self.status == 0
+            or "verdict: PASS" in lines
+            or any("PASS" in row[1:2] and "(" not in row[2] for row in rows)
+        )
 
     @property
     def text(self) -> str:

@@ -156,7 +156,9 @@ def reuse_a_seed(marsyard: Command, folder: Path) -> list[Output]:
 
 def confirm_on_terrains_of_the_calibration(marsyard: Command, folder: Path) -> list[Output]:
     text = CAMPAIGN.replace("[dispersions]", "is_imported = true\n[dispersions]")
-    (folder / "fake.toml").write_text(text.replace('"fake"', '"imported"') + CALIBRATION.replace('"fake"', '"imported"'))
+    (folder / "fake.toml").write_text(
+        text.replace('"fake"', '"imported"') + CALIBRATION.replace('"fake"', '"imported"')
+    )
     commit_all(folder)
     return [marsyard(*CONFIRM, folder / "run-imported")]
 

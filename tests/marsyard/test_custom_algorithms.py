@@ -140,6 +140,6 @@ def test_exported_cases_are_scored(tmp_path: Path) -> None:
         app, ["score", str(cases), str(table), "--out", str(tmp_path / "scored"), "--jobs", "1"]
     )
     assert result.exit_code == 0, result.output
-    assert "verdict: PASS" in result.output
+    assert "verdict: PASS (exploration)" in result.output
     assert [row["velocity_error_m_s"] for row in read_case_rows(tmp_path / "scored")] == [0.5, 0.0]
     assert (tmp_path / "scored" / "report.html").exists()

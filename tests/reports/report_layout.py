@@ -6,9 +6,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-VerdictName = Literal[
-    "PASS", "FAIL", "INSUFFICIENT", "MET BY RATE", "PASS (unregistered)", "PASS (other claims)"
-]
+VerdictName = Literal["PASS", "FAIL", "INSUFFICIENT", "MET BY RATE", "PASS (unregistered)", "PASS (other claims)"]
 
 
 class _Model(BaseModel):
