@@ -17,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from marsyard.cli.outcome import evaluate_and_report
 from marsyard.cli.options import console
+from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.case_evidence import CaseEvidence, RequirementEvidence
 from marsyard.reports.dashboard.entries import read_entries
 from marsyard.reports.evaluation import evaluate_run
@@ -72,7 +72,7 @@ def count_deciding_failures(look: int) -> tuple[int, int]:
     return largest_pass, bisect.bisect_left(counts, True, key=lambda count: evaluate(count) is Status.FAIL)
 
 
-def test_repeated_confirmations_pass_wrongly_in_at_most_ten_percent() -> None:
+def test_repeated_confirmations_keep_the_risk_of_a_wrong_pass() -> None:
     """Exact probability of PASS in up to 20 confirmations of 60 cases, repeated until one passes; FAIL is final."""
     undecided, passed = np.ones(1), 0.0
     for look in range(1, 21):
@@ -84,7 +84,7 @@ def test_repeated_confirmations_pass_wrongly_in_at_most_ten_percent() -> None:
     assert 0.05 < passed <= 1.0 - CONFIDENCE
 
 
-def test_separate_confirmations_would_pass_wrongly_in_most_studies() -> None:
+def test_separate_confirmations_exceed_the_risk_of_a_wrong_pass() -> None:
     """Twenty confirmations that are evaluated separately: the reason for their joint evaluation."""
     failures = np.random.default_rng(53).binomial(60, 1.0 - RATE, size=(2000, 20))
     lower = np.array([proportion_lower(60 - count, 60, CONFIDENCE) for count in range(61)])
@@ -144,7 +144,7 @@ def test_unfinished_campaign_is_insufficient_everywhere(make_run: MakeRun, state
 
 
 def test_looks_at_an_unfinished_campaign_never_pass(make_run: MakeRun) -> None:
-    """A look after every 50 of 1,000 cases at full confidence passes wrongly in more than a quarter of the campaigns."""
+    """A look after every 50 of 1,000 cases at full confidence passes wrongly in over a quarter of the campaigns."""
     rng = np.random.default_rng(8)
     failures = np.cumsum(rng.random((2000, 1000)) >= RATE, axis=1)[:, 49::50]
     cases = np.arange(50, 1001, 50)
