@@ -85,7 +85,9 @@ def test_groups_of_hazardous_flights_sum_to_all_flights() -> None:
     assert match is not None
     flights, *groups = (int(count.replace(",", "")) for count in match.groups())
     records = [json.loads(line) for line in CONFIRMATIONS.read_text(encoding="utf-8").splitlines()]
-    (cases,) = {record["cases"] for record in records if (record.get("campaign"), record.get("number")) == ("hda-hazardous", 1)}
+    (cases,) = {
+        record["cases"] for record in records if (record.get("campaign"), record.get("number")) == ("hda-hazardous", 1)
+    }
     assert flights == sum(groups) == cases
 
 
