@@ -52,7 +52,7 @@ _MAX_NAMES = 24
 SCHEMA = 7
 SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
 #: Properties of a verdict that `report.json` contains next to its fields.
-_VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "consumer_risk", "margin")
+_VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "margin")
 PAGE_FILE = "report.html"
 REPORT_JSON = "report.json"
 VERIFICATION_FILE = "verification.csv"

@@ -14,31 +14,67 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-Success = Bool[np.ndarray, " n"]  #: Whether each case is a success.
+from marsyard.reports.statistics.clusters import ClusteredCases
+
+Mask = Bool[np.ndarray, " n"]  #: Property of each case.
 Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.
+
+#: Kinds of cases that the record counts on each terrain: successes and failures of the population and other cases, in
+#: the first look, then those of later looks.
+_KINDS = 6
 
 
 @dataclass(frozen=True)
 class CaseEvidence:
-    """Results of the cases of a population.
+    """Results of the cases of a campaign with regard to a requirement.
 
-    - success: whether each case meets the requirement
+    - success: whether each case meets the requirement; false outside the population
+    - member: whether it belongs to the population
     - groups: terrain of each case, numbered from 0; None if unknown
     - in_first_look: mask of the cases of the first look
-    - contains_first: whether the first look of the claim was a look at some of these cases
     - labels: name of each terrain, if other confirmations can use the same terrains; None if each has its own
+    - contains_first: whether the first look of the claim was a look at some of these cases
     """
 
-    success: Success
+    success: Mask
+    member: Mask
     groups: Groups | None
-    in_first_look: Success
+    in_first_look: Mask
     labels: tuple[str, ...] | None = None
     contains_first: bool = False
+
+    @property
+    def n(self) -> int:
+        """Number of cases of the population."""
+        return int(self.member.sum())
+
+    @property
+    def failures(self) -> int:
+        """Number of failures of the population."""
+        return int((self.member & ~self.success).sum())
+
+    @property
+    def terrains(self) -> int | None:
+        """Number of terrains with a case of the population; None if unknown."""
+        return None if self.groups is None else int(np.unique(self.groups[self.member]).size)
+
+    @property
+    def clustered(self) -> ClusteredCases | None:
+        """The cases with their terrains; None if no two cases are on one terrain."""
+        if self.groups is None or int(self.groups.max(initial=-1)) + 1 == self.groups.size:
+            return None
+        return ClusteredCases(self.success, self.member, self.groups)
 
     @property
     def terrain_groups(self) -> Groups:
         """Terrain of each case; a case with an unknown terrain has its own."""
         return np.arange(self.success.size) if self.groups is None else self.groups
+
+    def join_own(self, own: CaseEvidence) -> CaseEvidence:
+        """Join the cases of earlier confirmations with those of the evaluated one, which are a later look."""
+        if self.contains_first:
+            own = replace(own, in_first_look=np.zeros(own.success.size, dtype=np.bool_))
+        return self.join(own)
 
     def join(self, other: CaseEvidence) -> CaseEvidence:
         """Join with the cases of another confirmation."""
@@ -59,6 +95,7 @@ class CaseEvidence:
         is_unknown = self.groups is None and other.groups is None
         return CaseEvidence(
             np.concatenate([self.success, other.success]),
+            np.concatenate([self.member, other.member]),
             None if is_unknown else np.concatenate(groups),
             np.concatenate([self.in_first_look, other.in_first_look]),
             labels,
@@ -68,13 +105,12 @@ class CaseEvidence:
     def to_rows(self) -> list[list[Any]]:
         """Count the cases of each terrain for the record of confirmations.
 
-        A row contains the cases and failures of the first look, those of later looks, and the number of terrains with
-        these values, or the name of a terrain that other confirmations can use.
+        A row contains successes, failures and other cases of the first look, those of later looks, and the number of
+        terrains with these values, or the name of a terrain that other confirmations can use.
         """
         groups, terrains = self.terrain_groups, int(self.terrain_groups.max(initial=-1)) + 1
-        first, failed = self.in_first_look, ~self.success
-        masks = (first, first & failed, ~first, ~first & failed)
-        counts = np.stack([np.bincount(groups[mask], minlength=terrains) for mask in masks], axis=1).tolist()
+        kinds = np.select([self.success, self.member], [0, 1], 2) + np.where(self.in_first_look, 0, 3)
+        counts = np.bincount(groups * _KINDS + kinds, minlength=terrains * _KINDS).reshape(terrains, _KINDS).tolist()
         if self.labels is not None:
             return [[*values, label] for values, label in zip(counts, self.labels, strict=True)]
         return [[*values, number] for values, number in sorted(Counter(map(tuple, counts)).items())]
@@ -82,21 +118,12 @@ class CaseEvidence:
     @classmethod
     def from_rows(cls, rows: Sequence[Sequence[Any]], *, is_first: bool) -> CaseEvidence:
         """Create the results from the rows of `to_rows`; `is_first`: whether they are of the first confirmation."""
-        labels = tuple(str(row[4]) for row in rows) if rows and isinstance(rows[0][4], str) else None
-        terrains = [row[:4] for row in rows for _ in range(1 if labels is not None else int(row[4]))]
-        counts = np.array(terrains, dtype=np.int64).reshape(-1, 4)
-        # successes and failures of the first look and of later looks, terrain by terrain
-        first, first_failures, later, later_failures = counts.T
-        cells = np.stack([first - first_failures, first_failures, later - later_failures, later_failures], axis=1)
-        repeated = cells.ravel()
-        n_terrains = len(counts)
-        return cls(
-            np.repeat(np.tile([True, False, True, False], n_terrains), repeated),
-            np.repeat(np.repeat(np.arange(n_terrains), 4), repeated),
-            np.repeat(np.tile([True, True, False, False], n_terrains), repeated) & is_first,
-            labels,
-            is_first,
-        )
+        labels = tuple(str(row[_KINDS]) for row in rows) if rows and isinstance(rows[0][_KINDS], str) else None
+        terrains = [row[:_KINDS] for row in rows for _ in range(1 if labels is not None else int(row[_KINDS]))]
+        counts = np.array(terrains, dtype=np.int64).reshape(-1, _KINDS)
+        kinds = np.repeat(np.tile(np.arange(_KINDS), len(counts)), counts.ravel())
+        groups = np.repeat(np.repeat(np.arange(len(counts)), _KINDS), counts.ravel())
+        return cls(kinds % 3 == 0, kinds % 3 < 2, groups, (kinds < 3) & is_first, labels, is_first)
 
 
 @dataclass(frozen=True)
@@ -116,10 +143,7 @@ class RequirementEvidence:
         """Return the counts for the record of confirmations."""
         population, with_unfinished = self.population.to_rows(), self.with_unfinished.to_rows()
         unfinished = {} if population == with_unfinished else {"with_unfinished": with_unfinished}
-        return {"n": self.population.success.size, "failures": int((~self.population.success).sum())} | {
-            "terrains": population,
-            **unfinished,
-        }
+        return {"n": self.population.n, "failures": self.population.failures} | {"terrains": population, **unfinished}
 
     @classmethod
     def from_table(cls, stored: Mapping[str, Any], *, is_first: bool) -> RequirementEvidence:

@@ -19,13 +19,7 @@ from marsyard.campaigns.store.confirmations import add_result
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
-from marsyard.reports.statistics.proportions import (
-    ClusterMethod,
-    confidence_at,
-    planned_looks,
-    proportion_lower,
-    proportion_upper,
-)
+from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
 from marsyard.reports.stored import StoredRun, read_run, table
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, collect_evidence, evaluate_requirements
 from marsyard.reports.wording import count
@@ -131,8 +125,7 @@ def _remedy_text(verdicts: Sequence[Verdict]) -> str:
     if not undecided_verdicts:
         return ""
     largest = max(undecided_verdicts, key=lambda verdict: verdict.further_cases or 0)
-    counts_terrains = largest.clustered is not None and largest.clustered.method is ClusterMethod.TERRAIN_COUNT
-    terrain_text = ", each on a new terrain" if counts_terrains else ""
+    terrain_text = "" if largest.clustered is None else ", each on a new terrain"
     cases = count(largest.further_cases or 0, "additional case")
     population = f" of the population of {largest.requirement_id}" if largest.population != "all" else ""
     return f" {cases}{population}{terrain_text}, all without a failure, would be enough."

@@ -178,6 +178,5 @@ def describe_contribution(verdict: Verdict, own: RequirementEvidence | None, joi
     """Add the numbers of the run itself to a verdict that joins several confirmations."""
     if own is None or len(joint.numbers) < 2:
         return verdict
-    failures, cases = int((~own.population.success).sum()), own.population.success.size
-    text = f"This run alone: {failures:,} of {count(cases, 'case')} failed."
+    text = f"This run alone: {own.population.failures:,} of {count(own.population.n, 'case')} failed."
     return replace(verdict, joint_text=text)

@@ -11,7 +11,8 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns import errors
-from marsyard.reports.statistics.proportions import Interval, clustered_evidence, proportion_interval
+from marsyard.reports.statistics.clusters import ClusteredCases
+from marsyard.reports.statistics.proportions import Interval, proportion_interval
 from marsyard.reports.statistics.samples import is_interpolated
 from marsyard.reports.wording import NOTHING, number, numbers, percent
 
@@ -131,9 +132,9 @@ def fraction_of(mask: Bool[np.ndarray, " n"], frame: pd.DataFrame) -> CaseFracti
         return CaseFraction(0, 0, math.nan, 0.0, 1.0)
     groups, clustered = terrain_groups(frame), None
     if groups is not None and int(groups.max()) + 1 < n:
-        # a two-sided interval consists of two one-sided bounds at this confidence
-        evidence = clustered_evidence(mask, groups, 0.5 * (1.0 + CONFIDENCE))
-        clustered = evidence.lower, evidence.upper
+        # a two-sided interval consists of two one-sided bounds
+        risk, cases = 0.5 * (1.0 - CONFIDENCE), ClusteredCases.of(mask, groups)
+        clustered = 1.0 - cases.max_failure_rate(risk), 1.0 - cases.min_failure_rate(risk)
     return CaseFraction(n, hits, hits / n, *proportion_interval(hits, n, CONFIDENCE), *(clustered or (None, None)))
 
 

@@ -109,13 +109,13 @@ class SamplingDesign:
         """Fraction of the risk of a wrong verdict (1 - confidence) that a look at `cases` cases may use."""
         return 1.0 if self.max_cases is None else risk_fraction_at(planned_looks(self.max_cases), cases)
 
-    def mask_first_look(self, frame: pd.DataFrame, population: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
-        """Create the mask of the rows of a population that an earlier first look used; None at the first look."""
+    def mask_first_look(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"] | None:
+        """Create the mask of the rows that an earlier first look used; None at the first look."""
         if self.first_look is None or self.max_cases is not None or "case" not in frame:
             return None
         if not bool((frame["case"] >= self.first_look).any()):
             return None
-        return np.asarray(population["case"] < self.first_look, dtype=np.bool_)
+        return np.asarray(frame["case"] < self.first_look, dtype=np.bool_)
 
     def exclude_nominal_case(self, frame: pd.DataFrame) -> pd.DataFrame:
         """Return the rows without the nominal case."""

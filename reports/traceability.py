@@ -106,7 +106,7 @@ _REQUIREMENT_COLUMNS = {"requirement": "requirement_id", "statement": "statement
 _EVIDENCE_COLUMNS = {
     "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
     "confidence": "confidence", "decided_by": "decide_by", "cases": "n", "failures": "failures", "terrains": "terrains",
-    "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper", "design_effect": "design_effect",
+    "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper",
     "consumer_risk": "consumer_risk", "further_cases": "further_cases", "note": "note",
 }  # fmt: skip
 #: Columns of the result on all cases, and its fields.

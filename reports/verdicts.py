@@ -1,13 +1,10 @@
 """Verdicts on requirements, computed from stored rows: status, bounds, and number of additional cases needed.
 
 A requirement specifies that `|metric| <= bound`, or a true column, holds for a fraction of a population at a
-confidence. Its status follows from one-sided Clopper-Pearson bounds of the success rate. Bounds of cases on shared
-terrains allow for correlation (`marsyard.reports.statistics.proportions`). If a campaign is evaluated repeatedly, the
-probability of a wrong verdict in any evaluation is at most 1 - confidence: each planned look (evaluation) uses a
-fraction of this risk, and looks at appended cases use `SequentialTest`. MET BY RATE: the requirement has
-`decide_by = "estimate"`, and the observed rate is sufficient, but the lower bound is not. Cases that are not
-independent random samples (Latin hypercube, Sobol, grids) have no bounds; requirements with `decide_by = "estimate"`
-can still be decided.
+confidence. Its status follows from one-sided bounds of the success rate, which allow for shared terrains and repeated
+evaluations (`marsyard.reports.bounds`). MET BY RATE: the requirement has `decide_by = "estimate"`, and the observed
+rate is sufficient, but the lower bound is not. Cases that are not independent random samples (Latin hypercube, Sobol,
+grids) have no bounds; requirements with `decide_by = "estimate"` can still be decided.
 """
 
 from __future__ import annotations
@@ -25,16 +22,12 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports import rates
-from marsyard.reports.case_evidence import CaseEvidence, Groups, RequirementEvidence, Success
+from marsyard.reports.bounds import Looks, RequiredRate, clustered_bounds, independent_bounds
+from marsyard.reports.case_evidence import CaseEvidence, Mask, RequirementEvidence
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics import proportions
-from marsyard.reports.statistics.proportions import (
-    ClusteredEvidence,
-    ClusterMethod,
-    SequentialTest,
-    clustered_evidence,
-    confidence_at,
-)
+from marsyard.reports.statistics.clusters import TerrainEvidence
+from marsyard.reports.statistics.proportions import SequentialTest
 from marsyard.reports.wording import count, format_fraction, percent, population_text
 
 #: Beginning of the statement of a requirement whose population the flight system cannot know.
@@ -90,7 +83,8 @@ class Verdict:
       probability, INSUFFICIENT for fewer cases than `min_cases_for_rate`, otherwise MET BY RATE
     - failures: cases with a missing, NaN or too large metric, unfinished cases, cases with a missing population flag
     - estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases; no bounds for other designs
-    - further_cases: additional cases without failure for PASS, on new terrains if terrains are counted; None if unknown
+    - further_cases: additional cases without failure for PASS, on new terrains if terrains are shared; None if unknown
+    - consumer_risk: probability of this result or a better one if the true rate equals the required rate
     - reason: why the requirement is not evaluated, or why the verdict is withheld
     - advice: why more cases cannot lead to PASS, and which change of the campaign can
     - accept_rate: whether MET BY RATE results in the exit status 0
@@ -121,7 +115,8 @@ class Verdict:
     decide_by: str = "confidence"
     reason: str = ""
     terrains: int | None = None
-    clustered: ClusteredEvidence | None = None
+    clustered: TerrainEvidence | None = None
+    consumer_risk: float = math.nan
     plain_lower: float = math.nan
     plain_upper: float = math.nan
     bounds_confidence: float = math.nan
@@ -147,21 +142,6 @@ class Verdict:
     def confident_status(self) -> Status:
         """The status by the bounds alone; INSUFFICIENT without bounds."""
         return compare_bounds(self.lower, self.upper, self.probability)
-
-    @property
-    def consumer_risk(self) -> float:
-        """Probability of this result or a better one if the true rate equals the required rate; NaN without bounds."""
-        if math.isnan(self.lower):
-            return math.nan
-        evidence = self.clustered
-        if evidence is None:
-            return proportions.consumer_risk(self.n - self.failures, self.n, self.probability)
-        return proportions.consumer_risk(evidence.effective_successes, evidence.effective_n, self.probability)
-
-    @property
-    def design_effect(self) -> float:
-        """The design effect of shared terrains; NaN if no terrain is shared."""
-        return math.nan if self.clustered is None else self.clustered.design_effect
 
     @property
     def margin(self) -> float:
@@ -195,18 +175,14 @@ class Verdict:
         evidence = self.clustered
         if evidence is None:
             return ""
-        is_effect_unknown = math.isnan(evidence.design_effect)
-        effect = self.n / evidence.effective_n if is_effect_unknown else evidence.design_effect
-        reason = "Cases on one terrain are correlated"
-        if evidence.method is ClusterMethod.TERRAIN_COUNT:
-            reason = "With too few failures to estimate their correlation, each terrain counts as one case"
-        text = (
-            f"The {count(self.n, 'case')} lie on {count(self.terrains or 0, 'terrain')}. {reason}: the bounds are "
-            f"those of {evidence.effective_n:.4g} independent cases (design effect {effect:.3g})."
-        )
+        failed = "1 has a failure" if evidence.failed_terrains == 1 else f"{evidence.failed_terrains:,} have a failure"
+        text = f"The {count(self.n, 'case')} lie on {count(evidence.terrains, 'terrain')}, of which {failed}"
+        if evidence.failure_pairs:
+            text += f" ({count(evidence.failure_pairs, 'pair')} of failures on one terrain)"
+        text += ". The bounds hold for every distribution of failure rates over terrains."
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
-        if evidence.method is ClusterMethod.TERRAIN_COUNT and self.further_cases and self.decide_by != ESTIMATE:
+        if self.further_cases and self.decide_by != ESTIMATE:
             cases = count(self.further_cases, "additional case")
             text += f" {cases} without a failure, each on a new terrain, would lead to PASS."
         return text
@@ -224,74 +200,23 @@ class Verdict:
         )
 
 
-@dataclass(frozen=True)
-class Looks:
-    """Earlier and planned looks (evaluations) of a campaign.
-
-    - in_first_look: mask of the cases that an earlier first look used; None at the first look
-    - risk_fraction: fraction of the risk of a wrong verdict that this look may use; 1 if no looks were planned
-    """
-
-    in_first_look: Success | None = None
-    risk_fraction: float = 1.0
-
-
-def add_bounds(verdict: Verdict, success: Success, groups: Groups | None, looks: Looks) -> tuple[Verdict, int]:
-    """Add bounds of the success rate of at least one case; also return the additional cases without failure for PASS.
-
-    groups: terrain of each case, numbered from 0; None if unknown
-    """
-    n, failures, probability, confidence = success.size, verdict.failures, verdict.probability, verdict.confidence
-    first_n = n if looks.in_first_look is None else int(looks.in_first_look.sum())
-    # confidences of the lower and of the upper bound
-    levels = _confidences(first_n, n, probability, confidence, looks)
-    lower = proportions.proportion_lower(n - failures, n, levels[0])
-    upper = proportions.proportion_upper(n - failures, n, levels[1])
-    verdict = replace(verdict, lower=lower, upper=upper, plain_lower=lower, plain_upper=upper)
-    if groups is None or int(groups.max()) + 1 == n:
-        needed_cases = _cases_needed(first_n, n, failures, probability, confidence, looks)
-        return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), needed_cases - n
-    evidence = clustered_evidence(success, groups, confidence)
-    in_first_look = np.ones(n, dtype=np.bool_) if looks.in_first_look is None else looks.in_first_look
-    if np.unique(groups[in_first_look]).size != first_n:
-        # effective number of independent cases at the first look
-        first_n = math.floor(clustered_evidence(success[in_first_look], groups[in_first_look], confidence).effective_n)
-    levels = _confidences(first_n, evidence.effective_n, probability, confidence, looks)
-    evidence_by_level = [clustered_evidence(success, groups, level) for level in levels]
-    evidence = replace(evidence_by_level[0], upper=evidence_by_level[1].upper)
-    if evidence.method is ClusterMethod.TERRAIN_COUNT:
-        # the tolerance prevents a rounding error from increasing an integer by 1
-        size, weight = evidence.terrains, 1.0
-        n_failed = math.ceil(evidence.terrains - evidence.effective_successes - 1e-9)
-    else:
-        weight = evidence.effective_n / n
-        size, n_failed = math.floor(evidence.effective_n), math.ceil(failures * weight)
-    needed_cases = _cases_needed(first_n, size, n_failed, probability, confidence, looks)
-    verdict = replace(verdict, lower=evidence.lower, upper=evidence.upper, clustered=evidence)
-    # convert effective cases to cases
-    additional = math.ceil((needed_cases - size) / weight)
-    return replace(verdict, bounds_confidence=levels[0], upper_confidence=levels[1]), additional
-
-
-def _confidences(
-    first_n: int, n: float | int, probability: float, confidence: float, looks: Looks
-) -> tuple[float, float]:
-    """Compute the confidences of the lower and of the upper bound."""
-    if looks.in_first_look is None:
-        level = confidence_at(confidence, looks.risk_fraction)
-        return level, level
-    pass_test, fail_test = (
-        SequentialTest(limit, 1.0 - confidence, first_n) for limit in (1.0 - probability, probability)
+def add_bounds(verdict: Verdict, evidence: CaseEvidence, looks: Looks) -> tuple[Verdict, int]:
+    """Add bounds of the success rate of at least one case; also return the additional cases for PASS."""
+    required = RequiredRate(verdict.probability, verdict.confidence)
+    plain, clustered = independent_bounds(evidence.success, evidence.member, required, looks), evidence.clustered
+    bounds = plain if clustered is None else clustered_bounds(clustered, required, looks)
+    verdict = replace(
+        verdict,
+        lower=bounds.lower,
+        upper=bounds.upper,
+        plain_lower=plain.lower,
+        plain_upper=plain.upper,
+        bounds_confidence=bounds.lower_confidence,
+        upper_confidence=bounds.upper_confidence,
+        consumer_risk=bounds.consumer_risk,
+        clustered=bounds.clustered,
     )
-    return 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
-
-
-def _cases_needed(first_n: int, n: int, failures: int, probability: float, confidence: float, looks: Looks) -> int:
-    """Compute the total number of cases that would lead to PASS without an additional failure."""
-    if looks.risk_fraction < 1.0:
-        level = confidence_at(confidence, looks.risk_fraction)
-        return n + proportions.further_cases_needed(n, failures, probability, level)
-    return SequentialTest(1.0 - probability, 1.0 - confidence, first_n).cases_needed(n, failures)
+    return verdict, bounds.further_cases
 
 
 def evaluate_requirements(
@@ -358,34 +283,26 @@ def collect_evidence(
         masks = [mask(frame, verdict.population) for mask in (rates.population_mask, rates.population_mask_if_answered)]
     except ValueError:
         return None
-    evidence = [
-        _case_evidence(verdict, frame[mask], sampling, frame, has_own_terrains=has_own_terrains) for mask in masks
-    ]
-    return RequirementEvidence(*evidence)
+    return RequirementEvidence(
+        *(_case_evidence(verdict, mask, sampling, frame, has_own_terrains=has_own_terrains) for mask in masks)
+    )
 
 
 def _case_evidence(
-    verdict: Verdict,
-    population: pd.DataFrame,
-    sampling: SamplingDesign,
-    frame: pd.DataFrame,
-    *,
-    has_own_terrains: bool = True,
+    verdict: Verdict, member: Mask, sampling: SamplingDesign, frame: pd.DataFrame, *, has_own_terrains: bool = True
 ) -> CaseEvidence:
-    """Collect the results of the cases of a population."""
-    _, has_unknown_flag = rates.population_and_unknown_masks(population, verdict.population.split(" and "))
-    success = np.asarray(
-        rates.success_mask(population, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag, dtype=np.bool_
-    )
-    in_first_look = sampling.mask_first_look(frame, population)
+    """Collect the results of all cases (`frame`) with regard to a population (`member`)."""
+    _, has_unknown_flag = rates.population_and_unknown_masks(frame, verdict.population.split(" and "))
+    success = rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag & member
+    in_first_look = sampling.mask_first_look(frame)
     if in_first_look is None:
-        in_first_look = np.ones(success.size, dtype=np.bool_)
-    groups = rates.terrain_groups(population) if success.size else None
+        in_first_look = np.ones(member.size, dtype=np.bool_)
+    groups = rates.terrain_groups(frame) if member.size else None
     if groups is None or has_own_terrains:
-        return CaseEvidence(success, groups, in_first_look)
+        return CaseEvidence(success, member, groups, in_first_look)
     first_rows = np.unique(groups, return_index=True)[1]
-    labels = tuple(f"terrain {value}" for value in population["terrain"].iloc[first_rows])
-    return CaseEvidence(success, groups, in_first_look, labels)
+    labels = tuple(f"terrain {value}" for value in frame["terrain"].iloc[first_rows])
+    return CaseEvidence(success, member, groups, in_first_look, labels)
 
 
 def _evaluate(
@@ -399,22 +316,36 @@ def _evaluate(
     if problem:
         return replace(verdict, reason=problem)
     try:
-        population = frame[rates.population_mask(frame, verdict.population)]
-        population_and_unfinished = frame[rates.population_mask_if_answered(frame, verdict.population)]
+        members = rates.population_mask(frame, verdict.population)
+        members_and_unfinished = rates.population_mask_if_answered(frame, verdict.population)
     except ValueError as error:
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
-    if population.empty:
+    if not members.any():
         needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
         return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
-    earlier_parts = (None, None) if earlier is None else (earlier.population, earlier.with_unfinished)
-    populations = (population, population_and_unfinished)
-    verdicts = [
-        _decide(verdict, cases, sampling, frame, earlier_part)
-        for cases, earlier_part in zip(populations, earlier_parts, strict=True)
+    own = [
+        _case_evidence(verdict, mask, sampling, frame, has_own_terrains=_has_own_terrains(earlier))
+        for mask in (members, members_and_unfinished)
     ]
-    return _withhold_if_uncertain(*verdicts)
+    joined = (
+        own
+        if earlier is None
+        else [
+            part.join_own(own_part)
+            for part, own_part in zip((earlier.population, earlier.with_unfinished), own, strict=True)
+        ]
+    )
+    decided = _decide(verdict, joined[0], sampling, frame)
+    if earlier is None and (members == members_and_unfinished).all():
+        return decided
+    return _withhold_if_uncertain(decided, _decide(verdict, joined[1], sampling, frame))
+
+
+def _has_own_terrains(earlier: RequirementEvidence | None) -> bool:
+    """Whether no other confirmation uses the terrains."""
+    return earlier is None or earlier.population.labels is None
 
 
 def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdict:
@@ -434,38 +365,21 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
 
 
-def _decide(
-    verdict: Verdict,
-    population: pd.DataFrame,
-    sampling: SamplingDesign,
-    frame: pd.DataFrame,
-    earlier: CaseEvidence | None = None,
-) -> Verdict:
-    """Decide the verdict from the cases of its population (at least one).
+def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
+    """Decide the verdict from the results of a population of at least one case.
 
-    - frame: all cases of the campaign
-    - earlier: cases of other confirmations of the same claim
+    frame: all cases of the campaign
     """
-    has_own_terrains = earlier is None or earlier.labels is None
-    evidence = _case_evidence(verdict, population, sampling, frame, has_own_terrains=has_own_terrains)
-    if earlier is not None:
-        if earlier.contains_first:
-            evidence = replace(evidence, in_first_look=np.zeros(evidence.success.size, dtype=np.bool_))
-        evidence = earlier.join(evidence)
-    success, groups = evidence.success, evidence.groups
-    n, failures = success.size, int((~success).sum())
-    rate, decides_by_rate = (n - failures) / n, verdict.decide_by == ESTIMATE
-    terrains = None if groups is None else int(population["terrain"].nunique())
-    if earlier is not None and groups is not None:
-        terrains = int(groups.max()) + 1
-    with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=terrains)
+    n, failures, decides_by_rate = evidence.n, evidence.failures, verdict.decide_by == ESTIMATE
+    rate = (n - failures) / n
+    with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=evidence.terrains)
     if not sampling.independent:
         reason = f"{'Decided by the rate of these cases. ' if decides_by_rate else ''}{sampling.no_probability}"
         status = _status_by_rate(rate, n, verdict.probability) if decides_by_rate else verdict.status
         return replace(with_counts, status=status, reason=reason)
     in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look
     looks = Looks(in_first_look, sampling.risk_fraction_at(len(frame)))
-    verdict_with_bounds, additional = add_bounds(with_counts, success, groups, looks)
+    verdict_with_bounds, additional = add_bounds(with_counts, evidence, looks)
     status = verdict_with_bounds.confident_status
     decides_by_rate = decides_by_rate and status is not Status.PASS
     if decides_by_rate:
@@ -476,14 +390,11 @@ def _decide(
     if decides_by_rate:
         return replace(verdict_with_bounds, further_cases=min_cases_for_rate(verdict.probability) - n)
     # number of additional cases, or advice if the campaign has too few terrains for them
-    clustered, terrain_supply = verdict_with_bounds.clustered, sampling.terrains
-    counts_terrains = clustered is not None and clustered.method is ClusterMethod.TERRAIN_COUNT
-    if not counts_terrains or terrain_supply is None or (terrains or 0) + additional <= terrain_supply.terrains:
+    clustered, supply = verdict_with_bounds.clustered, sampling.terrains
+    if clustered is None or supply is None or clustered.terrains + additional <= supply.terrains:
         return replace(verdict_with_bounds, further_cases=additional)
     needed_terrains = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
-    return replace(
-        verdict_with_bounds, advice=terrain_supply.advice(needed_terrains, verdict.probability, verdict.confidence)
-    )
+    return replace(verdict_with_bounds, advice=supply.advice(needed_terrains, verdict.probability, verdict.confidence))
 
 
 def _status_by_rate(rate: float, n: int, probability: float) -> Status:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.proportions import number_terrains
+from marsyard.reports.statistics.clusters import number_terrains
 from marsyard.reports.statistics.samples import Groups, is_shared, mean_interval
 
 #: Minimum fraction of the cases of each set on common terrains for a comparison within terrains.

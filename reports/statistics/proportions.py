@@ -1,4 +1,6 @@
-"""Success rates: exact binomial bounds, bounds for cases that share terrains, required cases, and sequential tests.
+"""Success rates of independent cases: exact binomial bounds, required cases, and sequential tests.
+
+`marsyard.reports.statistics.clusters` computes bounds for cases that share terrains.
 
 The bounds are those of Clopper & Pearson, "The use of confidence or fiducial limits illustrated in the case of the
 binomial", Biometrika 26, 1934.
@@ -9,12 +11,11 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float64
 from scipy import special, stats
 
 #: Maximum number of cases of `minimum_sample_size`.
@@ -99,91 +100,6 @@ def consumer_risk(successes: float | int, n: float | int, rate: float) -> float:
     return 1.0 if successes <= 0 else float(stats.beta.cdf(rate, successes, n - successes + 1.0))
 
 
-#: Minimum number of terrains, and of terrains with a failure and with a success, to estimate the design effect.
-#: Chosen by simulation (`tests/reports/statistics/test_clusters.py`) so that the bounds keep their confidence.
-_MIN_TERRAINS = 50
-_MIN_MIXED_TERRAINS = 10
-
-
-class ClusterMethod(StrEnum):
-    """Method of the bounds of clustered cases."""
-
-    KORN_GRAUBARD = "Korn-Graubard effective sample size"
-    TERRAIN_COUNT = "terrains counted instead of cases"
-
-
-@dataclass(frozen=True)
-class ClusteredEvidence:
-    """Evidence for a success rate from cases that share terrains.
-
-    - terrains, failed_terrains: number of distinct terrains, and of terrains with at least one failed case
-    - method: method of the bounds
-    - design_effect: variance of the success rate divided by that of as many independent cases; NaN if unknown
-    - effective_n, effective_successes: equivalent independent cases, and their successes for the lower bound
-    - lower, upper: one-sided bounds of the success rate of a case, each at the requirement's confidence
-    """
-
-    terrains: int
-    failed_terrains: int
-    method: ClusterMethod
-    design_effect: float
-    effective_n: float
-    effective_successes: float
-    lower: float
-    upper: float
-
-
-def clustered_evidence(
-    success: Bool[np.ndarray, " n"], terrain: Int[np.ndarray, " n"], confidence: float
-) -> ClusteredEvidence:
-    """Compute one-sided bounds of a success rate, each at `confidence`; `terrain`: terrain number of each case.
-
-    For few terrains with failures or with successes, terrains are counted instead of cases. Otherwise the bounds are
-    those of Clopper and Pearson with the effective sample size of Korn & Graubard 1998, limited to n.
-    """
-    index = number_terrains(terrain)
-    sizes = np.bincount(index).astype(np.float64)
-    successes = np.bincount(index, weights=success.astype(np.float64))
-    n_failed, n_succeeded = int((successes < sizes).sum()), int((successes > 0).sum())
-    n, terrains = float(sizes.sum()), sizes.size
-    if terrains >= _MIN_TERRAINS and min(n_failed, n_succeeded) >= _MIN_MIXED_TERRAINS:
-        method, design_effect = ClusterMethod.KORN_GRAUBARD, _estimate_design_effect(successes, sizes)
-        # The second factor accounts for the estimation of the variance from few terrains.
-        correction = (stats.t.ppf(confidence, n - 1) / stats.t.ppf(confidence, terrains - 1)) ** 2
-        effective_n = min(n, n / max(design_effect, 1e-9) * float(correction))
-        min_successes = max_successes = float(successes.sum() / n * effective_n)
-    else:
-        # A terrain counts as failed if any of its cases failed (lower bound), and as successful if any of its cases
-        # succeeded (upper bound). With equally many cases on each terrain, both bounds are therefore conservative. With
-        # unequal numbers (fewer answers on difficult terrains), the rate of the cases can be the more conservative one.
-        method, design_effect, effective_n = ClusterMethod.TERRAIN_COUNT, float("nan"), float(terrains)
-        scaled_successes = terrains * float(successes.sum() / n)
-        min_successes = min(float(terrains - n_failed), scaled_successes)
-        max_successes = max(float(n_succeeded), scaled_successes)
-    lower = proportion_lower(min_successes, effective_n, confidence)
-    upper = proportion_upper(max_successes, effective_n, confidence)
-    return ClusteredEvidence(terrains, n_failed, method, design_effect, effective_n, min_successes, lower, upper)
-
-
-def _estimate_design_effect(successes: Float[np.ndarray, " terrains"], sizes: Float[np.ndarray, " terrains"]) -> float:
-    """Estimate the variance of the rate over terrains (Taylor linearisation), divided by the binomial variance."""
-    terrains, n = sizes.size, sizes.sum()
-    rate = successes.sum() / n
-    residuals = successes - rate * sizes
-    variance = terrains / (terrains - 1) * float((residuals**2).sum()) / n**2
-    return float(variance / (rate * (1.0 - rate) / n))
-
-
-def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Number the terrains consecutively from 0, in the order of their original numbers."""
-    lowest, highest = int(terrain.min()), int(terrain.max())
-    if highest - lowest > 4 * terrain.size:
-        return np.unique(terrain, return_inverse=True)[1]
-    # for dense numbers: count instead of sorting, which is slow for a million cases
-    shifted = terrain - lowest
-    return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
-
-
 #: Minimum risk, since a confidence closer to 1 would be rounded to 1.
 _MIN_RISK = 1e-12
 #: Minimum number of cases of the first look, and maximum number of looks.
@@ -235,15 +151,19 @@ class SequentialTest:
     - rate: probability of an event at the limit of the requirement: 1 - probability for PASS, probability for FAIL
     - risk: probability of a false verdict at all looks together: 1 - confidence
     - first_n: number of cases at the first look, or of terrains if terrains are counted
+    - first_look_risk: probability of a false verdict at the first look, if it does not use the Clopper-Pearson bound
     """
 
     rate: float
     risk: float
     first_n: int
+    first_look_risk: float | None = None
 
     @cached_property
     def log_threshold(self) -> float:
         """Logarithm of the likelihood ratio that supports the verdict at a later look."""
+        if self.first_look_risk is not None:
+            return -math.log(max(_MIN_RISK, self.risk - self.first_look_risk))
         events = np.arange(self.first_n + 1, dtype=np.float64)
         deciding_events = events[stats.binom.cdf(events, self.first_n, self.rate) <= self.risk]
         log_probability = stats.binom.logpmf(deciding_events, self.first_n, self.rate)

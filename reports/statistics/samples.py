@@ -11,16 +11,14 @@ confidence interval for standard deviation of nonnormal distributions", Comput. 
 Values that share terrains (`groups`) are correlated; the terrain is the sampling unit. Mean and standard deviation: BCa
 bootstrap of entire terrains (Davison & Hinkley, "Bootstrap methods and their application", 1997, section 3.8), widened
 for few terrains as for few values; it also includes Student's interval with the variance over terrains (Taylor
-linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: order statistics, with the counts of
-`marsyard.reports.statistics.proportions`: the effective number of values (Woodruff, J. Amer. Statist. Assoc. 47, 1952,
-with Korn & Graubard's number), or the number of terrains if too few of them lie on one side.
+linearisation; Cochran, "Sampling techniques", 1977, section 6). Quantiles: the order statistic at which the rate of
+larger values has its bound (`marsyard.reports.statistics.clusters`).
 
 `python -m benchmarks.validation --only intervals --only shared` measures the coverage of all these intervals.
 """
 
 from __future__ import annotations
 
-import bisect
 import math
 import warnings
 from collections.abc import Callable, Sequence
@@ -29,17 +27,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.reports.statistics.proportions import (
-    ClusterMethod,
-    Interval,
-    check_confidence,
-    clustered_evidence,
-    number_terrains,
-    proportion_lower,
-)
+from marsyard.reports.statistics.clusters import count_sizes, event_scores, max_statistic, number_terrains
+from marsyard.reports.statistics.proportions import Interval, check_confidence
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
 _MAX_BOOTSTRAP = 2000
@@ -224,20 +217,15 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
         # `ppf` gives the smallest k with P(Bin <= k) >= confidence; the value of 1-based rank k + 1 is the bound
         rank = int(stats.binom.ppf(confidence, n, quantile))
         return float(ordered[rank]) if rank < n else math.inf
-    is_below = values <= ordered[min(n - 1, max(0, math.ceil(quantile * n) - 1))]
-    evidence = clustered_evidence(is_below, groups, confidence)
-    weight = evidence.effective_n / n
-    if evidence.method is ClusterMethod.TERRAIN_COUNT:
-        # an upper bound of the maxima of the terrains is also an upper bound of the values; each terrain counts once
-        index = number_terrains(groups)
-        ordered = np.full(int(index.max()) + 1, -math.inf)
-        np.maximum.at(ordered, index, values)
-        ordered, weight = np.sort(ordered), 1.0
-    # first rank above the quantile; each value is `weight` independent values
-    ranks = range(1, ordered.size + 1)
-    total = ordered.size * weight
-    rank = bisect.bisect_left(ranks, True, key=lambda k: proportion_lower(k * weight, total, confidence) >= quantile)
-    return float(ordered[rank]) if rank < ordered.size else math.inf
+    # `index` is that of the sorted values; each value has `larger` larger values on its terrain
+    index = number_terrains(groups)[np.argsort(values, kind="stable")]
+    sizes = count_sizes(np.bincount(index))
+    limit = max_statistic(sizes, 1.0 - quantile, 1.0 - confidence)
+    larger = pd.Series(index[::-1]).groupby(index[::-1]).cumcount().to_numpy()
+    # statistic of the values from each rank on, and beyond the largest value
+    statistic = np.append(np.cumsum(np.diff(event_scores(sizes))[larger])[::-1], 0)
+    is_bound = statistic[1:] <= limit
+    return float(ordered[np.argmax(is_bound)]) if is_bound.any() else math.inf
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,8 @@ class ClusterEvidence(_Model):
 
     terrains: int
     failed_terrains: int
-    method: str
-    design_effect: float | None = Field(description="null for too few failures or terrains")
-    effective_n: float = Field(description="number of independent cases with the same evidence")
-    effective_successes: float
-    lower: float
-    upper: float
+    successful_terrains: int
+    failure_pairs: int = Field(description="number of pairs of failures on one terrain")
 
 
 class AllCases(_Model):

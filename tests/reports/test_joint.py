@@ -52,7 +52,7 @@ def make_evidence(cases: int, failures: int) -> RequirementEvidence | None:
     if not cases:
         return None
     success = np.arange(cases) >= failures
-    part = CaseEvidence(success, None, np.arange(cases) < 60, contains_first=True)
+    part = CaseEvidence(success, np.ones(cases, dtype=bool), None, np.arange(cases) < 60, contains_first=True)
     return RequirementEvidence(part, part)
 
 
@@ -91,16 +91,20 @@ def test_separate_confirmations_exceed_the_risk_of_a_wrong_pass() -> None:
     assert (lower[failures] >= RATE).any(axis=1).mean() > 0.5
 
 
-@given(st.lists(st.tuples(st.booleans(), st.integers(0, 5), st.booleans()), min_size=1, max_size=40), st.booleans())
-def test_counts_in_the_record_keep_the_evidence(cases: list[tuple[bool, int, bool]], is_labelled: bool) -> None:
-    success, terrain, in_first_look = (np.array(values) for values in zip(*cases, strict=True))
+CASES = st.tuples(st.booleans(), st.booleans(), st.integers(0, 5), st.booleans())
+
+
+@given(st.lists(CASES, min_size=1, max_size=40), st.booleans())
+def test_counts_in_the_record_keep_the_evidence(cases: list[tuple[bool, bool, int, bool]], is_labelled: bool) -> None:
+    success, member, terrain, in_first_look = (np.array(values) for values in zip(*cases, strict=True))
     names, groups = np.unique(terrain, return_inverse=True)
     labels = tuple(f"terrain {name}" for name in names) if is_labelled else None
-    evidence = CaseEvidence(success, groups, in_first_look, labels)
+    evidence = CaseEvidence(success & member, member, groups, in_first_look, labels)
     rows = json.loads(json.dumps(evidence.to_rows()))
     restored = CaseEvidence.from_rows(rows, is_first=True)
     assert sorted(restored.to_rows()) == sorted(rows)
-    assert (restored.success.size, int(restored.success.sum())) == (success.size, int(success.sum()))
+    assert (restored.n, restored.failures) == (evidence.n, evidence.failures)
+    assert restored.success.size == len(cases)
     joined = evidence.join(restored)
     assert len(np.unique(joined.terrain_groups)) == len(names) * (1 if is_labelled else 2)
     assert not CaseEvidence.from_rows(rows, is_first=False).in_first_look.any()

@@ -1,0 +1,411 @@
+"""Bounds of the rate of an event among cases that share terrains; exact for every distribution of rates over terrains.
+
+Model: a terrain has an unknown rate theta of events, which varies between terrains with an unknown distribution G on
+[0, 1]. Given theta, the cases on the terrain are independent: k of its n cases have the event with the binomial
+probability B(k; n, theta). The rate q of a case is the mean of G. The numbers n are part of the design.
+
+The statistic is S = sum of k^2 over the terrains: the number of events, plus twice the number of pairs of events on one
+terrain. Events that are spread over terrains are therefore stronger evidence for a low rate than as many events on one
+terrain. `event_scores` limits the number of values of S for large n.
+
+The p-value of a rate q is the supremum of P(S <= observed) over all G with the mean q (the least favourable mixing
+distribution). For a given distribution of all other terrains, P is linear in the G of one terrain, so its maximum has
+two support points. The supremum is therefore searched among the G with two support points; the tests verify that other
+distributions do not exceed it. Without an event it is (1 - q)^terrains: each terrain counts as one case. With one case
+on each terrain it is the binomial distribution of Clopper and Pearson.
+
+Cases that do not belong to a population have neither the event nor its opposite. The rate in the population is the rate
+of events per case, divided by the rate of members per case. Both have a bound, and share the risk.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Complex128, Float64, Int
+from scipy import ndimage, optimize, special, stats
+
+#: Numbers of terrains by their number of cases: pairs (cases on a terrain, terrains with this number).
+Sizes = tuple[tuple[int, int], ...]
+#: Relative positions of two support points: of the lower one between 0 and the mean, of the other between mean and 1.
+Pair = tuple[float, float]
+
+#: Fraction of the risk of a wrong bound that the bound of the rate of members uses.
+_MEMBER_RISK_FRACTION = 0.1
+#: Minimum rate of members for the number of further cases, which would otherwise be infinite.
+_MIN_MEMBER_RATE = 0.01
+#: Maximum number of values of one batch of distributions, and limits of the number of support points per axis.
+_MAX_BATCH, _MIN_GRID, _MAX_GRID = 2**16, 8, 18
+#: Number of cases on a terrain up to which the squares of numbers of events are not rounded.
+_MAX_SQUARED = 32
+#: Factor of suppression of unresolved coefficients of a generating function; the rounding error is 1e-16 / this.
+_ALIASING = 1e-10
+#: Range of the logits of support points in the search, number of its refinements, and of refined local maxima.
+_MAX_LOGIT, _REFINEMENTS, _MAX_STARTS = 7.0, 4, 4
+#: Maximum number of searches for a bound, and its relative accuracy.
+_MAX_STEPS, _TOLERANCE = 20, 1e-4
+
+
+def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Number the terrains consecutively from 0, in the order of their original numbers."""
+    lowest, highest = int(terrain.min()), int(terrain.max())
+    if highest - lowest > 4 * terrain.size:
+        return np.unique(terrain, return_inverse=True)[1]
+    # for dense numbers: count instead of sorting, which is slow for a million cases
+    shifted = terrain - lowest
+    return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
+
+
+@dataclass(frozen=True)
+class TerrainCounts:
+    """Numbers of cases by terrain (`sizes`), and the statistic of an event: the sum of k^2 over the terrains."""
+
+    sizes: Sizes
+    statistic: int
+
+    @classmethod
+    def of(cls, event: Bool[np.ndarray, " n"], index: Int[np.ndarray, " n"]) -> TerrainCounts:
+        """Count cases and events; `index` numbers the terrains from 0 (`number_terrains`)."""
+        cases, events = np.bincount(index), np.bincount(index, weights=event).astype(np.int64)
+        sizes = count_sizes(cases)
+        return cls(sizes, int(event_scores(sizes)[events].sum()))
+
+    @property
+    def terrains(self) -> int:
+        """Number of terrains."""
+        return sum(terrains for _, terrains in self.sizes)
+
+    def with_single_cases(self, cases: int) -> TerrainCounts:
+        """Return the counts with additional cases without the event, each on a new terrain."""
+        if cases == 0:
+            return self
+        terrains = dict(self.sizes)
+        return TerrainCounts(tuple(sorted({**terrains, 1: terrains.get(1, 0) + cases}.items())), self.statistic)
+
+    def p_value(self, rate: float) -> float:
+        """Compute the largest probability of a statistic at most as large, if the rate of the event is `rate`."""
+        return _max_tail(self.sizes, self.statistic, rate)
+
+    def max_rate(self, risk: float) -> float:
+        """Compute the upper bound of the rate of the event: the rate whose p-value equals `risk`."""
+        return _max_rate(self.sizes, self.statistic, risk)
+
+
+def count_sizes(cases_on_terrain: Int[np.ndarray, " terrains"]) -> Sizes:
+    """Count the terrains with each number of cases."""
+    cases, terrains = np.unique(cases_on_terrain[cases_on_terrain > 0], return_counts=True)
+    return tuple(zip(cases.tolist(), terrains.tolist(), strict=True))
+
+
+def event_scores(sizes: Sizes) -> Int[np.ndarray, " _"]:
+    """Return the score of 0 to n events on a terrain, for the largest number of cases n.
+
+    It is k^2 for k events if n is at most 32, otherwise k^2 in units of (n / 32)^2, rounded up.
+    """
+    largest = max(cases for cases, _ in sizes)
+    events = np.arange(largest + 1, dtype=np.int64)
+    scale = max(largest, _MAX_SQUARED)
+    # integers: -(-a // b) rounds a / b up
+    return np.asarray(-(-(events**2) * _MAX_SQUARED**2 // scale**2))
+
+
+@lru_cache(maxsize=4096)
+def max_statistic(sizes: Sizes, rate: float, risk: float) -> int:
+    """Find the largest statistic whose p-value at a rate is at most `risk`; -1 if there is none."""
+    largest = _largest_statistic(sizes)
+
+    def exceeds(statistic: int) -> bool:
+        return _max_tail(sizes, statistic, rate) > risk
+
+    # bracket the result from the nearer end: statistics near the ends are much faster to evaluate
+    width = 1
+    if rate < 0.5:
+        while width < largest and not exceeds(width):
+            width *= 2
+        values = range(min(width, largest) + 1)
+    else:
+        while width < largest and exceeds(largest - width):
+            width *= 2
+        values = range(max(largest - width, 0), largest + 1)
+    return values.start + bisect.bisect_left(values, True, key=exceeds) - 1
+
+
+@lru_cache(maxsize=4096)
+def _max_rate(sizes: Sizes, statistic: int, risk: float) -> float:
+    """See `TerrainCounts.max_rate`."""
+    terrains = sum(count for _, count in sizes)
+    if statistic >= _largest_statistic(sizes):
+        return 1.0
+    # without an event, the p-value is (1 - rate)^terrains; events increase it
+    lower = 1.0 - math.pow(risk, 1.0 / terrains)
+    if statistic == 0:
+        return lower
+
+    tail, rate = TailFunction(sizes, statistic), lower
+    for _ in range(_MAX_STEPS):
+        probability, pair = _least_favourable(sizes, statistic, rate)
+        if probability <= risk * (1.0 + _TOLERANCE):
+            break
+        # the rate with this p-value for the same pair; the least favourable pair there has a larger p-value
+        rate = _solve_rate(tail, pair, rate, risk)
+    return rate
+
+
+def _solve_rate(tail: TailFunction, pair: Pair, rate: float, risk: float) -> float:
+    """Find the rate above `rate` at which the tail probability of a pair of support points equals `risk`."""
+
+    def log_ratio(logit: float) -> float:
+        mean = float(special.expit(logit))
+        probability = tail.of_pairs(*_support(np.array(pair[:1]), np.array(pair[1:]), mean), mean)
+        return math.log(max(float(probability[0, 0]), 1e-300) / risk)
+
+    start = float(special.logit(rate))
+    stop = start + 1.0
+    while log_ratio(stop) > 0.0:
+        stop += 1.0
+    if log_ratio(start) <= 0.0:  # by rounding
+        return rate
+    return float(special.expit(optimize.brentq(log_ratio, start, stop, xtol=_TOLERANCE)))
+
+
+def _max_tail(sizes: Sizes, statistic: int, rate: float) -> float:
+    """Compute the supremum of P(S <= statistic) over the distributions with the mean `rate`."""
+    terrains = sum(count for _, count in sizes)
+    if statistic < 0:
+        return 0.0
+    if statistic >= _largest_statistic(sizes):
+        return 1.0
+    if statistic == 0:
+        return math.pow(1.0 - rate, terrains)
+    if sizes == ((1, terrains),):
+        return float(stats.binom.cdf(statistic, terrains, rate))
+    return _least_favourable(sizes, statistic, rate)[0]
+
+
+@lru_cache(maxsize=16384)
+def _least_favourable(sizes: Sizes, statistic: int, rate: float) -> tuple[float, Pair]:
+    """Find the largest P(S <= statistic) of the distributions with two support points; return it with the points."""
+    tail = TailFunction(sizes, statistic)
+    grid = min(_MAX_GRID, max(_MIN_GRID, math.isqrt(_MAX_BATCH // tail.nodes.size)))
+    # most points are close to 0, to the mean, and to 1
+    logits = special.expit(np.linspace(-_MAX_LOGIT, _MAX_LOGIT, grid))
+    x, y = np.concatenate([[0.0], logits, [1.0]]), np.append(logits, 1.0)
+    probabilities = tail.of_pairs(*_support(x, y, rate), rate)
+    is_maximum = probabilities == ndimage.maximum_filter(probabilities, 3, mode="nearest")
+    starts = np.argwhere(is_maximum)
+    order = np.argsort(-probabilities[tuple(starts.T)], kind="stable")[:_MAX_STARTS]
+    probability, pair = max(_refine(tail, rate, (x, y), (int(row), int(column))) for row, column in starts[order])
+    return min(probability, 1.0), pair
+
+
+def _support(x: np.ndarray, y: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Compute support points below and above the mean from their relative positions between 0, the mean and 1."""
+    return x * rate, rate + y * (1.0 - rate)
+
+
+def _refine(
+    tail: TailFunction, rate: float, axes: tuple[np.ndarray, np.ndarray], position: tuple[int, int]
+) -> tuple[float, Pair]:
+    """Refine a maximum on a grid of the relative positions of two support points; return it with the positions."""
+    probability = 0.0
+    for _ in range(_REFINEMENTS):
+        axes = _between_neighbours(axes[0], position[0]), _between_neighbours(axes[1], position[1])
+        probabilities = tail.of_pairs(*_support(*axes, rate), rate)
+        row, column = np.unravel_index(int(probabilities.argmax()), probabilities.shape)
+        position, probability = (int(row), int(column)), float(probabilities[row, column])
+    return probability, (float(axes[0][position[0]]), float(axes[1][position[1]]))
+
+
+def _between_neighbours(axis: Float64[np.ndarray, " n"], index: int) -> Float64[np.ndarray, " 7"]:
+    """Return seven points between the neighbours of a point of the grid."""
+    return np.linspace(axis[max(index - 1, 0)], axis[min(index + 1, axis.size - 1)], 7)
+
+
+def _largest_statistic(sizes: Sizes) -> int:
+    """Return the statistic if all cases have the event."""
+    scores = event_scores(sizes)
+    return sum(terrains * int(scores[cases]) for cases, terrains in sizes)
+
+
+class TailFunction:
+    """P(S <= statistic) as a function of the distribution of the rate over terrains.
+
+    The generating function of S is the product of those of all terrains. It is evaluated at `nodes` on a circle in the
+    complex plane, and the sum of its first coefficients is a weighted sum of these values (discrete Fourier transform).
+    The radius of the circle is below 1, to suppress the coefficients that the number of nodes does not resolve.
+
+    If this needs fewer nodes, the missing scores are summed: P(S <= s) is 1 - P(S_max - S <= S_max - s - 1).
+    """
+
+    def __init__(self, sizes: Sizes, statistic: int) -> None:
+        complement = _largest_statistic(sizes) - statistic - 1
+        self._is_complement = complement < statistic
+        length = 1 + min(statistic, complement)
+        count = 2 * length
+        radius = _ALIASING ** (1.0 / count)
+        indices = np.arange(length + 1)
+        #: Nodes in the upper half plane; the values in the lower half plane are their complex conjugates.
+        self.nodes = radius * np.exp(2j * np.pi * indices / count)
+        # geometric series: sum of (radius^-1 exp(-2 pi i k / count))^power over the powers below `length`
+        ratios = 1.0 / self.nodes
+        self._weights = (1.0 - ratios**length) / (1.0 - ratios) / count
+        self._weights[1:-1] *= 2.0
+        self._sizes = sizes
+        # node^score for each size, by the number of events
+        self._factors = []
+        for cases, _ in sizes:
+            scores = event_scores(sizes)[: cases + 1]
+            scores = scores[-1] - scores if self._is_complement else scores
+            self._factors.append(self.nodes ** scores[:, None])
+
+    def of_pairs(
+        self, low: Float64[np.ndarray, " rows"], high: Float64[np.ndarray, " columns"], mean: float
+    ) -> Float64[np.ndarray, "rows columns"]:
+        """Evaluate all distributions with one support point in `low`, one in `high`, and the given mean."""
+        weight = ((mean - low[:, None]) / (high - low[:, None]))[..., None]
+        product = np.ones((low.size, high.size, self.nodes.size), dtype=np.complex128)
+        for index, (_, terrains) in enumerate(self._sizes):
+            values = (1.0 - weight) * self._terrain(index, low)[:, None] + weight * self._terrain(index, high)
+            product *= _power(values, terrains)
+        return self._sum(product)
+
+    def of_distribution(self, rates: Float64[np.ndarray, " points"], weights: Float64[np.ndarray, " points"]) -> float:
+        """Evaluate the distribution with the support points `rates` and their `weights`, which sum to 1."""
+        product = np.ones(self.nodes.size, dtype=np.complex128)
+        for index, (_, terrains) in enumerate(self._sizes):
+            product *= _power(weights @ self._terrain(index, rates), terrains)
+        return float(self._sum(product))
+
+    def _terrain(self, index: int, rates: Float64[np.ndarray, " m"]) -> Complex128[np.ndarray, "m nodes"]:
+        """Evaluate the generating function of the score of one terrain, for each rate."""
+        cases = self._sizes[index][0]
+        probabilities = stats.binom.pmf(np.arange(cases + 1), cases, rates[:, None])
+        # without BLAS, whose threads cost more than such small products
+        return np.einsum("ij,jk->ik", probabilities, self._factors[index])
+
+    def _sum(self, values: Complex128[np.ndarray, "*batch nodes"]) -> Float64[np.ndarray, "*batch"]:
+        """Sum the first coefficients of the generating function."""
+        probability = np.einsum("...k,k->...", values, self._weights).real
+        return np.asarray(1.0 - probability if self._is_complement else probability)
+
+
+def _power(values: Complex128[np.ndarray, "*batch"], exponent: int) -> Complex128[np.ndarray, "*batch"]:
+    """Raise to a positive power by repeated squaring, which is much faster than the power of complex numbers."""
+    if exponent == 1:
+        return values
+    root = _power(values, exponent // 2)
+    return np.asarray(root * root * values if exponent & 1 else root * root)
+
+
+@lru_cache(maxsize=1024)
+def attainable_risk(sizes: Sizes, rate: float, risk: float) -> float:
+    """Compute the largest p-value of a rate that is at most `risk`; 0 if there is none."""
+    return _max_tail(sizes, max_statistic(sizes, rate, risk), rate)
+
+
+@dataclass(frozen=True)
+class TerrainEvidence:
+    """Numbers of terrains with a case of the population, with a failure, and with a success.
+
+    failure_pairs: number of pairs of failures on one terrain
+    """
+
+    terrains: int
+    failed_terrains: int
+    successful_terrains: int
+    failure_pairs: int
+
+
+@dataclass(frozen=True)
+class ClusteredCases:
+    """Cases that share terrains.
+
+    All cases of the design are included, because the number of cases of a population on a terrain can depend on the
+    terrain. `index` numbers the terrains from 0 (`number_terrains`).
+
+    - member: whether each case belongs to the population
+    - success: whether each case is a success; ignored outside the population
+    """
+
+    success: Bool[np.ndarray, " n"]
+    member: Bool[np.ndarray, " n"]
+    index: Int[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, success: Bool[np.ndarray, " n"], index: Int[np.ndarray, " n"]) -> ClusteredCases:
+        """Create cases that all belong to the population."""
+        return cls(success, np.ones(success.size, dtype=np.bool_), index)
+
+    @cached_property
+    def failures(self) -> TerrainCounts:
+        """Failures of the population."""
+        return TerrainCounts.of(self.member & ~self.success, self.index)
+
+    @cached_property
+    def is_first_on_terrain(self) -> Bool[np.ndarray, " n"]:
+        """Whether each case is the first one on its terrain."""
+        is_first = np.zeros(self.index.size, dtype=np.bool_)
+        is_first[np.unique(self.index, return_index=True)[1]] = True
+        return is_first
+
+    def count_terrains(self) -> TerrainEvidence:
+        """Count the terrains by the outcomes of their cases."""
+        members = np.bincount(self.index, weights=self.member)
+        failures = np.bincount(self.index, weights=self.member & ~self.success)
+        return TerrainEvidence(
+            terrains=int((members > 0).sum()),
+            failed_terrains=int((failures > 0).sum()),
+            successful_terrains=int((members > failures).sum()),
+            failure_pairs=int((failures * (failures - 1.0) / 2.0).sum()),
+        )
+
+    def max_failure_rate(self, risk: float) -> float:
+        """Compute the upper bound of the failure rate in the population."""
+        min_member_rate, other_risk = self._min_member_rate(risk)
+        return min(1.0, self.failures.max_rate(other_risk) / min_member_rate) if min_member_rate > 0.0 else 1.0
+
+    def consumer_risk(self, max_failure_rate: float, risk: float) -> float:
+        """Compute the probability of this result or a better one if the failure rate is `max_failure_rate`.
+
+        risk: permitted risk; its part for the rate of members is included. The result is at most `risk` if and only if
+        the upper bound of the failure rate at this risk is at most `max_failure_rate`.
+        """
+        min_member_rate, other_risk = self._min_member_rate(risk)
+        return min(1.0, self.failures.p_value(max_failure_rate * min_member_rate) + risk - other_risk)
+
+    def further_cases_needed(self, max_failure_rate: float, risk: float) -> int:
+        """Find the minimum number of further cases, each on a new terrain and without a failure, for a failure rate.
+
+        The upper bound of the failure rate is then at most `max_failure_rate`. The rate of members is not increased, so
+        slightly fewer cases can be sufficient.
+        """
+        min_member_rate, other_risk = self._min_member_rate(risk)
+        rate = max_failure_rate * max(min_member_rate, _MIN_MEMBER_RATE)
+
+        def is_sufficient(cases: int) -> bool:
+            return self.failures.with_single_cases(cases).p_value(rate) <= other_risk
+
+        upper = 1
+        while not is_sufficient(upper):
+            upper *= 2
+        return bisect.bisect_left(range(upper), True, key=is_sufficient)
+
+    def _min_member_rate(self, risk: float) -> tuple[float, float]:
+        """Return the lower bound of the rate of members, and the part of the risk that it does not use."""
+        if self.member.all():
+            return 1.0, risk
+        max_other_rate = TerrainCounts.of(~self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
+        return 1.0 - max_other_rate, (1.0 - _MEMBER_RISK_FRACTION) * risk
+
+    def min_failure_rate(self, risk: float) -> float:
+        """Compute the lower bound of the failure rate in the population."""
+        max_member_rate, other_risk = 1.0, risk
+        if not self.member.all():
+            max_member_rate = TerrainCounts.of(self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
+            other_risk = (1.0 - _MEMBER_RISK_FRACTION) * risk
+        no_failure = TerrainCounts.of(~self.member | self.success, self.index)
+        return (1.0 - no_failure.max_rate(other_risk)) / max_member_rate
