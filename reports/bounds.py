@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from marsyard.reports.case_evidence import Mask
 from marsyard.reports.statistics import proportions
 from marsyard.reports.statistics.clusters import ClusteredCases, TerrainEvidence, attainable_risk, count_sizes
 from marsyard.reports.statistics.proportions import SequentialTest, confidence_at

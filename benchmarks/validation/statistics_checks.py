@@ -21,9 +21,9 @@ from benchmarks.validation.nights import (
 )
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.history import MAX_EARLIER_NIGHTS
+from marsyard.reports.statistics.clusters import ClusteredCases, Sizes, event_scores, max_statistic, number_terrains
 from marsyard.reports.statistics.proportions import (
     Interval,
-    clustered_evidence,
     confidence_at,
     planned_looks,
     proportion_lower,
@@ -101,36 +101,69 @@ def run_intervals(quick: bool) -> Iterator[Measure]:
     )
 
 
-def _draw_successes(
-    rng: np.random.Generator, rate: float, correlation: float, terrains: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw successes on terrains with beta-distributed rates; return the successes and their terrains.
+#: Designs of cases that share terrains: (cases on a terrain, number of terrains).
+_DESIGNS: dict[str, Sizes] = {
+    "8 terrains of 3 cases": ((3, 8),),
+    "250 terrains of 4 cases": ((4, 250),),
+    "60 terrains of 8 cases": ((8, 60),),
+    "138 terrains of 1 to 16 cases": ((1, 60), (2, 40), (5, 30), (16, 8)),
+}
+_CORRELATIONS = (0.0, 0.05, 0.3, 1.0)
+
+
+def _draw_events(rng: np.random.Generator, sizes: Sizes, rate: float, correlation: float, trials: int) -> np.ndarray:
+    """Draw the number of events on each terrain, for each trial; the rates of terrains have a beta distribution.
 
     The beta distribution has the parameters rate * weight and (1 - rate) * weight. The correlation of two cases on one
     terrain is then 1 / (weight + 1).
     """
+    cases = np.repeat([size for size, _ in sizes], [terrains for _, terrains in sizes])
+    shape = trials, cases.size
+    if correlation == 0.0:
+        return rng.binomial(cases, rate, shape)
+    if correlation == 1.0:
+        return np.where(rng.random(shape) < rate, cases, 0)
     weight = (1.0 - correlation) / correlation
-    rates = rng.beta(rate * weight, (1.0 - rate) * weight, terrains)
-    terrain = np.repeat(np.arange(terrains), _CASES_PER_TERRAIN)
-    return rng.random(terrain.size) < rates[terrain], terrain
+    return rng.binomial(cases, rng.beta(rate * weight, (1.0 - rate) * weight, shape))
+
+
+def _statistics(events: np.ndarray, sizes: Sizes) -> np.ndarray:
+    """Compute the statistic of the events of each trial."""
+    return np.asarray(event_scores(sizes)[events].sum(axis=1))
 
 
 def run_correlated_rates(quick: bool) -> Iterator[Measure]:
-    """Measure the coverage of the bounds of a success rate of cases that share terrains."""
-    trials = 400 if quick else 3000
+    """Measure the coverage of the bounds of a failure rate of cases that share terrains."""
+    trials = 2000 if quick else 20_000
     rng = np.random.default_rng(2)
-    for rate in (0.99, 0.95, 0.8):
-        for correlation in (0.05, 0.3, 0.9):
-            for terrains in (20, 60, 250):
-                evidence = [
-                    clustered_evidence(*_draw_successes(rng, rate, correlation, terrains), CONFIDENCE)
-                    for _ in range(trials)
-                ]
-                lower = float(np.mean([bounds.lower <= rate for bounds in evidence]))
-                upper = float(np.mean([bounds.upper >= rate for bounds in evidence]))
-                claim = f"90 % bounds, rate {rate}, correlation {correlation}, {terrains} terrains"
-                how = f"{trials} campaigns, {_CASES_PER_TERRAIN} cases per terrain; the worse of both bounds"
-                yield Measure(claim, min(lower, upper), "", _min_coverage(CONFIDENCE, trials), how, "at least")
+    for design, sizes in _DESIGNS.items():
+        cases = np.repeat([size for size, _ in sizes], [terrains for _, terrains in sizes])
+        for rate in (0.01, 0.05, 0.2):
+            limits = max_statistic(sizes, rate, 1.0 - CONFIDENCE), max_statistic(sizes, 1.0 - rate, 1.0 - CONFIDENCE)
+            for correlation in _CORRELATIONS:
+                events = _draw_events(rng, sizes, rate, correlation, trials)
+                too_low = float(np.mean(_statistics(events, sizes) <= limits[0]))
+                too_high = float(np.mean(_statistics(cases - events, sizes) <= limits[1]))
+                claim = f"90 % bounds, failure rate {rate}, correlation {correlation:g}, {design}"
+                how = f"{trials} campaigns; the worse of both bounds"
+                limit = _min_coverage(CONFIDENCE, trials)
+                yield Measure(claim, 1.0 - max(too_low, too_high), "", limit, how, "at least")
+
+
+def run_power(quick: bool) -> Iterator[Measure]:
+    """Report the probability of PASS if the true failure rate is half of the permitted rate, and a tenth of it."""
+    trials = 2000 if quick else 20_000
+    rng = np.random.default_rng(7)
+    designs = {f"{250 * cases} cases on 250 terrains": ((cases, 250),) for cases in (1, 4, 16)}
+    designs |= {f"{cases} cases on as many terrains": ((1, cases),) for cases in (1000, 4000)}
+    for name, sizes in designs.items():
+        limit = max_statistic(sizes, 0.01, 1.0 - CONFIDENCE)
+        for rate, text in ((0.005, "half"), (0.001, "a tenth")):
+            for correlation in (0.0, 0.3):
+                passed = _statistics(_draw_events(rng, sizes, rate, correlation, trials), sizes) <= limit
+                claim = f"probability of PASS of 99 % at 90 %, {text} of the permitted failures, "
+                claim += f"correlation {correlation:g}, {name}"
+                yield Measure(claim, float(passed.mean()), "", None, f"{trials} campaigns", "at least")
 
 
 def run_correlated_errors(quick: bool) -> Iterator[Measure]:
@@ -199,17 +232,21 @@ def _simulate_decision(
     if correlation is None:
         success, terrain = rng.random(max_cases) < required, np.arange(max_cases)
     else:
-        success, terrain = _draw_successes(rng, required, correlation, -(-max_cases // _CASES_PER_TERRAIN))
+        sizes = ((_CASES_PER_TERRAIN, -(-max_cases // _CASES_PER_TERRAIN)),)
+        failures = _draw_events(rng, sizes, 1.0 - required, correlation, 1)[0]
+        success = (np.arange(_CASES_PER_TERRAIN) >= failures[:, None]).ravel()
         order = rng.permutation(success.size)
-        success, terrain = success[order][:max_cases], terrain[order][:max_cases]
+        terrain = np.repeat(np.arange(failures.size), _CASES_PER_TERRAIN)[order][:max_cases]
+        success = success[order][:max_cases]
     for look in planned_looks(max_cases):
         confidence, first_successes = confidence_at(CONFIDENCE, look.risk_fraction), success[: look.cases]
         if correlation is None:
             counts = int(first_successes.sum()), look.cases, confidence
             lower, upper = proportion_lower(*counts), proportion_upper(*counts)
         else:
-            evidence = clustered_evidence(first_successes, terrain[: look.cases], confidence)
-            lower, upper = evidence.lower, evidence.upper
+            cases = ClusteredCases.of(first_successes, number_terrains(terrain[: look.cases]))
+            lower = 1.0 - cases.max_failure_rate(1.0 - confidence)
+            upper = 1.0 - cases.min_failure_rate(1.0 - confidence)
         if lower >= required or upper < required:
             return lower >= required, upper < required
     return False, False
@@ -238,6 +275,7 @@ def run_nights(quick: bool) -> Iterator[Measure]:
 CHECKS = (
     Check("intervals", "Statistics", run_intervals),
     Check("clustered", "Statistics", run_correlated_rates),
+    Check("power", "Statistics", run_power),
     Check("shared", "Statistics", run_correlated_errors),
     Check("sequential", "Statistics", run_sequential),
     Check("nights", "Statistics", run_nights),

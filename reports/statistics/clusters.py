@@ -285,7 +285,7 @@ class TailFunction:
         cases = self._sizes[index][0]
         probabilities = stats.binom.pmf(np.arange(cases + 1), cases, rates[:, None])
         # without BLAS, whose threads cost more than such small products
-        return np.einsum("ij,jk->ik", probabilities, self._factors[index])
+        return np.asarray(np.einsum("ij,jk->ik", probabilities, self._factors[index]))
 
     def _sum(self, values: Complex128[np.ndarray, "*batch nodes"]) -> Float64[np.ndarray, "*batch"]:
         """Sum the first coefficients of the generating function."""
