@@ -18,6 +18,7 @@ from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.store.confirmations import add_result
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.rates import engine_failed
+from marsyard.reports.remedy import find_remedy
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
 from marsyard.reports.stored import StoredRun, read_run, table
@@ -44,6 +45,7 @@ class OverallVerdict:
     - sentence: explanation
     - without_status: headline if `status` is None
     - is_exploration: whether the run is an exploration, which the headline of PASS states
+    - cases_to_append: additional cases, all without a failure, that would decide the campaign; None if unknown
     """
 
     status: Status | None
@@ -51,6 +53,7 @@ class OverallVerdict:
     sentence: str
     without_status: str = "NO REQUIREMENT"
     is_exploration: bool = False
+    cases_to_append: int | None = None
 
     @property
     def word(self) -> str:
@@ -91,16 +94,21 @@ def combine_verdicts(
     )
     n_undecided = statuses.count(Status.INSUFFICIENT)
     undecided_text = f", {n_undecided} undecided" if n_undecided else ""
+    remedy = find_remedy(verdicts, len(frame))
+    remedy_text = f" {remedy.text}" if remedy.text else ""
     sentence = {
         Status.PASS: f"{count(len(statuses), 'requirement')} met.",
         Status.MET_BY_RATE: f"{fraction} met by the rate only, not at the required confidence.",
         Status.UNREGISTERED: f"{fraction} met, but no registered record shows the earlier runs.",
         Status.OTHER_CLAIMS: f"{fraction} met, after other claims about this campaign that did not pass.",
         Status.FAIL: f"{fraction} not met{undecided_text}.",
-        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {subject}.{_remedy_text(verdicts)}",
+        Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {subject}.{remedy_text}",
     }[worst]
     is_exploration = evidence is not None and evidence.kind is EvidenceKind.EXPLORATION
-    return OverallVerdict(worst, crashed, sentence + crash_text, is_exploration=is_exploration)
+    cases_to_append = remedy.cases if worst is Status.INSUFFICIENT and sampling.max_cases is None else None
+    return OverallVerdict(
+        worst, crashed, sentence + crash_text, is_exploration=is_exploration, cases_to_append=cases_to_append
+    )
 
 
 def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
@@ -114,21 +122,6 @@ def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     if has_rate_verdict or any(verdict.status is Status.INSUFFICIENT for verdict in verdicts):
         return 3
     return QUALIFIED_EXIT_CODE if any(verdict.status in _QUALIFIED for verdict in verdicts) else 0
-
-
-def _remedy_text(verdicts: Sequence[Verdict]) -> str:
-    """Describe how many additional cases would decide all requirements, or why more cases cannot; may be empty."""
-    verdict_with_advice = next((verdict for verdict in verdicts if verdict.advice), None)
-    if verdict_with_advice is not None:
-        return f" {verdict_with_advice.advice}"
-    undecided_verdicts = [verdict for verdict in verdicts if verdict.further_cases is not None]
-    if not undecided_verdicts:
-        return ""
-    largest = max(undecided_verdicts, key=lambda verdict: verdict.further_cases or 0)
-    terrain_text = "" if largest.clustered is None else ", each on a new terrain"
-    cases = count(largest.further_cases or 0, "additional case")
-    population = f" of the population of {largest.requirement_id}" if largest.population != "all" else ""
-    return f" {cases}{population}{terrain_text}, all without a failure, would be enough."
 
 
 @dataclass(frozen=True)

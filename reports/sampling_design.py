@@ -34,24 +34,23 @@ class TerrainSupply:
     def advice(self, min_terrains: int, probability: float, confidence: float) -> str:
         """Explain that the campaign needs at least `min_terrains` terrains, not more cases; state the settings."""
         requirement = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
-        supply_text = f"{count(self.terrains, 'stored terrain')} ({self.key} = {self.terrains})"
+        supply_text = f"{count(self.terrains, 'terrain')} ({self.key} = {self.terrains})"
         shortage = f"The campaign has only {supply_text}."
         if self.terrains >= min_terrains:
             shortage = (
                 f"Terrains are drawn at random and can repeat, so the {supply_text} are unlikely to give as many."
             )
-        text = (
+        # "location" or "world": table of the parameters `bank` and `terrain`
+        table_name = self.key.removeprefix('dispersions."').partition(".")[0]
+        settings = f"--set {table_name}.bank={min_terrains}"
+        if not self.in_turn or not self.key.endswith(".bank"):
+            dispersion = f'{{distribution="in-turn",low=0,high={min_terrains - 1}}}'
+            settings += f" --set 'dispersions.\"{table_name}.terrain\"={dispersion}'"
+        return (
             f"To show a success rate of {requirement}, the cases must include at least {min_terrains:,} different "
-            f"terrains. {shortage}"
+            f"terrains. {shortage} Run the campaign again with {min_terrains:,} cases, each on a terrain of its own: "
+            f"{settings} -n {min_terrains}."
         )
-        if not self.key.endswith(".bank"):
-            return f"{text} Widen the range of {self.key}, and the bank, and run the campaign again."
-        # 1.1 n random draws from 10 n terrains give 10 n (1 - exp(-0.11)) = 1.04 n different terrains on average
-        bank, cases = 10 * min_terrains, -(-11 * min_terrains // 10)
-        if self.in_turn:
-            bank = cases = min_terrains
-        remedy = f"{bank:,} stored terrains and {cases:,} cases: --set {self.key}={bank} -n {cases}."
-        return f"{text} Run the campaign again with {remedy}"
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ def read_terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | Non
             return TerrainSupply(1, path)
         in_turn = dispersion.get("distribution") == "in-turn"
         low, high = dispersion.get("low"), dispersion.get("high")
-        if isinstance(low, int) and isinstance(high, int) and high - low + 1 < bank:
-            return TerrainSupply(high - low + 1, f'dispersions."{path}"', in_turn)
+        if isinstance(low, int) and isinstance(high, int):  # otherwise a formula of the bank's size
+            return TerrainSupply(min(high - low + 1, bank), f'dispersions."{path}"', in_turn)
         return TerrainSupply(bank, f"{name}.bank", in_turn)
     return None

@@ -40,15 +40,22 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
 
     `shared_input` is the number of an input that several cases use, one of `Scenario.shared_inputs`.
 
+    - max_stored_terrains: largest bank whose terrains can be stored on disk before the cases; each case on a larger
+      bank builds its terrain in memory
     - algorithm_table: path of the parameter table that selects the algorithms; by default the top level
     - part_keys: parameter keys that select custom parts, and the kind of each part; by default only scores
     """
 
+    max_stored_terrains: int = 64
     algorithm_table: tuple[str, ...] = ()
     part_keys: Mapping[str, PartKind] = {"scores": SCORE}
 
     def __init__(self, max_cached_grounds: int = 0) -> None:
         self.load_ground: LoadGround = lru_cache(maxsize=max_cached_grounds)(SiteGround.from_bank)
+
+    def list_stored_terrains(self, bank: int) -> tuple[int, ...]:
+        """Return the numbers of a bank's terrains; empty for a bank of more than `max_stored_terrains` terrains."""
+        return tuple(range(bank)) if bank <= self.max_stored_terrains else ()
 
     @abstractmethod
     def input_terrain(self, p: ParametersType, shared_input: int) -> tuple[TerrainBank, int]:
@@ -57,7 +64,7 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Build the terrain of a shared input and store it in the cache on disk."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
-        bank.terrain(number)
+        bank.store(number)
 
     @abstractmethod
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:

@@ -15,9 +15,10 @@ from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.systems import SCENARIOS_FOLDER
 from marsyard.sim.camera import read_camera
 from marsyard.sim.parameters import warn_deprecated
+from marsyard.sim.terrain import MAX_TERRAINS
 
-#: Minimum number of terrains of a new campaign's bank, enough for cases appended later, and maximum of a bank.
-MIN_TERRAINS, MAX_TERRAINS = 10_000, 100_000
+#: Minimum number of terrains of a new campaign's bank, enough for cases appended later and for studies.
+MIN_TERRAINS = 100_000
 
 
 @dataclass(frozen=True)

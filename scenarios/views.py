@@ -66,17 +66,21 @@ class SiteGround:
 
     @classmethod
     def from_site(cls, site: Site, scale: Scale | None = None, *, seed: int = 1, number: int = 0) -> SiteGround:
-        """Load or build terrain `number` of a site's bank; by default at the site's coarsest scale.
+        """Load terrain `number` of a site's bank, or build and store it; by default at the site's coarsest scale.
 
         Raises ValueError if the site has no terrain at that scale.
         """
-        return cls.from_bank(site, site.terrain(scale), seed, number)
+        terrain = site.terrain(scale)
+        bank = TerrainBank(terrain, seed)
+        surface = bank.store(number)
+        return cls(site, terrain, surface, bank.rocks(number, surface))
 
     @classmethod
     def from_bank(cls, site: Site, terrain: TerrainParameters, seed: int, number: int) -> SiteGround:
-        """Load or build terrain `number` of a bank, and place its rocks."""
+        """Load terrain `number` of a bank if it is stored, otherwise build it in memory, and place its rocks."""
         bank = TerrainBank(terrain, seed)
-        return cls(site, terrain, bank.terrain(number), bank.rocks(number))
+        surface = bank.terrain(number)
+        return cls(site, terrain, surface, bank.rocks(number, surface))
 
     def photometry(self, sun: Sun) -> Photometry:
         """Return the photometry of this ground under a sun and the sky of the site's atmosphere."""

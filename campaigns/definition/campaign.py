@@ -163,6 +163,12 @@ class Campaign:
         return tuple(path for path, item in dispersions if not isinstance(item, Grid | Fixed | Derived | CyclicInteger))
 
     @cached_property
+    def cyclic_paths(self) -> tuple[str, ...]:
+        """Paths of the dispersions whose number follows the number of the case or, in a study, of its streams."""
+        dispersions = self.configuration.dispersions.items()
+        return tuple(path for path, item in dispersions if isinstance(item, CyclicInteger))
+
+    @cached_property
     def order(self) -> tuple[str, ...]:
         """Paths in the order of evaluation: a path follows those in its formulas. Raises ValueError for a cycle."""
         inputs = {path: dispersion.names for path, dispersion in self.configuration.dispersions.items()}

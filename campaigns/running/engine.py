@@ -237,7 +237,7 @@ def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None
             missing = _list_missing_cases(run, store)
             if missing or retries:
                 compile_kernels(executor, configuration.scenario, run.observer.note)
-                _prepare_inputs(run, executor, itertools.chain(*missing, retries))
+                prepare_inputs(run.campaign, executor, run.observer, itertools.chain(*missing, retries))
                 _run_cases(run, store, executor, [*missing, retries])
             write_table(table, store, numeric_metrics(configuration.requirements))
             if run.shard is None:
@@ -257,10 +257,15 @@ def _list_missing_cases(run: _CampaignRun, store: RowStore) -> list[range]:
     return [part for part in limited if part]
 
 
-def _prepare_inputs(run: _CampaignRun, executor: Executor, cases: Iterable[int]) -> None:
-    """Build the inputs shared by cases; if this fails, the rows of the affected cases contain the error."""
-    configuration, observer = run.campaign.configuration, run.observer
-    plan = plan_inputs(run.campaign, cases)
+def prepare_inputs(
+    campaign: Campaign, executor: Executor, observer: ProgressObserver, cases: Iterable[int] | None
+) -> None:
+    """Build the inputs that several cases share (see `plan_inputs`).
+
+    A case whose input could not be prepared builds it; if this fails, its row contains the error.
+    """
+    configuration = campaign.configuration
+    plan = plan_inputs(campaign, cases)
     inputs = plan.to_prepare
     if plan.build_bytes > plan.limit_bytes:
         sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache limit ({plan.limit_bytes / 1e9:.1f} GB)"

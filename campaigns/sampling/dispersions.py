@@ -249,15 +249,20 @@ class CyclicInteger(_WholeNumbers):
     """The whole numbers from `low` to `high`, both included, in sequence over the cases, then from `low` again.
 
     No number repeats before all numbers have occurred; for example, a campaign then uses as many terrains as possible.
-    If the number only selects one of many independent terrains, cases with different numbers are independent.
+    If the number only selects one of many independent terrains, cases with different numbers are independent. In a
+    study the number follows the number of the random streams.
     """
 
     distribution: Literal["in-turn"]
 
+    @property
+    def size(self) -> int:
+        """Number of the values; formulas must have been evaluated."""
+        return int(self.high) - int(self.low) + 1
+
     def value(self, case: int) -> int:
         """Return the number of a case."""
-        low, high = int(self.low), int(self.high)
-        return low + case % (high - low + 1)
+        return int(self.low) + case % self.size
 
 
 class Scipy(base.Dispersion):

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
@@ -22,7 +22,7 @@ from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import Executor
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
-from marsyard.campaigns.running.engine import ProgressObserver, check_metrics
+from marsyard.campaigns.running.engine import ProgressObserver, check_metrics, prepare_inputs
 from marsyard.campaigns.running.preparation import compile_kernels
 from marsyard.campaigns.running.replay import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
@@ -159,14 +159,20 @@ class PointRunner:
 def prepare_campaign(campaign: Campaign, max_cases: int) -> Campaign:
     """Return the campaign with the design `adaptive` and at most `max_cases` cases.
 
-    Raises CampaignError if a dispersion cannot be a standard normal variable.
+    A number `in-turn` that does not repeat within the study belongs to the random streams: it follows their number.
+    Raises CampaignError if a dispersion is neither a standard normal variable nor such a number.
     """
     configuration = campaign.configuration
     for path, dispersion in configuration.dispersions.items():
-        if isinstance(dispersion, Grid | CyclicInteger):
-            reason = f"is a distribution '{dispersion.distribution}', which has no probabilities"
-            remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
-            raise CampaignError(f"dispersions.{path}: {reason}; {remedy}")
+        remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
+        if isinstance(dispersion, Grid):
+            raise CampaignError(f"dispersions.{path}: is a distribution 'grid', which has no probabilities; {remedy}")
+        if isinstance(dispersion, CyclicInteger):
+            inputs = {name: value_at(configuration.parameters, name) for name in dispersion.names}
+            size = dispersion.insert_values(inputs).size
+            if size < max_cases:
+                reason = f"the {size} values of the distribution 'in-turn' repeat within {max_cases} cases"
+                raise CampaignError(f"dispersions.{path}: {reason}; extend its range, {remedy}")
     if not campaign.drawn_paths:
         raise CampaignError(f"campaign '{configuration.name}' has no random dispersion")
     changes = {"design": Design(kind=ADAPTIVE), "cases": max_cases, "appended": (), "max_cases": None}
@@ -254,6 +260,7 @@ def _run_study(
         try:
             with create_executor(session.executor) as executor:
                 compile_kernels(executor, campaign.configuration.scenario, observer.note)
+                prepare_inputs(campaign, executor, observer, None)
                 runner = PointRunner(campaign, directory, store, executor, observer)
                 result = session.execute(campaign, runner)
         finally:

@@ -93,10 +93,10 @@ class Failure:
 
     - case: number of the reduced case; original_case: number of the case before the reduction
     - margin: margin of the reduced case
-    - values: values of the dispersions that differ from the campaign's parameters, by path
+    - values: values of the dispersions that differ from the campaign's parameters, and of numbers `in-turn`, by path
     - distance: distance of these values from the medians, standard deviations; small distances are more likely
     - similar: number of violations with the same cause
-    - repeated, repetitions: number of violations among the repetitions with new random streams
+    - repeated, repetitions: number of violations among the repetitions with new random streams and numbers `in-turn`
     - outcome: outcome of the reduced case
     """
 
@@ -324,7 +324,7 @@ class SearchStudy:
                     reduction.case,
                     first.case,
                     reduction.margin,
-                    {path: values[path] for path in paths},
+                    {path: values[path] for path in (*paths, *self.campaign.cyclic_paths)},
                     float(np.linalg.norm(reduced_coordinates)),
                     int(has_same_cause.sum()),
                     sum(item.margin < 0.0 for item in repetitions),

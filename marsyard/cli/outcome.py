@@ -75,6 +75,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     for table in _comparison_tables(evaluation.sampling.exclude_nominal_case(run.frame), run.requirements, verdicts):
         console.print(table)
     lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence]
+    if is_finished and evaluation.overall_verdict.cases_to_append:
+        lines.append(f"to decide: marsyard append {directory} {evaluation.overall_verdict.cases_to_append}")
     if not any(verdict.withheld_status for verdict in verdicts):
         lines.append(f"evidence: {evaluation.evidence.text}")
     lines.append(f"report: {page}")
@@ -209,7 +211,7 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     if terrain_supply is None:
         return limits
     # number of distinct terrains: assigned in turn, or drawn at random
-    terrains = min(cases, terrain_supply.terrains) if terrain_supply.in_turn else cases
+    terrains = min(cases, terrain_supply.terrains)
     path = next((path for path in ("location.terrain", "world.terrain") if path in configuration.dispersions), None)
     if not terrain_supply.in_turn and path is not None and cases <= _MAX_DRAWS:
         terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})

@@ -54,7 +54,7 @@ class World:
 
     @classmethod
     def from_parameters(cls, p: DescentScenarioParameters) -> World:
-        """Create the world of a case; read its terrain from the cache or build it."""
+        """Create the world of a case; load its terrain if it is stored, otherwise build it in memory."""
         terrain = add_terrain_fault(p.faults, p.terrain)
         bank = TerrainBank(terrain, p.location.bank_seed)
         surface = bank.terrain(p.location.terrain)
@@ -64,7 +64,7 @@ class World:
             return cls(surface, None, Sun(towards_sun), p.meshes)
         air = p.preset.environment
         sun = Sun(towards_sun, air.sun_radius_rad)
-        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain))
+        ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain, surface))
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 
     def scene(self, east_m: float, north_m: float, last_height_m: float, pixel_rad: float) -> Scene:

@@ -37,7 +37,7 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.sensor.detector import BURST_DN, BURST_PX
 from marsyard.sim.sensor.imu import IMUS, ImuClass
-from marsyard.sim.terrain import Site, TerrainParameters, site, sites
+from marsyard.sim.terrain import MAX_TERRAINS, Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.landforms import Dunes
 
 #: Regular dunes of the dune fault.
@@ -144,7 +144,7 @@ TRIPLE_SIZE = 3
 class Location(Parameters):
     """Terrain and position of the descent."""
 
-    bank: Annotated[int, bounded_field(1, 100000, "number of terrains in the terrain bank")] = 4
+    bank: Annotated[int, bounded_field(1, MAX_TERRAINS, "number of terrains in the terrain bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
     east_m: Annotated[float, Field(description="east coordinate at the first image, on the periodic terrain")] = 0.0

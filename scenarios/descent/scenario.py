@@ -72,8 +72,8 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
     }
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the terrains in the terrain bank."""
-        return tuple(range(self.check_parameters(parameters).location.bank))
+        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
+        return self.list_stored_terrains(self.check_parameters(parameters).location.bank)
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the index of the terrain below the descent; empty with the dune fault, whose terrain is in no bank."""

@@ -28,8 +28,8 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
-#: Maximum number of terrains in a worker's cache; loading a terrain with its rocks takes one or two seconds.
-MAX_GROUNDS = 64
+#: Maximum number of terrains in a worker's memory: those of several campaigns, or of a small bank; 12 MB each.
+MAX_GROUNDS = 4
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
-        bank = self.check_parameters(parameters).location.bank
-        return tuple(range(bank)) if bank <= MAX_GROUNDS else ()
+        return self.list_stored_terrains(self.check_parameters(parameters).location.bank)
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the index of the terrain below the flight."""

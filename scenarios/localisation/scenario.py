@@ -43,8 +43,6 @@ from marsyard.sim.terrain import TerrainBank
 #: The inertial data begin `LEAD_S` before the start of localisation and end `MARGIN_S` after the last image, s. The
 #: span is longer if the error of a clock moves a time tag out of it.
 LEAD_S, MARGIN_S = 0.2, 0.2
-#: Largest bank whose terrains are built before the cases; a terrain needs 180 MB on disk.
-MAX_SHARED_TERRAINS = 20
 #: Minimum height of a camera for which the ground's mesh is made, m: a lower one needs no finer first guess.
 _MIN_HEIGHT_M = 50.0
 #: Index of the terrain that a wrong map shows, minus the index of the case's terrain.
@@ -57,12 +55,12 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
     name = "localisation"
     parameters_type = LocalisationScenarioParameters
     task = LOCALISATION
+    max_stored_terrains = 20  # a terrain needs 180 MB on disk
     part_keys: Mapping[str, PartKind] = {}
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
-        bank = self.check_parameters(parameters).location.bank
-        return tuple(range(bank)) if bank <= MAX_SHARED_TERRAINS else ()
+        return self.list_stored_terrains(self.check_parameters(parameters).location.bank)
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the indices of the terrains below the descent and on the map."""

@@ -50,7 +50,7 @@ class LocalisationWorld:
         optical_depth: float | None = None,
         detector: DetectorParameters | None = None,
     ) -> LocalisationWorld:
-        """Create the world of a case; read its terrain from the bank's cache or build it.
+        """Create the world of a case; load its terrain if it is stored, otherwise build it in memory.
 
         - sun_azimuth_deg, sun_elevation_deg: azimuth clockwise from north, and elevation
         - optical_depth: of the dusty atmosphere during the landing; None for that of the site

@@ -37,7 +37,7 @@ from marsyard.sim.sensor import (
     preset,
     stereo_mast,
 )
-from marsyard.sim.terrain import site
+from marsyard.sim.terrain import MAX_TERRAINS, site
 
 #: Angles in degrees: relative angles, and azimuths.
 RelativeAngle = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -58,7 +58,7 @@ class WorldParameters(Parameters):
     site: Annotated[
         str, site_validator("a rover", "ground"), Field(description="preset of terrain, rocks, texture and light")
     ] = "mars-yard"
-    bank: Annotated[int, Field(ge=1, le=100000, description="number of terrains in the terrain bank")] = 8
+    bank: Annotated[int, Field(ge=1, le=MAX_TERRAINS, description="number of terrains in the terrain bank")] = 8
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
     terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank, from 0")] = 0
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048

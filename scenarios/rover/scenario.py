@@ -53,8 +53,6 @@ from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
-#: Maximum bank size whose terrains are built before the runs; terrains of larger banks are built by the runs.
-MAX_PREPARED_TERRAINS = 64
 #: Cache sizes of a process: grounds, shared drives with their images, visibilities of targets along drives.
 MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
 
@@ -242,8 +240,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the runs."""
-        bank = self.check_parameters(parameters).world.bank
-        return tuple(range(bank)) if bank <= MAX_PREPARED_TERRAINS else ()
+        return self.list_stored_terrains(self.check_parameters(parameters).world.bank)
 
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the index of the run's terrain."""

@@ -1,4 +1,4 @@
-"""Synthesis of terrains from seeds, and the bank that caches them on disk for a campaign's workers."""
+"""Synthesis of terrains from seeds, and the bank of numbered terrains, which can store them on disk for many cases."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNI
 _MODULES_NOT_HASHED = ("rocks", "sites.py")
 #: Beginning of the identity of a terrain on an imported DTM.
 IMPORTED_TERRAIN = "DTM"
+#: Maximum number of terrains of a bank: one for each case of the largest campaign.
+MAX_TERRAINS = 1_000_000_000
 #: Samples of the terrains that this process uses, by file: the cache does not evict these files.
 _IN_USE: WeakValueDictionary[Path, np.ndarray] = WeakValueDictionary()
 
@@ -91,34 +93,57 @@ def _code_version(*, has_tails: bool) -> str:
 
 @dataclass(frozen=True)
 class TerrainBank:
-    """Numbered terrains with the same parameters, cached on disk. Wind tails of rocks are part of the surface.
+    """Numbered terrains with the same parameters. Wind tails of rocks are part of the surface.
 
-    Terrain k is a pure function of the parameters, the seed and k. The file of a terrain is one array: all levels, then
-    `Surface.factors` (fine relief, albedo contrast and rock density). Workers memory-map it and therefore share its
-    pages. The size of the cache is limited (see `marsyard.sim.cache.evict_files`).
+    Terrain k is a pure function of the parameters, the seed and k. A terrain that several cases use can be stored on
+    disk: its file is one array, which contains all levels, then `Surface.factors` (fine relief, albedo contrast and
+    rock density). Workers memory-map it and therefore share its pages. The size of the cache is limited (see
+    `marsyard.sim.cache.evict_files`). A terrain of a single case is built in memory, so that the cache does not grow
+    with the number of cases.
     """
 
     parameters: TerrainParameters
     seed: int
 
     def terrain(self, number: int) -> Surface:
+        """Load a terrain from disk if it is stored there; otherwise build it in memory."""
+        path = self._path(number)
+        samples = self._load(path)
+        return self._surface(path, self._build_samples(number) if samples is None else samples)
+
+    def store(self, number: int) -> Surface:
         """Load a terrain from disk, or build and store it; if it cannot be written, it is kept in memory only."""
         path = self._path(number)
-        flat = load_array(path)
-        if flat is not None and flat.size == self._size():
-            touch(path)
-        else:
-            surface = self._build(number)
-            flat = np.concatenate([array.reshape(-1) for array in (*surface.levels, surface.factors)])
+        samples = self._load(path)
+        if samples is None:
+            samples = self._build_samples(number)
             try:
                 evict_files(path.parent, 4 * self._size(), set(_IN_USE))
-                flat = save_array(path, flat)
+                samples = save_array(path, samples)
             except OSError as error:
                 warnings.warn(f"terrain {number} is not stored: {path}: {error.strerror}", CacheWarning, stacklevel=2)
-                flat.flags.writeable = False
-        _IN_USE[path] = flat
+        return self._surface(path, samples)
+
+    def _load(self, path: Path) -> np.ndarray | None:
+        """Map the samples of a stored terrain, and mark its file as used; None if it is missing or damaged."""
+        samples = load_array(path)
+        if samples is None or samples.size != self._size():
+            return None
+        touch(path)
+        return samples
+
+    def _build_samples(self, number: int) -> np.ndarray:
+        """Build the samples of a terrain, read-only, in the order of its file."""
+        surface = self._build(number)
+        samples = np.concatenate([array.reshape(-1) for array in (*surface.levels, surface.factors)])
+        samples.flags.writeable = False
+        return samples
+
+    def _surface(self, path: Path, samples: np.ndarray) -> Surface:
+        """Create the surface from the samples of a terrain."""
+        _IN_USE[path] = samples
         sides, factor_side = self._sides(), self._factor_side()
-        *parts, factors = np.split(flat, np.cumsum([2 * side**2 for side in sides]))
+        *parts, factors = np.split(samples, np.cumsum([2 * side**2 for side in sides]))
         levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
         return Surface(levels, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
 
@@ -134,11 +159,11 @@ class TerrainBank:
         """Return the bytes that a terrain would add on disk, without the header of the file; 0 if it is stored."""
         return 0 if self._path(number).exists() else 4 * self._size()
 
-    def rocks(self, number: int) -> RockField | None:
-        """Build the rocks of a terrain; they are not cached. None if the parameters have no rocks."""
+    def rocks(self, number: int, surface: Surface) -> RockField | None:
+        """Build the rocks of a terrain on its surface; they are not stored. None if the parameters have no rocks."""
         if self.parameters.rocks is None:
             return None
-        return RockField.draw(self.terrain(number), self.parameters.rocks, substream(self._rng(number), "rocks"))
+        return RockField.draw(surface, self.parameters.rocks, substream(self._rng(number), "rocks"))
 
     def _rng(self, number: int) -> np.random.Generator:
         return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=(number,))))

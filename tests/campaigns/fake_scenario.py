@@ -41,7 +41,7 @@ class FakeParameters(BaseModel):
 
     altitude_m: float = Field(default=2000.0, gt=0.0)
     lowest_altitude_m: float = Field(default=0.0, ge=0.0)
-    terrain: int = Field(default=0, ge=0, le=9)
+    terrain: int = Field(default=0, ge=0, le=99_999)
     bank_seed: int = Field(default=1, ge=0)
     is_imported: bool = False
     kind: str = Field(default="plain", pattern="^[a-z]+$")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pandas as pd
@@ -81,16 +83,38 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
     """`new` and `--dry-run` report too few cases, too few terrains and designs without independent draws."""
     assert "takes at least 230 cases without a failure; the campaign has 24" in run_command("new", "few")[1]
     assert evidence_limits(load_campaign("few.toml", cases=230)) == []
-    cases, terrains = evidence_limits(load_campaign("dimes-smoke"))
+    (cases,) = evidence_limits(load_campaign("dimes-smoke"))
     assert cases.startswith("DIMES-VEL: 99 % at 90 % confidence takes at least 230 cases")
-    assert "has only 8 stored terrains (location.bank = 8)" in terrains
-    # ten stored terrains for each of the 230; 253 draws then have 230 different terrains (see test_verdicts)
-    assert "--set location.bank=2300 -n 253" in terrains
-    larger = load_campaign("dimes-smoke", ["location.bank=2300"], 253)
-    assert evidence_limits(larger) == []
-    # more cases on the same terrains do not add evidence
-    (terrains,) = evidence_limits(load_campaign("dimes-smoke", cases=1000))
-    assert "only 8 stored terrains" in terrains
+    assert evidence_limits(load_campaign("dimes-smoke", cases=230)) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "supply"),
+    [
+        ("dimes-smoke", ["location.bank=8"], "has only 8 terrains (location.bank = 8)"),
+        (
+            "dimes-smoke",
+            ["location.bank=8", 'dispersions."location.terrain".distribution="integer"'],
+            "has only 8 terrains (location.bank = 8)",
+        ),
+        ("dimes-smoke", ["location.terrain=3"], "has only 1 terrain (location.terrain = 1)"),
+        ("vtt-terrains", ['dispersions."world.terrain"={low=2,high=5}'], '(dispersions."world.terrain" = 4)'),
+    ],
+)
+def test_advice_about_terrains_can_be_followed_literally(name: str, settings: list[str], supply: str) -> None:
+    """More cases on the same terrains do not add evidence; the options of the advice do."""
+    (advice,) = evidence_limits(load_campaign(name, settings, 1000))
+    assert supply in advice
+    options = shlex.split(advice.rpartition(": ")[2].removesuffix("."))
+    assert options[-2] == "-n"
+    additional_settings = [value for option, value in pairwise(options) if option == "--set"]
+    campaign = load_campaign(name, [*settings, *additional_settings], int(options[-1]))
+    assert evidence_limits(campaign) == []
+    path = "world.terrain" if name == "vtt-terrains" else "location.terrain"
+    assert len({campaign.draws(case)[path] for case in range(int(options[-1]))}) == int(options[-1])
+
+
+def test_designs_without_independent_draws_are_reported() -> None:
     sobol_limits = evidence_limits(load_campaign("dimes-smoke", ["design.kind=sobol"], 32))
     assert 'Set design.kind = "random", and run it again.' in sobol_limits[0]
 

@@ -79,7 +79,7 @@ def test_invalid_parameters_are_reported(campaign_file: CampaignFile, parameters
         ("altitude_m = {distribution='gamma', a=[1]}", "altitude_m.a: input should be a valid number"),
         ("altitude_m = 'uniform'", "dispersions.altitude_m: input should be a valid dictionary"),
         ("altitude_m = {low = 1}", "dispersions.altitude_m.distribution: required, but missing"),
-        ("terrain = {distribution='integer', low=0, high=12}", "includes 12, which is not valid"),
+        ("terrain = {distribution='integer', low=0, high=100000}", "includes 100000, which is not valid"),
         ("terrain = {distribution='integer', low=0.5, high=2}", "terrain.low: input should be a valid integer"),
         ("terrain = {distribution='integer', low=3, high=2}", "low = 3 must not be above high = 2"),
         ("terrain = {distribution='uniform', low=0, high=3}", "input should be a valid integer"),
@@ -223,7 +223,7 @@ def test_overrides_replace_values_and_dispersions(campaign_file: CampaignFile) -
         ("a b=3", "is not a dotted key"),
         ("a..b=3", "is not a dotted key"),
         ("a=1\nb=2", "expected KEY=VALUE"),
-        ("dispersions.terrain.high=99", "dispersions.terrain: integer(low=0, high=99) includes 99"),
+        ("dispersions.terrain.high=100000", "dispersions.terrain: integer(low=0, high=100000) includes 100000"),
     ],
 )
 def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, override: str, message: str) -> None:

@@ -24,7 +24,20 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _read_bytes(bank: TerrainBank, number: int) -> bytes:
-    return b"".join(level.tobytes() for level in bank.terrain(number).levels)
+    return b"".join(level.tobytes() for level in bank.store(number).levels)
+
+
+def test_terrain_of_a_single_case_is_not_written(cache: Path) -> None:
+    """The cache contains the terrains that were stored, however many others are built."""
+    bank = TerrainBank(SMALL, seed=1)
+    built = [b"".join(level.tobytes() for level in bank.terrain(number).levels) for number in range(5)]
+    assert not list(cache.iterdir())
+    assert built[3] == _read_bytes(bank, 3)
+    assert len(list(cache.iterdir())) == 1
+    # a stored terrain is mapped, not built
+    level = bank.terrain(3).levels[0]
+    assert level.tobytes() == built[3][: level.nbytes]
+    assert not level.flags.owndata
 
 
 def test_cached_terrain_equals_the_built_terrain(cache: Path) -> None:
@@ -100,7 +113,7 @@ def test_terrain_is_synced_before_rename(cache: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("os.fsync", record_sync)
     monkeypatch.setattr(Path, "replace", record_rename)
-    TerrainBank(SMALL, seed=1).terrain(0)
+    TerrainBank(SMALL, seed=1).store(0)
     assert [Path(step).suffix or Path(step).name for step in steps] == [".part", "renamed", "terrain"]
 
 
@@ -121,27 +134,27 @@ def test_terrains_are_built_without_a_writable_cache(cache: Path, monkeypatch: p
 def test_terrain_larger_than_the_limit_is_built(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE_GB", "0.00001")
     bank = TerrainBank(SMALL, seed=1)
-    first = bank.terrain(0)
-    second = bank.terrain(1)
-    assert first.levels[0].tobytes() == TerrainBank(SMALL, seed=1).terrain(0).levels[0].tobytes()
+    first = bank.store(0)
+    second = bank.store(1)
+    assert first.levels[0].tobytes() == TerrainBank(SMALL, seed=1).store(0).levels[0].tobytes()
     assert np.isfinite(second.levels[0]).all()
 
 
 def test_terrains_are_read_only(cache: Path) -> None:
-    level = TerrainBank(SMALL, seed=1).terrain(0).levels[0]
+    level = TerrainBank(SMALL, seed=1).store(0).levels[0]
     with pytest.raises(ValueError, match="read-only"):
         level[0, 0, 0] = np.float32(1.0)
 
 
 def test_unused_terrain_is_evicted_for_the_next(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
-    terrain_in_use = bank.terrain(0)
+    terrain_in_use = bank.store(0)
     size = next(cache.iterdir()).stat().st_size
     monkeypatch.setenv("MARSYARD_CACHE_GB", f"{2.5 * size / 1e9:.12f}")
     first = set(cache.iterdir())
     expected = _read_bytes(bank, 1)
     second = set(cache.iterdir()) - first
-    bank.terrain(2)
+    bank.store(2)
     assert len(list(cache.iterdir())) == 2
     assert first <= set(cache.iterdir()), "in use by this process"
     assert not second & set(cache.iterdir())
@@ -150,7 +163,7 @@ def test_unused_terrain_is_evicted_for_the_next(cache: Path, monkeypatch: pytest
 
 
 def test_terrain_stays_readable_after_its_file_is_removed(cache: Path) -> None:
-    surface = TerrainBank(SMALL, seed=1).terrain(0)
+    surface = TerrainBank(SMALL, seed=1).store(0)
     content = surface.levels[0].tobytes()
     next(cache.iterdir()).unlink()
     assert surface.levels[0].tobytes() == content

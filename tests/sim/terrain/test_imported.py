@@ -113,9 +113,9 @@ def test_brightness_uses_the_image_offset(npz: Path) -> None:
 def test_changed_file_produces_another_terrain(npz: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
     bank = TerrainBank(make_terrain_parameters(RealTerrain(dtm=npz)), seed=1)
-    original = bank.terrain(0).levels[0].tobytes()
+    original = bank.store(0).levels[0].tobytes()
     np.savez(npz, dem=make_dem() * 2.0, dem_gsd=1.0)
-    assert bank.terrain(0).levels[0].tobytes() != original
+    assert bank.store(0).levels[0].tobytes() != original
 
 
 def test_hirise_tile_is_imported(shared_data: Path) -> None:

@@ -69,7 +69,7 @@ def test_tails_in_the_bank_do_not_change_the_positions_of_rocks(
     tail_heights = tail_bank.terrain(0).levels[0][..., 0] - plain_bank.terrain(0).levels[0][..., 0]
     assert tail_heights.min() == 0.0
     assert tail_heights.max() > 0.02
-    rocks, rocks_of_plain = tail_bank.rocks(0), plain_bank.rocks(0)
+    rocks, rocks_of_plain = (bank.rocks(0, bank.terrain(0)) for bank in (tail_bank, plain_bank))
     assert rocks is not None
     assert rocks_of_plain is not None
     np.testing.assert_array_equal(rocks.position_m[:, :2], rocks_of_plain.position_m[:, :2])
@@ -86,6 +86,6 @@ def test_rock_abundance_changes_the_cached_terrain_only_with_tails(
     parameters = TerrainParameters(samples=64, spacing_m=0.05, rocks=rocks)
     for tails in (None, WindTails()):
         for abundance in (0.05, 0.1):
-            TerrainBank(parameters.with_changes({"rocks": {"abundance": abundance, "tails": tails}}), 1).terrain(0)
+            TerrainBank(parameters.with_changes({"rocks": {"abundance": abundance, "tails": tails}}), 1).store(0)
     terrains = [path for path in (tmp_path / "terrain").glob("*.npy") if not path.name.startswith("rocks-")]
     assert len(terrains) == 3  # one without tails, two with tails
