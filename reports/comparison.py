@@ -29,6 +29,7 @@ from marsyard.reports.statistics.changes import (
     compare_successes,
     correct_holm,
     difference_p_value,
+    symmetry_p_value,
 )
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.wording import (
@@ -67,7 +68,7 @@ class PairedComparison:
     """Another algorithm compared with the tested one on the same cases; p-values are corrected by Holm's method.
 
     - only_first, only_other: cases within the bound only for the tested or the other algorithm; None without bound
-    - success_p, error_p: two-sided p-values of successes (`compare_successes`) and of errors (`compare_errors`)
+    - success_p, error_p: two-sided p-values of successes (`compare_successes`) and of the mean (`compare_errors`)
     - pairs: number of cases that both algorithms answered
     - mean, lower, upper: mean of the other algorithm's error minus the tested one's (magnitudes), with its interval
     """
@@ -375,4 +376,4 @@ def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFr
     finite_groups = None if groups is None else groups[first_index][finite]
     if first_metric.larger_is_better:  # a rate has the values 0 and 1
         return compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)[2]
-    return compare_errors(second_values[finite] - first_values[finite], finite_groups, CONFIDENCE)[3]
+    return symmetry_p_value(second_values[finite] - first_values[finite], finite_groups)

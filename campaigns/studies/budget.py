@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from SALib.analyze import sobol as sobol_indices
 from SALib.sample import sobol as sobol_design
 from scipy.special import ndtri
@@ -26,6 +26,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver
 from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.store.rows import Row
+from marsyard.campaigns.studies.contributions import MIN_COMMON, Budget, compute_budget
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -44,12 +45,8 @@ from marsyard.sim.streams import Streams
 KIND = "budget"
 #: Name of the variable of the random streams among Sobol's indices.
 STREAMS = "random streams"
-#: Number of bootstrap resamples of intervals.
-_RESAMPLES = 2000
 #: Number of base cases that are evaluated together.
 _BATCH = 8
-#: Minimum number of base cases whose error has a value in all configurations.
-MIN_COMMON = 10
 
 
 @dataclass(frozen=True)
@@ -91,28 +88,6 @@ class Configuration:
 
 
 @dataclass(frozen=True)
-class Contribution:
-    """Contribution of a source of error to the mean square of the error, in its squared unit.
-
-    - source, title: see `ErrorSource`
-    - alone: mean square with this source only, minus that without any source
-    - removed: mean square with all sources, minus that without this one
-    - mean, lower, upper: mean of `alone` and `removed`, and bounds of its interval; without interactions of more than
-      two sources, these means and the mean square without any source add up to the mean square with all sources
-    - answered: numbers of base cases whose error has a value, without the source and with the source alone
-    """
-
-    source: str
-    title: str
-    alone: float
-    removed: float
-    mean: float
-    lower: float
-    upper: float
-    answered: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class SobolIndex:
     """First-order and total Sobol index of a dispersion or the random streams, with half-widths of their intervals."""
 
@@ -121,28 +96,6 @@ class SobolIndex:
     first_width: float
     total: float
     total_width: float
-
-
-@dataclass(frozen=True)
-class Budget:
-    """An error budget: mean squares of the error over the base cases whose error has a value in all configurations.
-
-    - contributions: one per source, the largest first
-    - total, total_lower, total_upper: mean square with all sources, and bounds of its interval
-    - remaining: mean square without any source, for example caused by images, matching and scene
-    - closure, closure_lower, closure_upper: (remaining + sum of the means of the contributions) / total
-    - common: number of these base cases
-    """
-
-    contributions: tuple[Contribution, ...]
-    total: float
-    total_lower: float
-    total_upper: float
-    remaining: float
-    closure: float
-    closure_lower: float
-    closure_upper: float
-    common: int
 
 
 @dataclass(frozen=True)
@@ -270,8 +223,8 @@ class _Study:
         budget = compute_budget(errors, groups, self._sources, self._is_centred, settings.confidence)
         if budget is None and n and not reason:
             reason = (
-                f"No budget: fewer than {MIN_COMMON} base cases were answered in every configuration, or all errors "
-                "are equal."
+                f"No budget: fewer than {MIN_COMMON} base cases were answered in every configuration, all are on one "
+                "terrain, or all errors are equal."
             )
         return BudgetResult(
             self._quantity,
@@ -350,76 +303,6 @@ class _Study:
             rows = self._runner.run([Candidate(tuple(coordinates[i].tolist()), int(streams[i])) for i in cases])
             errors += [self._error(row) for row in rows]
         return compute_indices(np.array(errors), problem, self._settings.confidence, seed)
-
-
-def compute_budget(
-    errors: Float64[np.ndarray, "configurations n"],
-    groups: np.ndarray,
-    sources: Sequence[ErrorSource],
-    is_centred: bool,
-    confidence: float,
-) -> Budget | None:
-    """Compute the contributions from the base cases whose error has a value in all configurations.
-
-    None for too few of these cases, or if all errors are equal. The intervals are percentiles of a bootstrap over
-    groups of cases (terrains).
-
-    - errors: error of each case in each configuration of `list_configurations`; NaN without a value
-    - groups: number of the group of each case
-    """
-    has_error = np.isfinite(errors)
-    is_common: Bool[np.ndarray, "n"] = has_error.all(axis=0)
-    n_sources = len(sources)
-    if not n_sources or is_common.sum() < MIN_COMMON:
-        return None
-    values = errors[:, is_common]
-    group_numbers = np.unique(groups[is_common], return_inverse=True)[1]
-    n_groups = int(group_numbers.max()) + 1
-    rng = np.random.default_rng(0)
-    # row 0 of all arrays below: original sample; other rows: bootstrap resamples
-    resampled = rng.multinomial(n_groups, np.full(n_groups, 1.0 / n_groups), size=_RESAMPLES)
-    weights = np.concatenate([np.ones((1, group_numbers.size)), resampled[:, group_numbers]])
-    weights /= weights.sum(axis=1, keepdims=True)
-    # mean square of each configuration
-    squares = weights @ (values**2).T
-    if is_centred:
-        squares = squares - (weights @ values.T) ** 2
-    if squares[:, 0].min() <= 0.0:
-        return None
-    total, without_sources = squares[:, 0], squares[:, 1]
-    removed = total[:, None] - squares[:, 2 : 2 + n_sources]
-    alone = squares[:, 2 + n_sources :] - without_sources[:, None]
-    mean = 0.5 * (removed + alone)
-    closure = (without_sources + mean.sum(axis=1)) / total
-    tail_percent = 50.0 * (1.0 - confidence)
-    bounds = (tail_percent, 100.0 - tail_percent)
-    lower, upper = np.percentile(mean, bounds, axis=0)
-    counts = has_error.sum(axis=1)
-    contributions = [
-        Contribution(
-            source.name,
-            source.title,
-            float(alone[0, index]),
-            float(removed[0, index]),
-            float(mean[0, index]),
-            float(lower[index]),
-            float(upper[index]),
-            (int(counts[2 + index]), int(counts[2 + n_sources + index])),
-        )
-        for index, source in enumerate(sources)
-    ]
-    total_bounds, closure_bounds = np.percentile(total, bounds), np.percentile(closure, bounds)
-    return Budget(
-        contributions=tuple(sorted(contributions, key=lambda item: -item.mean)),
-        total=float(total[0]),
-        total_lower=float(total_bounds[0]),
-        total_upper=float(total_bounds[1]),
-        remaining=float(without_sources[0]),
-        closure=float(closure[0]),
-        closure_lower=float(closure_bounds[0]),
-        closure_upper=float(closure_bounds[1]),
-        common=int(is_common.sum()),
-    )
 
 
 def compute_indices(
