@@ -8,19 +8,17 @@ import json
 import os
 import platform
 from importlib.metadata import version
-from pathlib import Path
 
 import cv2
 
 from benchmarks import descent, engine, estimators, hda, images, localisation, renderers, reporting, starting, vtt
 from benchmarks.check import reference_workload
-from benchmarks.page import PAGE, write_page
+from benchmarks.page import PAGE, REFERENCE, RESULTS, is_within_limit, scale_value, write_page
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
 
-RESULTS = Path(__file__).parent / "results" / "benchmarks.json"
 #: Packages whose versions are stored with the results.
 PACKAGES = ("marsyard", "numpy", "numba", "pyrender2", "opencv-python-headless")
 
@@ -33,10 +31,7 @@ def main() -> None:
     measurements = [
         # first, because other benchmarks increase the memory of the process
         *images.measure_memory(500),
-        Measurement(
-            "reference workload of make bench-check (ms)",
-            [1e3 * time_s for time_s in core_seconds(reference_workload(), 50)],
-        ),
+        Measurement(REFERENCE, [1e3 * time_s for time_s in core_seconds(reference_workload(), 50)]),
         *descent.measure_frame(15),
         *descent.measure_case(7),
         *estimators.compare_estimators(8),
@@ -50,11 +45,15 @@ def main() -> None:
         *starting.measure(5),
         *reporting.measure(),
     ]
-    print(f"{'core-seconds, unless stated otherwise':<52}{'median':>8}{'min':>8}{'max':>8}  {'limit':<8}")
+    reference_ms = next(row.median for row in measurements if row.name == REFERENCE)
+    heads = f"{'median':>8}{'min':>8}{'max':>8}{'scaled':>8}"
+    print(f"{'core-seconds, unless stated otherwise':<52}{heads}  {'limit':<8}")
     for row in measurements:
-        mark = "" if row.is_within_limit else "  MISSED"
+        scaled = scale_value(row.name, row.median, reference_ms)
+        value = row.median if scaled is None else scaled
+        mark = "  MISSED" if is_within_limit(row.limit_text, value) is False else ""
         low, high = min(row.values), max(row.values)
-        print(f"{row.name:<52}{row.median:8.3f}{low:8.3f}{high:8.3f}  {row.limit_text:<8}{mark}")
+        print(f"{row.name:<52}{row.median:8.3f}{low:8.3f}{high:8.3f}{value:8.3f}  {row.limit_text:<8}{mark}")
     store(measurements)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from benchmarks.images import descent_pose, descent_scene
 from benchmarks.stages import DESCENT_STAGES, measure_stages
 from benchmarks.timing import Measurement, core_seconds
+from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import CameraParameters
@@ -35,20 +36,21 @@ def measure_frame(repeats: int) -> list[Measurement]:
 
 
 def measure_case(repeats: int) -> list[Measurement]:
-    """Measure complete `dimes-gusev` cases over one prepared terrain, and their stages."""
-    campaign = load_campaign("dimes-gusev")
+    """Measure complete `dimes-gusev` cases over one prepared terrain, their stages, and cases over new terrains."""
+    prepared, campaign = (load_campaign("dimes-gusev", settings) for settings in (["location.bank=1"], []))
+    prepared.scenario.prepare(prepared.base_parameters(), 0)
     case_numbers = itertools.count()
 
-    def run_next() -> None:
+    def run_next(campaign: Campaign = prepared) -> None:
         case = next(case_numbers)
-        parameters = campaign.with_values({**campaign.draws(case), "location.terrain": 0})
-        campaign.scenario.run(parameters, campaign.streams(case))
+        campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
 
     return [
         Measurement(
             "dimes-gusev case: 3 frames, detector, instruments, DIMES", core_seconds(run_next, repeats), limit=0.6
         ),
         *measure_stages("dimes-gusev case", run_next, repeats, DESCENT_STAGES),
+        Measurement("dimes-gusev case over a new terrain", core_seconds(partial(run_next, campaign), repeats)),
     ]
 
 

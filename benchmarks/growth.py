@@ -122,13 +122,13 @@ def _measure_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
 
 
 def _measure_terrain_sizes(samples: Sequence[int]) -> list[tuple[float, float]]:
-    """Measure a case over terrains with these numbers of samples per axis."""
+    """Measure a case over prepared terrains with these numbers of samples per axis."""
     points = []
     for count in samples:
-        campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "retain.showcase=none"])
+        campaign = load_campaign("dimes-smoke", [f"terrain.samples={count}", "location.bank=1"])
+        campaign.scenario.prepare(campaign.base_parameters(), 0)
         # always the same case, because run times differ between cases
-        parameters = campaign.with_values({**campaign.draws(0), "location.terrain": 0})
-        run = partial(campaign.scenario.run, parameters, campaign.streams(0))
+        run = partial(campaign.scenario.run, campaign.parameters(0), campaign.streams(0))
         points.append((float(count**2), _min_core_seconds(run)))
     return points
 

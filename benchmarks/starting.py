@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -23,34 +22,21 @@ def measure(repeats: int) -> list[Measurement]:
 
 
 def _measure_first_run() -> list[Measurement]:
-    """Measure the compilation of kernels, and the additional time of a first campaign compared with a repetition.
-
-    The campaign runs first with an empty terrain cache, then with all terrains built, then twice more.
-    """
+    """Measure the compilation of kernels, and the additional time of a first campaign compared with a repetition."""
     with TemporaryDirectory() as folder:
-        empty_cache, terrain_cache = Path(folder, "new"), Path(folder, "built")
-        compile_s = _measure_wall_s("compile", variables={"MARSYARD_CACHE": str(empty_cache)})
-        shutil.copytree(empty_cache, terrain_cache)
+        compile_s = _measure_wall_s("compile", variables={"MARSYARD_CACHE": folder})
 
-        def run(cache: Path, name: str) -> float:
+        def run(name: str) -> float:
             arguments = ("run", "dimes-smoke", "-n", "1", "--jobs", "1", "--set", "retain.showcase=none")
-            variables = {"MARSYARD_CACHE": str(cache)}
+            variables = {"MARSYARD_CACHE": folder}
             # status 3: one case is too few for a verdict
             return _measure_wall_s(*arguments, "--out", str(Path(folder, name)), variables=variables, allowed=(0, 3))
 
-        first_s = run(empty_cache, "first")
-        shutil.copytree(empty_cache / "terrain", terrain_cache / "terrain", dirs_exist_ok=True)
-        with_terrains_s = run(terrain_cache, "with terrains")
-        repetition_s = min(run(terrain_cache, f"again {number}") for number in range(2))
+        first_s = run("first")
+        repetition_s = min(run(f"again {number}") for number in range(2))
     return [
         Measurement("marsyard compile after installation (wall s)", [compile_s]),
-        Measurement(
-            "first run: additional time for loading kernels (wall s)", [with_terrains_s - repetition_s], limit=3.0
-        ),
-        Measurement(
-            "first run: additional time for loading kernels and generating eight terrains (wall s)",
-            [first_s - repetition_s],
-        ),
+        Measurement("first run: additional time for loading kernels (wall s)", [first_s - repetition_s], limit=3.0),
     ]
 
 

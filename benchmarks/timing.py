@@ -32,13 +32,6 @@ class Measurement:
             return f"<= {self.limit:g}"
         return f">= {self.minimum:g}" if self.minimum is not None else ""
 
-    @property
-    def is_within_limit(self) -> bool:
-        """Whether the median is within the limits."""
-        return (self.limit is None or self.median <= self.limit) and (
-            self.minimum is None or self.median >= self.minimum
-        )
-
 
 def core_seconds(run: Callable[[], object], repeats: int) -> list[float]:
     """Measure the processor time of each run after a warm-up run."""

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from benchmarks.validation import (
     campaign_checks,
+    difference_checks,
     dimes_checks,
     document,
     flight_checks,
@@ -45,6 +46,7 @@ CHECKS = (
     *campaign_checks.CHECKS,
     *soak.CHECKS,
     *statistics_checks.CHECKS,
+    *difference_checks.CHECKS,
     *rare_checks.CHECKS,
     *rare_verdicts.CHECKS,
 )

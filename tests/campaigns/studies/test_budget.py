@@ -22,13 +22,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies import budget, runner
-from marsyard.campaigns.studies.budget import (
-    STREAMS,
-    BudgetResult,
-    BudgetSettings,
-    active_sources,
-    start_budget,
-)
+from marsyard.campaigns.studies.budget import STREAMS, BudgetResult, BudgetSettings, active_sources, start_budget
 from marsyard.campaigns.studies.contributions import compute_budget
 from marsyard.reports.budget import budget_sentences, read_budget
 from marsyard.reports.campaign import write_report
