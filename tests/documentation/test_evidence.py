@@ -1,0 +1,100 @@
+"""Tests that pages agree with the record of confirmations and with the code: numbers, seeds, cases, time spans."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.scenarios.localisation import scenario as localisation
+from marsyard.scenarios.localisation.flight import LEAD_S as FLIGHT_LEAD_S
+
+ROOT = Path(__file__).parents[2]
+RECORD = ROOT / "benchmarks" / "results" / "confirmations.jsonl"
+PAGES = ("dimes.md", "hda.md", "localisation.md", "vtt.md")
+
+
+def read_confirmations() -> dict[tuple[str, int], dict[str, Any]]:
+    """Read the first entry of each confirmation: algorithm, seed and number of cases."""
+    entries = (json.loads(line) for line in RECORD.read_text().splitlines())
+    return {(entry["campaign"], entry["number"]): entry for entry in entries if "seed" in entry}
+
+
+def list_rows(page: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the rows of the tables, each with the first campaign of the record named after the last heading."""
+    campaigns, campaign = {name for name, _ in read_confirmations()}, ""
+    for line in (ROOT / "docs" / page).read_text().splitlines():
+        if line.startswith("#"):
+            campaign = ""
+        if not campaign:
+            campaign = next((name for name in re.findall(r"`([a-z0-9-]+)`", line) if name in campaigns), "")
+        if line.startswith("|"):
+            yield campaign, [cell.strip() for cell in line.strip("|").split("|")]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_seeds_of_confirmations_are_those_of_the_record(page: str) -> None:
+    confirmations = read_confirmations()
+    for _, cells in list_rows(page):
+        command = re.match(r"`marsyard run ([\w./-]+)`", cells[0])
+        for number, seed in re.findall(r"confirmation (\d+)[^;|]*? seed (\d+)", "|".join(cells)):
+            assert command is not None, cells
+            assert confirmations[Path(command.group(1)).stem, int(number)]["seed"] == int(seed), cells
+
+
+def test_rows_of_hazard_detection_name_their_confirmation() -> None:
+    """Rows with a verdict: algorithm under test, number of cases, and number of the confirmation."""
+    confirmations, n_rows = read_confirmations(), 0
+    for campaign, cells in list_rows("hda.md"):
+        if cells[0] == f"`{cells[0].strip('`')}`" and cells[0].strip("`") in {name for name, _ in confirmations}:
+            campaign, cells = cells[0].strip("`"), cells[1:]
+        number = next((cell.removeprefix("confirmation ") for cell in cells if re.fullmatch(r"confirmation \d", cell)), "")
+        if number and len(cells) > 1 and cells[1].isdigit() and any("**" in cell for cell in cells):
+            entry = confirmations[campaign, int(number)]
+            assert (entry["frozen"]["algorithm"], entry["cases"]) == (cells[0].strip("`"), int(cells[1])), cells
+            n_rows += 1
+    assert n_rows >= 5
+
+
+def test_explorations_do_not_use_the_seed_of_a_calibration() -> None:
+    """The first cases of `loc-jezero` with the campaign's own seed are a calibration."""
+    text = " ".join((ROOT / "docs" / "localisation.md").read_text().split())
+    (kind,) = re.findall(r"first 24 descents of `loc-jezero` \(an? (\w+)", text)
+    configuration = load_campaign("loc-jezero").configuration
+    runs = configuration.calibration.runs
+    is_calibration = any(run.campaign == "loc-jezero" and run.seed == configuration.seed for run in runs)
+    assert (kind == "calibration") == is_calibration
+
+
+def test_span_of_inertial_data_is_that_of_the_code() -> None:
+    text = " ".join((ROOT / "docs" / "localisation.md").read_text().split())
+    assert re.findall(r"inertial data begin ([\d.]+) s before", text) == [f"{localisation.LEAD_S:g}"]
+    assert re.findall(r"flight is simulated from ([\d.]+) s before", text) == [f"{FLIGHT_LEAD_S:g}"]
+
+
+def test_pages_use_one_term_for_requirements_without_confidence() -> None:
+    pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "reports" / "templates").glob("*.j2")]
+    texts = {page: " ".join(page.read_text().split()) for page in pages}
+    assert [page for page, text in texts.items() if re.search(r"decided by (the )?(observed )?rate", text)] == []
+    assert sum("evaluated by observed rate" in text for text in texts.values()) > 5
+
+
+def test_number_of_cases_of_a_campaign_is_that_of_its_file() -> None:
+    """Tables of commands: the column `cases` states the number of cases of the campaign's file."""
+    n_rows = 0
+    for page in PAGES:
+        for _, cells in list_rows(page):
+            command = re.fullmatch(r"`marsyard run ([\w-]+)`", cells[0])
+            if command is None or command.group(1) not in catalogue():
+                continue
+            number = re.match(r"[\d,]+", cells[2])
+            assert number is not None, cells
+            cases = load_campaign(command.group(1)).configuration.cases
+            assert int(number.group().replace(",", "")) == cases, cells
+            n_rows += 1
+    assert n_rows > 20
