@@ -23,6 +23,7 @@ from marsyard.reports.budget import budget_section, budget_sentences, read_budge
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
+from marsyard.reports.multiplicity import multiplicity_text
 from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
 from marsyard.reports.rare import rare_section, read_result, result_sentences
 from marsyard.reports.requirement_cases import CaseFinder
@@ -121,6 +122,7 @@ def page_context(
         "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),
         "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
+        "multiplicity": multiplicity_text(verdicts),
         "metric": metric,
         "metric_label": "" if metric is None else label(metric),
         "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],

@@ -43,6 +43,7 @@ from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run, next_look, record_look
+from marsyard.reports.multiplicity import multiplicity_text
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks
@@ -77,6 +78,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence]
     if is_finished and evaluation.overall_verdict.cases_to_append:
         lines.append(f"to decide: marsyard append {directory} {evaluation.overall_verdict.cases_to_append}")
+    if multiplicity := multiplicity_text(verdicts):
+        lines.append(multiplicity)
     if not any(verdict.withheld_status for verdict in verdicts):
         lines.append(f"evidence: {evaluation.evidence.text}")
     lines.append(f"report: {page}")

@@ -19,6 +19,7 @@ from marsyard.reports.campaign import PAGE_FILE, REPORT_JSON, VERIFICATION_FILE,
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
 from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.multiplicity import multiplicity_text
 from marsyard.reports.presentation import ShowcaseView, showcase_view
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sections import embed_json, replay_command, script_hash
@@ -70,6 +71,7 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
         filters=[(name.lower(), name, sorted(choices - {""})) for name, choices in filter_values.items()],
         max_other=stored.MAX_OTHER_VERDICTS,
         coverage=stored.count_verdicts(rows),
+        multiplicity=multiplicity_text([row.latest.verdict for row in rows if row.latest is not None]),
         data=embed_json(_create_filter_data(rows)),
         script=script,
         hash=script_hash(script),
@@ -100,7 +102,15 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
     cases = _write_cases(folder, entry, evaluation.run, finder)
     links = {int(case["case"]): case["file"] for case in cases}
     lists = finder.requirement_cases()
-    text = _render("dashboard_campaign.html.j2", entry=entry, cases=cases, lists=lists, links=links, **_FORMATTERS)
+    text = _render(
+        "dashboard_campaign.html.j2",
+        entry=entry,
+        cases=cases,
+        lists=lists,
+        links=links,
+        multiplicity=multiplicity_text(entry.requirements),
+        **_FORMATTERS,
+    )
     write_atomic(page, text)
 
 

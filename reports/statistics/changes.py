@@ -252,8 +252,9 @@ def _subset_means(
 
 def symmetry_p_value(differences: Float[np.ndarray, " n"], groups: Groups) -> float:
     """Compute the two-sided p-value of paired differences that are symmetric about zero (signed ranks)."""
-    are_shared = groups is not None and is_shared(groups)
-    return _test_signed_ranks(_sum_groups(differences, groups) if are_shared else differences)
+    if groups is not None and is_shared(groups):
+        return _test_signed_ranks(_sum_groups(differences, groups))
+    return _test_signed_ranks(differences)
 
 
 def _sum_groups(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:

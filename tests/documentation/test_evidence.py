@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from marsyard.campaigns.definition.loading import catalogue, load_campaign
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.localisation import scenario as localisation
 from marsyard.scenarios.localisation.flight import LEAD_S as FLIGHT_LEAD_S
+from marsyard.scenarios.systems import catalogue
 
 ROOT = Path(__file__).parents[2]
 RECORD = ROOT / "benchmarks" / "results" / "confirmations.jsonl"
@@ -53,7 +54,9 @@ def test_rows_of_hazard_detection_name_their_confirmation() -> None:
     for campaign, cells in list_rows("hda.md"):
         if cells[0] == f"`{cells[0].strip('`')}`" and cells[0].strip("`") in {name for name, _ in confirmations}:
             campaign, cells = cells[0].strip("`"), cells[1:]
-        number = next((cell.removeprefix("confirmation ") for cell in cells if re.fullmatch(r"confirmation \d", cell)), "")
+        number = next(
+            (cell.removeprefix("confirmation ") for cell in cells if re.fullmatch(r"confirmation \d", cell)), ""
+        )
         if number and len(cells) > 1 and cells[1].isdigit() and any("**" in cell for cell in cells):
             entry = confirmations[campaign, int(number)]
             assert (entry["frozen"]["algorithm"], entry["cases"]) == (cells[0].strip("`"), int(cells[1])), cells
@@ -66,6 +69,7 @@ def test_explorations_do_not_use_the_seed_of_a_calibration() -> None:
     text = " ".join((ROOT / "docs" / "localisation.md").read_text().split())
     (kind,) = re.findall(r"first 24 descents of `loc-jezero` \(an? (\w+)", text)
     configuration = load_campaign("loc-jezero").configuration
+    assert configuration.calibration is not None
     runs = configuration.calibration.runs
     is_calibration = any(run.campaign == "loc-jezero" and run.seed == configuration.seed for run in runs)
     assert (kind == "calibration") == is_calibration

@@ -1,0 +1,69 @@
+"""Tests of the statement on several requirements: expected number of false PASSes, and where it is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from marsyard.cli.outcome import evaluate_and_report
+from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.statistics.proportions import proportion_lower
+
+Rows = Callable[..., pd.DataFrame]
+MakeRun = Callable[..., Path]
+
+
+@dataclass(frozen=True)
+class Decided:
+    confidence: float
+    decide_by: str = "confidence"
+    n: int = 100
+
+
+def test_risks_of_requirements_are_added() -> None:
+    assert multiplicity_text([]) == multiplicity_text([Decided(0.9)]) == ""
+    text = multiplicity_text([Decided(0.9), Decided(0.9), Decided(0.95)])
+    assert text.startswith("3 requirements are decided at a confidence: if none is met, up to 0.25 false PASSes")
+    assert text.endswith("Their PASSes hold together with at least 75 % confidence.")
+    # requirements without a verdict at a confidence have no risk of a false PASS
+    others = [Decided(0.9, "estimate"), Decided(0.9, n=0), Decided(float("nan")), Decided(1.5)]
+    assert multiplicity_text([*others, Decided(0.9)]) == ""
+    assert multiplicity_text([*others, Decided(0.9), Decided(0.9)]).startswith("2 requirements")
+    assert multiplicity_text([Decided(0.9)] * 10).endswith("A single PASS of these is weak evidence.")
+
+
+def test_stated_number_bounds_the_false_passes_of_a_simulation() -> None:
+    """Three requirements at the limit: 99 %, 95 % and 90 % at 90 % confidence; 5,000 campaigns of 300 cases."""
+    rng = np.random.default_rng(1)
+    rates = np.array([0.99, 0.95, 0.9])
+    limits = [
+        next(k for k in range(301) if proportion_lower(k, 300, 0.9) >= rate) for rate in rates
+    ]  # smallest number of successes for PASS
+    passes = rng.binomial(300, rates, (5000, 3)) >= limits
+    # standard deviation of the mean number of false PASSes: at most sqrt(3 * 0.09 / 5000) = 0.0073
+    assert 0.15 < passes.sum(axis=1).mean() <= 0.3 + 3 * 0.0073
+    assert passes.any(axis=1).mean() <= 0.3 + 3 * 0.0065
+
+
+@pytest.mark.parametrize("requirements", [1, 2])
+def test_statement_is_printed_and_shown(
+    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any], tmp_path: Path, requirements: int
+) -> None:
+    second = {**velocity, "id": "SECOND", "bound": 9.0}
+    directory = make_run(make_rows(24), [velocity, second][:requirements])
+    console = Console(record=True, width=200)
+    evaluate_and_report(directory, console)
+    write_site(tmp_path / "site", [directory])
+    texts = [console.export_text(), (directory / "report.html").read_text()]
+    texts += [page.read_text() for page in (tmp_path / "site").rglob("index.html")]
+    assert len(texts) == 4
+    statement = "2 requirements are decided at a confidence: if none is met, up to 0.2 false PASSes"
+    assert [statement in text for text in texts] == [requirements == 2] * 4
