@@ -146,7 +146,7 @@ class Location(Parameters):
 
     bank: Annotated[int, bounded_field(1, MAX_TERRAINS, "number of terrains in the terrain bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank, from 0")] = 0
     east_m: Annotated[float, Field(description="east coordinate at the first image, on the periodic terrain")] = 0.0
     north_m: Annotated[float, Field(description="north coordinate at the first image, on the periodic terrain")] = 0.0
 

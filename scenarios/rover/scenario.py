@@ -60,7 +60,7 @@ MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
 class VariantParameters(Parameters):
     """Rock, terrain and sun of one run; `SharedDriveParameters.run` is the index of a run."""
 
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain among the stored terrains")] = 0
+    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank, from 0")] = 0
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 1.4
     height_m: Annotated[float, Field(gt=0.01, le=5.0, description="height of the rock")] = 0.8
     shape: Annotated[int, Field(ge=0, le=31, description="number of the rock's shape, see PlacedRock")] = 0
