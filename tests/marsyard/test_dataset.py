@@ -57,15 +57,14 @@ def read_shard(path: Path) -> dict[str, bytes]:
         return {member.name: shard.extractfile(member).read() for member in shard.getmembers()}  # type: ignore[union-attr]
 
 
-def test_only_terrains_of_the_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_terrains_of_several_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Six cases on four terrains in turn: two terrains are used twice."""
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path / "cache"))
     path = tmp_path / "samples.toml"
-    dispersion = '"location.terrain" = { distribution = "integer", low = 0, high = 19, source = "any" }'
+    dispersion = '"location.terrain" = { distribution = "in-turn", low = 0, high = 3, source = "any" }'
     path.write_text(CAMPAIGN.replace("bank = 1", "bank = 20").replace("samples = 512", "samples = 256") + dispersion)
-    campaign = load_campaign(str(path))
-    _prepare_terrains(campaign, range(2))
-    terrains = {campaign.parameters(case).model_dump()["location"]["terrain"] for case in range(2)}
-    assert len(list((tmp_path / "cache" / "terrain").iterdir())) == len(terrains)
+    _prepare_terrains(load_campaign(str(path)), range(6))
+    assert len(list((tmp_path / "cache" / "terrain").iterdir())) == 2
 
 
 def compute_points(sample: dict[str, Any], camera_file: Path, distance: np.ndarray) -> np.ndarray:
