@@ -94,10 +94,13 @@ class SizedFaults(Parameters):
 
     @property
     def columns(self) -> dict[str, Scalar]:
-        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one fault."""
+        """The fault and its size; "none" and 0 without a fault, "several" and NaN with more than one fault.
+
+        `fault_free` marks the cases without a fault, in which an algorithm must answer.
+        """
         faults = [(name, float(size)) for name, size in self.model_dump().items() if size] or [("none", 0.0)]
         name, size = faults[0] if len(faults) == 1 else ("several", float("nan"))
-        return {"fault": name, "fault_size": size}
+        return {"fault": name, "fault_size": size, "fault_free": name == "none"}
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Return the changed parameters of the detector by table; an empty table changes nothing."""

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from benchmarks.validation import (
     campaign_checks,
+    controls,
     difference_checks,
     dimes_checks,
     document,
@@ -49,6 +50,7 @@ CHECKS = (
     *difference_checks.CHECKS,
     *rare_checks.CHECKS,
     *rare_verdicts.CHECKS,
+    *controls.CHECKS,
 )
 
 

@@ -64,12 +64,13 @@ def write_page(checks: Sequence[Check], stored: dict[str, dict]) -> None:
     """Write the page with rows in the order of the checks, so that only values differ between runs."""
     text = TEMPLATE.read_text()
     sections: dict[str, list[str]] = {}
+    columns = {check.section: ("property", "limit", "measured", "", *check.method_columns) for check in checks}
     for check in checks:
         rows = sections.setdefault(check.section, [])
         for row in stored.get(check.name, {}).get("measures", []):
             rows.append(_format_row(Measure(**row)))
     for section, rows in sections.items():
-        header = ["| property | limit | measured | | method |", "|---|---|---|---|---|"]
+        header = [f"| {' | '.join(columns[section])} |".replace("|  |", "| |"), "|---" * len(columns[section]) + "|"]
         text = text.replace("{" + section + "}", "\n".join(header + rows) if rows else "Not measured yet.")
     text = text.replace("{environment}", _describe_environments(checks, stored))
     DOCUMENT.write_text(text)

@@ -51,8 +51,11 @@ class Check:
         Heading of its rows in the document.
     run
         Function that yields the measurements; its argument `quick` selects fewer samples (with the same limits).
+    method_columns
+        Headings of the last columns of its table; `Measure.how` contains a cell for each, separated by " | ".
     """
 
     name: str
     section: str
     run: Callable[[bool], Iterator[Measure]]
+    method_columns: tuple[str, ...] = ("method",)

@@ -186,7 +186,6 @@ class LandingParameters(Parameters):
     """Parameters of the landing (`descent.score.compute_touchdown`); all values except the burn's are assumed."""
 
     computation_s: Annotated[float, bounded_field(0.0, 1000.0, "computation time on the flight computer")] = 14.0
-    processor_factor: Annotated[float, Field(gt=0.0, le=1e6, description="run time, flight / host (assumed)")] = 600.0
     steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "maximum horizontal speed without steering")] = (
         5.0
     )

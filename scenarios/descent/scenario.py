@@ -25,12 +25,12 @@ from marsyard.scenarios.conditions import (
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, states_at_images, true_velocity
 from marsyard.scenarios.descent.measurement import Instruments, add_increments, measure, measure_exactly
+from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.descent.score import (
     Images,
     compute_touchdown,
     conditions,
-    feasible_overlap_row,
     instrument_errors,
     propagate_to_firing,
 )
@@ -135,7 +135,7 @@ class Descent:
 
     - p: parameters of the case
     - states, images: true states at the images, and the delivered images
-    - overlap: columns of `feasible_overlap_row`, empty if there are fewer than three images
+    - overlap: columns of `overlap_row`, empty if there are fewer than three images
     """
 
     p: DescentScenarioParameters
@@ -167,8 +167,7 @@ class Descent:
         overlap: Mapping[str, Scalar] = {}
         if p.triple_indices is not None:
             triple = [states[index] for index in p.triple_indices]
-            camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
-            overlap = feasible_overlap_row(triple, world, camera, detector.calibration, p.dimes)
+            overlap = overlap_row(triple, world, optics.camera)
         return cls(p, streams, world, flight, instruments, states, images, measurements, overlap)
 
     @cached_property
@@ -199,8 +198,6 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
         "touchdown_speed_corrected_m_s": float(np.hypot(*landing.with_answer)),
         "touchdown_speed_uncorrected_m_s": float(np.hypot(*landing.without_answer)),
         "in_time_assumed": landing.is_in_time,
-        # measured computation time, scaled to the flight computer
-        "in_time_measured": p.landing.processor_factor * float(algorithm_run.row["estimation_time_s"]) <= available_s,
         **stream_row(estimate, descent.truth),
         **algorithm_run.row,
     }

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import UInt16
 
-from marsyard.algorithms.dimes import DimesOptions, propagate_velocity
-from marsyard.algorithms.dimes.binning import View, altitudes_at_images, bin_factors, place_camera
-from marsyard.algorithms.dimes.overlap import search_geometry, template_candidates
+from marsyard.algorithms.dimes import propagate_velocity
+from marsyard.algorithms.dimes.binning import altitudes_at_images
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
 from marsyard.scenarios.descent.exposure import World
@@ -20,15 +18,11 @@ from marsyard.scenarios.descent.measurement import Instruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.velocity import Horizontal
-from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
-from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration
+from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import height_above_ground
 
 Images = Sequence[UInt16[np.ndarray, "rows columns"]]
-
-#: Width of the ground patch whose mean height is the reference of DIMES' altitude, m.
-GROUND_PATCH_M = 200.0
 
 
 @dataclass(frozen=True)
@@ -158,33 +152,3 @@ def instrument_errors(world: World, states: Sequence[State], measurements: Desce
         row[f"altitude_error_{number}_m"] = float(error * heights[number - 1])
         row[f"tag_error_{number}_s"] = float(tag_error)
     return row
-
-
-def feasible_overlap_row(
-    states: Sequence[State], world: World, camera: CameraModel, calibration: DetectorCalibration, options: DimesOptions
-) -> dict[str, Scalar]:
-    """Count the grid points of the feasible overlap of three images: template and search window of DIMES fit there.
-
-    Attitudes, times, altitudes and camera are the true ones. As in DIMES, the zero-phase spot is excluded. If a pair
-    of images has no such point, the geometry makes DIMES fail.
-    """
-    columns, rows = bin_factors(camera.size[::-1], options.binned_size)
-    patch_samples = GROUND_PATCH_M / world.surface.spacing_m
-    level = int(np.clip(np.rint(np.log2(max(patch_samples, 1.0))), 0, len(world.surface.levels) - 1))
-    # the overlap depends on the geometry of the views only, so that their images are blank
-    blank = np.zeros(options.binned_size[::-1], dtype=np.float32)
-    views = []
-    for state in states:
-        altitude_m = float(state.position_m[2] - world.surface.height(state.position_m[0], state.position_m[1], level))
-        model, centre = place_camera(camera.bin(columns, rows), state.attitude, altitude_m)
-        views.append(View(blank, blank, model, centre, state.time_s, calibration, calibration.rows_summed * rows))
-    sun = world.sun.direction
-    first_count, second_count = (
-        len(template_candidates(view, later, search_geometry(view, later, options), sun, options).pixels)
-        for view, later in pairwise(views)
-    )
-    return {
-        "feasible_overlap": min(first_count, second_count) > 0,
-        "feasible_overlap_first_pair": first_count,
-        "feasible_overlap_second_pair": second_count,
-    }

@@ -126,6 +126,12 @@ class TripleParameters(Parameters):
             le=60.0, description="time that is assigned to the interval between two images, as in the MER landings, s"
         ),
     ] = 3.75
+    velocity_bias_m_s: Annotated[
+        NonNegative,
+        Field(
+            description="SD per axis of the constant error of the horizontal inertial velocity; assumed: that of the wind"
+        ),
+    ] = 15.0
     max_speed_m_s: Annotated[
         Positive, Field(description="maximum speed: distance divided by the virtual interval, as in DIMES")
     ] = 30.0

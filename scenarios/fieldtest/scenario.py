@@ -93,7 +93,8 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         images = [counts for counts, _ in exposures]
         ground_points = exposures[1][1].points_world(np.s_[::CLOUD_GRID_PX, ::CLOUD_GRID_PX])
         truth = truth_velocities(p, case)[1, :2]
-        measurements = measure(p, case, images, detector, key.calibrated_camera())
+        inertial = streams.generator("inertial velocity")
+        measurements = measure(p, case, images, detector, key.calibrated_camera(), inertial)
         # cloud transmittance on the ground of the second image, at the time of each image, and its changes
         transmittances = cloud_transmittances(run, ground_points, [state.time_s for state in case.states])
         changes = np.abs(np.diff(transmittances, axis=0))
@@ -156,8 +157,7 @@ def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, 
     """Compute the paper's truth velocities: GPS differences divided by the virtual interval, world axes (III.D.5).
 
     The images of a triple are not consecutive, so the time between them has no meaning for an inertial unit. The paper
-    assigns a fixed virtual interval to each pair. The velocities that a lander's inertial unit would give to the
-    estimator are the same differences ("biased IMU velocities", III.D.3).
+    assigns a fixed virtual interval to each pair.
     """
     fixes = case.run.images.position_m[list(case.triple.image_indices)]
     return np.asarray(np.diff(fixes, axis=0) / p.triples.virtual_interval_s)
@@ -169,8 +169,15 @@ def measure(
     images: Sequence[UInt16[np.ndarray, "rows columns"]],
     detector: Detector,
     camera: CameraModel,
+    rng: np.random.Generator,
 ) -> DescentMeasurements:
-    """Create an estimator's inputs: time tags at the virtual interval, and the calibrated camera (paper, III.D)."""
+    """Create an estimator's inputs: time tags at the virtual interval, and the calibrated camera (paper, III.D).
+
+    The inertial velocities are the paper's truth velocities plus a constant horizontal error, drawn from `rng`: "biased
+    IMU velocities" (III.D.3), because an inertial unit measures changes of velocity, but does not know the wind. Without
+    the error the truth would be an input.
+    """
+    bias = np.append(p.triples.velocity_bias_m_s * rng.standard_normal(2), 0.0)
     tags = [number * p.triples.virtual_interval_s for number in range(len(images))]
     indices_and_tags = list(zip(case.triple.image_indices, tags, strict=True))
     altitudes = case.run.images.altitude_m
@@ -180,7 +187,7 @@ def measure(
         ),
         attitudes=tuple(AttitudeMeasurement(case.run.attitudes[index], tag) for index, tag in indices_and_tags),
         altitudes=tuple(AltitudeMeasurement(float(altitudes[index]), tag) for index, tag in indices_and_tags),
-        interval_velocities_m_s=truth_velocities(p, case),
+        interval_velocities_m_s=truth_velocities(p, case) + bias,
         sun_direction=case.run.sun(case.states[1].time_s),
     )
 
@@ -196,6 +203,8 @@ def _conditions(
         "category": str(case.triple.category),
         "one_direction": case.triple.category is not Category.OPPOSITE_DIRECTION,
         "clear_sky": run.clouds is None,
+        "intact_cable": run.parameters.cable_bursts == 0.0,
+        "noisy_cable": run.parameters.cable_bursts > 0.0,
         "site": run.parameters.site,
         "terrain": p.site_names.index(run.parameters.site),
         "location_east_m": float(case.states[1].position_m[0]),

@@ -200,6 +200,24 @@ class GroundTruth:
         distance_m = distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m
         return np.asarray(distance_m > 0.5 * self.limits.diameter_m)
 
+    @property
+    def visible_hazards(self) -> Bool[np.ndarray, "rows columns"]:
+        """Unsafe positions whose whole footprint is in both images."""
+        return np.asarray(self.covered & ~self.footprints.safe)
+
+    def clearance_fraction(self, position: Float[np.ndarray, "2"]) -> float:
+        """Compute the distance of a position (x, y) from the nearest visible hazard, divided by the largest distance.
+
+        The largest distance is that of a position whose footprint is in both images; the result is 0 outside of them.
+        Returns NaN without a visible hazard.
+        """
+        if not np.any(self.visible_hazards):
+            return float("nan")
+        distances = np.where(self.covered, distance_transform_edt(~self.visible_hazards), 0.0)
+        row, column = divmod(int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T))), distances.shape[1])
+        is_outside = np.hypot(*(self.positions[row, column] - position)) > self.step_m
+        return 0.0 if is_outside else float(distances[row, column] / distances.max())
+
     def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
         """Compute the distance from a position (x, y) to the nearest unsafe grid position."""
         unsafe = self.positions[~self.footprints.safe]
@@ -335,8 +353,10 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
 
     The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean
     error, `rms` the RMS error, `median_error` the median absolute error. `noise` is the robust standard deviation of
-    the errors about a fitted plane; it affects roughness. `outliers` is the fraction of errors about this plane beyond
-    five times `noise`. The result is empty for fewer than four cells with an elevation.
+    the errors about a fitted plane; it affects roughness. `relief_error_fraction` is `noise` divided by the same
+    deviation of the exact heights: it is 1 for a plane, which needs no images, and 0 for an exact map. `outliers` is the
+    fraction of errors about the plane beyond five times `noise`. The result is empty for fewer than four cells with an
+    elevation.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
     local = ground.elevation.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
@@ -349,9 +369,8 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
     if values.size < 4:  # the fitted plane has three parameters
         return {}
     design = np.column_stack([local[is_finite], np.ones(values.size)])
-    is_inlier = np.abs(values - np.median(values)) <= 5.0 * _robust_deviation(values)
-    residuals = values - design @ np.linalg.lstsq(design[is_inlier], values[is_inlier], rcond=None)[0]
-    noise = _robust_deviation(residuals)
+    residuals = _subtract_plane(design, values)
+    noise, relief = _robust_deviation(residuals), _robust_deviation(_subtract_plane(design, exact[is_finite]))
     slope_errors = (sampled.slope_rad - truth.footprints.slope_rad)[sampled.valid]
     has_slopes = slope_errors.size > 0
     return {
@@ -359,10 +378,17 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
         "elevation_rms_m": float(np.sqrt(np.mean(values**2))),
         "elevation_median_error_m": float(np.median(np.abs(values))),
         "elevation_noise_m": noise,
+        "relief_error_fraction": noise / relief,
         "elevation_outliers": float(np.mean(np.abs(residuals) > 5.0 * noise)),
         "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if has_slopes else float("nan"),
         "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if has_slopes else float("nan"),
     }
+
+
+def _subtract_plane(design: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Subtract the plane that is fitted to the values without their outliers."""
+    is_inlier = np.abs(values - np.median(values)) <= 5.0 * _robust_deviation(values)
+    return np.asarray(values - design @ np.linalg.lstsq(design[is_inlier], values[is_inlier], rcond=None)[0])
 
 
 def _robust_deviation(values: Float[np.ndarray, "n"]) -> float:

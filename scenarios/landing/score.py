@@ -37,6 +37,8 @@ DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.
 #: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
 #: axis, and change of height as a fraction of the range along the optical axis.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
+#: Minimum distance of a site from hazards, as a fraction of the distance of the farthest position.
+MIN_CLEARANCE_FRACTION = 0.5
 #: Columns of tracks, motion, structure and map.
 MOTION_COLUMNS = (
     "features", "tracks", "features_in_view", "tracks_correct", "tracked_fraction", "tracks_outlier_fraction",
@@ -67,7 +69,8 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
     """Classify the flight by its true ground: no safe site, only safe sites without margin, or safe sites with margin.
 
     The ground around a site with margin is safe up to a lander's radius. Exactly one of `no_safe_site_exists`,
-    `narrow_site_exists` and `wide_site_exists` is true.
+    `narrow_site_exists` and `wide_site_exists` is true. `hazard_visible`: both images show an unsafe footprint, so that
+    not every site is right.
     """
     has_safe_site, has_margin = bool(np.any(truth.safe)), bool(np.any(truth.safe_with_margin))
     return {
@@ -75,6 +78,7 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
         "no_safe_site_exists": not has_safe_site,
         "narrow_site_exists": has_safe_site and not has_margin,
         "wide_site_exists": has_margin,
+        "hazard_visible": bool(np.any(truth.visible_hazards)),
     }
 
 
@@ -84,15 +88,26 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     The true site is the reported site minus the navigation error at the first image. Only the outcome SAFE_SITE
     reports a site. If the algorithm did not converge, the helicopter descends to the a-priori site. The numbers of the
     site and `descent_target_safe` then describe the a-priori site, and `site_safe` is false.
+
+    `answer_correct`: the site is safe, or no site is reported and no safe site with margin exists. Where only narrow
+    sites exist, both answers are correct, because a narrow site leaves no margin for the errors of the algorithm.
+    `site_clearance_fraction` is the distance of the reported site from the nearest hazard in both images, divided by
+    that of the farthest position; NaN without a site or without hazards. `site_far_from_hazards`: it is at least
+    `MIN_CLEARANCE_FRACTION`. The paper selects the safe site that is farthest from all hazards (section III).
     """
-    row = _ground_row("site", _true_site(estimate, flight), truth)
-    is_target_safe = bool(row["site_safe"])
-    reports_safe_site = estimate.outcome is SiteOutcome.SAFE_SITE and is_target_safe
+    position = _true_site(estimate, flight)
+    row = _ground_row("site", position, truth)
+    is_target_safe, reports_site = bool(row["site_safe"]), estimate.outcome is SiteOutcome.SAFE_SITE
+    reports_safe_site, refuses = reports_site and is_target_safe, estimate.outcome is SiteOutcome.NO_SAFE_SITE
+    clearance = truth.clearance_fraction(position) if reports_site and position is not None else NAN
     return {
         **row,
         "site_safe": reports_safe_site,
         "descent_target_safe": is_target_safe,
-        "safe_or_no_site_reported": reports_safe_site or estimate.outcome is SiteOutcome.NO_SAFE_SITE,
+        "safe_or_no_site_reported": reports_safe_site or refuses,
+        "answer_correct": reports_safe_site or (refuses and not np.any(truth.safe_with_margin)),
+        "site_clearance_fraction": clearance,
+        "site_far_from_hazards": clearance >= MIN_CLEARANCE_FRACTION,
     }
 
 
@@ -251,12 +266,13 @@ def times_row(details: object) -> dict[str, Scalar]:
 def map_row(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
 ) -> dict[str, Scalar]:
-    """Compute the columns of map errors and hazard counts; empty without a map."""
+    """Compute the columns of map errors and hazard counts; only the relief error, NaN, without a map."""
+    row: dict[str, Scalar] = {"relief_error_fraction": NAN}
     if not isinstance(estimate.details, HdaDetails) or estimate.details.ground is None:
-        return {}
+        return row
     ground = estimate.details.ground
     sampled_map = SampledMap.sample(ground, flight, truth, (p.hda.max_slope_rad, p.hda.max_roughness_m))
-    return {**map_errors(ground, flight, sampled_map, truth), **count_hazards(ground, sampled_map, truth)}
+    return {**row, **map_errors(ground, flight, sampled_map, truth), **count_hazards(ground, sampled_map, truth)}
 
 
 def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[str, Scalar]:
@@ -308,6 +324,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "grid_px": p.hda.grid_px,
         "max_slope_deg": float(np.degrees(p.hda.max_slope_rad)),
         "max_roughness_m": p.hda.max_roughness_m,
+        "strict_threshold": p.hda.max_roughness_m <= truth.limits.max_roughness_m,
         **ground_columns(case.world.ground),
         **contrast_columns(pair.counts[0], p.detector),
         **optics_columns(p.detector.optics),

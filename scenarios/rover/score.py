@@ -244,9 +244,12 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
 
 
 def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Compute the columns of the designated point's visibility at the stops of a run."""
+    """Compute the columns of the designated point's visibility at the stops of a run.
+
+    A run without stops has not lost sight of the point: it counts, as a failure, in the population of visible targets.
+    """
     if not run.stops:
-        return {"point_in_view": False, "obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
+        return {"point_in_view": True, "obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
     heads = [stop.world_from_head for stop in run.stops]
     columns = asdict(evaluate_visibility(run.world, run.rig, run.target.point_world, heads, p.vtt))
     return {"point_in_view": columns.pop("in_view"), **columns}

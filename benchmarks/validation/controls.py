@@ -1,0 +1,123 @@
+"""Negative controls on every campaign of the catalogue: each must fail at least one requirement.
+
+The controls are algorithms that use no image, refuse, answer without regard to the case, crash, hang or return NaN
+(`marsyard.algorithms.controls`). A campaign whose requirements a control meets gives a PASS without meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pandas as pd
+
+from benchmarks.validation.records import Check, Measure
+from marsyard.algorithms.faults import Fault
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.evaluation import compute_exit_code
+from marsyard.reports.rates import engine_failed
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.verdicts import Status, evaluate_requirements
+from marsyard.scenarios.interface import conditions_recorded_by
+from marsyard.scenarios.systems import catalogue, systems
+
+MODULE = "marsyard.algorithms.controls"
+#: Title of each control, by the name of its class. The controls of the first line answer, and run on the same images.
+ANSWERING = {"NoImage": "no image", "Refusal": "refusal", "Constant": "constant"}
+FAILING = {"NotANumber": "NaN", "Crash": "crash"}
+HANG = {"Hang": "hang"}
+TITLES: Mapping[str, str] = {**ANSWERING, **FAILING, **HANG}
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Cases of a campaign on which the controls run, and changes of its file (``KEY=VALUE``)."""
+
+    cases: Sequence[int] = (0, 1, 2, 3)
+    overrides: tuple[str, ...] = ()
+
+
+#: Campaigns whose first four cases are expensive or do not contain the populations of their requirements. Fault campaigns
+#: run without a fault, because a refusal is right with one.
+SETTINGS: Mapping[str, Settings] = {
+    "dimes-offnominal": Settings(overrides=("faults={}",)),
+    "hda-faults": Settings((0, 4, 8, 12), ("faults={}",)),
+    "hda-threshold": Settings((0, 3, 21, 22)),
+    "loc-faults": Settings(overrides=("faults={}",)),
+}
+
+
+def run_controls(campaign_name: str, settings: Settings) -> tuple[Campaign, dict[str, pd.DataFrame]]:
+    """Run all controls on cases of a campaign; return the campaign and the rows of each control, by its class.
+
+    A hanging algorithm has the rows that the engine stores for a case above its time limit: its conditions, and the
+    outcome TIMED_OUT.
+    """
+    rows: dict[str, list[Row]] = {name: [] for name in TITLES}
+    for names in (tuple(ANSWERING), *((name,) for name in FAILING)):
+        specs = [f"{MODULE}:{name}" for name in names]
+        campaign = load_campaign(campaign_name, settings.overrides, algorithms=specs)
+        for case in settings.cases:
+            conditions, rows_by_name = _run_case(campaign, names, case)
+            for name, row in rows_by_name.items():
+                rows[name].append(row)
+            if names == ("Crash",):
+                rows["Hang"].append({**conditions, "outcome": Fault.TIMED_OUT.name, "answered": False})
+    return campaign, {name: pd.DataFrame(items) for name, items in rows.items()}
+
+
+def _run_case(campaign: Campaign, names: Sequence[str], case: int) -> tuple[Row, dict[str, Row]]:
+    """Run one case; return its recorded conditions, and the row of each algorithm as if it were under test."""
+    conditions: Row = {}
+    with conditions_recorded_by(conditions.update):
+        result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+    prefixes = {name: f"{name}." for name in names[1:]}
+    is_compared = tuple(prefixes.values())
+    first = {
+        column: value for column, value in result.row.items() if not is_compared or not column.startswith(is_compared)
+    }
+    rows = {names[0]: {**conditions, **first, "outcome": result.outcome, "answered": result.answered}}
+    for name, prefix in prefixes.items():
+        own = {column.removeprefix(prefix): result.row[column] for column in result.row if column.startswith(prefix)}
+        rows[name] = {**conditions, **own}
+    return conditions, rows
+
+
+def find_failed_requirements(campaign: Campaign, frame: pd.DataFrame) -> tuple[list[str], int]:
+    """Evaluate a campaign's requirements on rows; return the ids of those that fail, and the exit status."""
+    requirements = [item.model_dump() for item in campaign.configuration.requirements]
+    sampling = read_sampling_design(campaign.configuration.model_dump(mode="json"))
+    verdicts = evaluate_requirements(frame, requirements, sampling)
+    failed = [verdict.requirement_id for verdict in verdicts if verdict.status is Status.FAIL]
+    return failed, compute_exit_code(verdicts, bool(engine_failed(frame).any()))
+
+
+def measure_campaign(campaign_name: str, settings: Settings) -> Measure:
+    """Count the controls that fail no requirement of a campaign; a crash, hang or invalid answer may end with exit status 1."""
+    campaign, frames = run_controls(campaign_name, settings)
+    cells, passing = [], 0
+    for name, frame in frames.items():
+        failed, exit_code = find_failed_requirements(campaign, frame)
+        is_stopped = name not in ANSWERING and exit_code == 1
+        passing += not failed and not is_stopped
+        cells.append(", ".join(failed) or ("exit status 1" if is_stopped else "**none**"))
+    claim = f"`{campaign_name}`, {len(settings.cases)} cases"
+    return Measure(claim, float(passing), "1", 0.0, " | ".join(cells))
+
+
+def _check_controls(quick: bool) -> Iterator[Measure]:
+    """Run the controls on all campaigns of the catalogue, or on a small one of each system."""
+    if quick:
+        for system in systems():
+            for name, overrides in system.compilation_campaigns.items():
+                yield measure_campaign(name, Settings((0, 1), overrides))
+        return
+    for name in catalogue():
+        yield measure_campaign(name, SETTINGS.get(name, Settings()))
+
+
+CHECKS = (Check("controls", "Negative controls", _check_controls, tuple(TITLES.values())),)
