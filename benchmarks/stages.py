@@ -27,7 +27,7 @@ DESCENT_STAGES: Stages = {
     "detector": (("sensor/detector.py", "draw"), ("sensor/detector.py", "expose"), ("sensor/optics.py", "from_camera")),
     "instruments": (("descent/measurement.py", "draw"), ("descent/measurement.py", "measure")),
     "DIMES": (("dimes/estimator.py", "estimate"),),
-    "feasible overlap": (("descent/score.py", "feasible_overlap_row"),),
+    "feasible overlap": (("descent/overlap.py", "overlap_row"),),
 }
 
 #: Name of the time outside all stages.

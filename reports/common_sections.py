@@ -59,7 +59,7 @@ from marsyard.reports.wording import (
     split_unit,
 )
 
-#: Boolean column: whether the geometry allows a feasible overlap for the algorithm.
+#: Boolean column: whether the images of each pair show enough common ground.
 FEASIBLE_OVERLAP = "feasible_overlap"
 
 

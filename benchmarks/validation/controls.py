@@ -24,7 +24,8 @@ from marsyard.scenarios.interface import conditions_recorded_by
 from marsyard.scenarios.systems import catalogue, systems
 
 MODULE = "marsyard.algorithms.controls"
-#: Title of each control, by the name of its class. The controls of the first line answer, and run on the same images.
+#: Title of each control, by the name of its class. Controls of one line run on the same images. Those that answer are
+#: separate from those that fail, because the columns of a failure depend on the algorithm under test.
 ANSWERING = {"NoImage": "no image", "Refusal": "refusal", "Constant": "constant"}
 FAILING = {"NotANumber": "NaN", "Crash": "crash"}
 HANG = {"Hang": "hang"}
@@ -44,10 +45,17 @@ class Settings:
 #: Campaigns whose first four cases are expensive or do not contain the populations of their requirements. Fault campaigns
 #: run without a fault, because a refusal is right with one.
 SETTINGS: Mapping[str, Settings] = {
+    # two runs of the helicopter; a noisy run and the run with an intact cable
+    "dimes-fieldtest": Settings((12, 36, 42, 5, 13, 20)),
+    "dimes-fieldtest-noise": Settings((0, 5, 4, 13)),
     "dimes-offnominal": Settings(overrides=("faults={}",)),
     "hda-faults": Settings((0, 4, 8, 12), ("faults={}",)),
-    "hda-threshold": Settings((0, 3, 21, 22)),
+    "hda-threshold": Settings((0, 1, 2, 3, 22)),
     "loc-faults": Settings(overrides=("faults={}",)),
+    # targets of one drive, near the middle of the rock
+    "vtt-sideways": Settings((70, 71, 72)),
+    "vtt-straight": Settings((100, 102, 108)),
+    "vtt-turn": Settings((45, 46, 54, 55)),
 }
 
 
@@ -58,14 +66,14 @@ def run_controls(campaign_name: str, settings: Settings) -> tuple[Campaign, dict
     outcome TIMED_OUT.
     """
     rows: dict[str, list[Row]] = {name: [] for name in TITLES}
-    for names in (tuple(ANSWERING), *((name,) for name in FAILING)):
+    for names in (tuple(ANSWERING), tuple(FAILING)):
         specs = [f"{MODULE}:{name}" for name in names]
         campaign = load_campaign(campaign_name, settings.overrides, algorithms=specs)
         for case in settings.cases:
             conditions, rows_by_name = _run_case(campaign, names, case)
             for name, row in rows_by_name.items():
                 rows[name].append(row)
-            if names == ("Crash",):
+            if "Crash" in names:
                 rows["Hang"].append({**conditions, "outcome": Fault.TIMED_OUT.name, "answered": False})
     return campaign, {name: pd.DataFrame(items) for name, items in rows.items()}
 

@@ -208,15 +208,16 @@ class GroundTruth:
     def clearance_fraction(self, position: Float[np.ndarray, "2"]) -> float:
         """Compute the distance of a position (x, y) from the nearest visible hazard, divided by the largest distance.
 
-        The largest distance is that of a position whose footprint is in both images; the result is 0 outside of them.
-        Returns NaN without a visible hazard.
+        The largest distance is that of a position whose footprint is in both images. The result is 0 outside of the
+        images and without a safe position in them, and NaN without a visible hazard.
         """
         if not np.any(self.visible_hazards):
             return float("nan")
         distances = np.where(self.covered, distance_transform_edt(~self.visible_hazards), 0.0)
         row, column = divmod(int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T))), distances.shape[1])
         is_outside = np.hypot(*(self.positions[row, column] - position)) > self.step_m
-        return 0.0 if is_outside else float(distances[row, column] / distances.max())
+        largest = float(distances.max())
+        return 0.0 if is_outside or largest == 0.0 else float(distances[row, column]) / largest
 
     def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
         """Compute the distance from a position (x, y) to the nearest unsafe grid position."""
@@ -386,8 +387,12 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
 
 
 def _subtract_plane(design: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Subtract the plane that is fitted to the values without their outliers."""
-    is_inlier = np.abs(values - np.median(values)) <= 5.0 * _robust_deviation(values)
+    """Subtract the plane that is fitted to the values without their outliers, which are found about a first plane.
+
+    An additional plane in the values does not change the result.
+    """
+    residuals = values - design @ np.linalg.lstsq(design, values, rcond=None)[0]
+    is_inlier = np.abs(residuals - np.median(residuals)) <= 5.0 * _robust_deviation(residuals)
     return np.asarray(values - design @ np.linalg.lstsq(design[is_inlier], values[is_inlier], rcond=None)[0])
 
 

@@ -162,6 +162,15 @@ def test_requirement_texts_describe_metric_and_population() -> None:
         "|position error| ≤ 0.03 m in at least 99 % of valid answers at selectable targets"
     )
     assert texts["HDA-SAFE"].startswith("the reported site is safe in at least 99 % of cases with a reported site")
-    assert texts["HDA-TIME"].startswith("60 × run time of all stages ≤ 2 s in at least 95 %")
+    times = {
+        "id": "TIME",
+        "metric": "tracking_time_s + motion_time_s + structure_time_s + hazards_time_s",
+        "scale": 60.0,
+        "bound": 2.0,
+        "probability": 0.95,
+        "confidence": 0.9,
+    }
+    scaled = requirement_text(Requirement.model_validate(times))
+    assert scaled.startswith("60 × run time of all stages ≤ 2 s in at least 95 %")
     assert population_text("valid and selectable and navcam") == "valid answers at selectable targets, with the navcam"
     assert population_text("in_the_dark") == "cases with in the dark"

@@ -43,7 +43,7 @@ def _write_campaign(folder: Path, metric: str, population: str = "valid", bound:
         ("velocity_eror_m_s", "valid", "bound = 5.0", "metric", "did you mean 'velocity_error_m_s'?"),
         ("velocity_error_m_s + wind_m", "valid", "bound = 5.0", "metric", "unknown column of numbers 'wind_m'"),
         ("answerd", "valid", "", "metric", "did you mean 'answered'?"),
-        ("velocity_error_m_s", "valid and in_time_measurd", "bound = 5.0", "population", "mean 'in_time_measured'?"),
+        ("velocity_error_m_s", "valid and in_time_asumed", "bound = 5.0", "population", "mean 'in_time_assumed'?"),
         ("feasible_overlap", "valid", "bound = 5.0", "metric", "unknown column of numbers 'feasible_overlap'"),
     ],
 )

@@ -55,7 +55,7 @@ def test_index_lists_all_requirements_and_campaigns(make_rows: Rows, make_run: M
     assert coverage_text == f"INSUFFICIENT 1 NO CAMPAIGN {len(shipped_requirements()) - 1}"
     matrix = list(csv.DictReader(io.StringIO((tmp_path / "site" / "verification.csv").read_text())))
     verdicts = {row["requirement"]: row["verdict"] for row in matrix}
-    assert (verdicts["DIMES-VEL"], verdicts["HDA-TIME"]) == ("INSUFFICIENT", "NO CAMPAIGN")
+    assert (verdicts["DIMES-VEL"], verdicts["HDA-POS"]) == ("INSUFFICIENT", "NO CAMPAIGN")
 
 
 def test_finished_campaigns_precede_interrupted_ones(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:

@@ -77,10 +77,8 @@ def test_three_image_estimator_receives_first_middle_and_last_image(nine_images:
     ]
     for name in ("velocity_true_x_m_s", "velocity_true_y_m_s"):
         assert nine_images.row[f"dimes.{name}"] == pytest.approx(three_images[name], rel=1e-12)
-    assert (nine_images.row["feasible_overlap_first_pair"], nine_images.row["feasible_overlap_second_pair"]) == (
-        three_images["feasible_overlap_first_pair"],
-        three_images["feasible_overlap_second_pair"],
-    )
+    for name in ("overlap_width_first_pair_m", "overlap_width_second_pair_m"):
+        assert nine_images.row[name] == three_images[name]
     assert float(nine_images.row["dimes.velocity_error_m_s"]) < 1.0
     assert "dimes.stream_images" not in nine_images.row
 

@@ -190,11 +190,12 @@ def test_insufficient_overlap_gives_no_velocity() -> None:
         assert math.isfinite(float(result.row[f"{name}_true_x_m_s"]))
 
 
-def test_feasible_overlap_is_computed_from_truth(nominal_case: CaseResult) -> None:
-    """An altitude error of 40 % makes DIMES search in wrong areas; the true overlap is unchanged."""
-    wrong_altitude = run_descent(faults={"altitude_error": 0.4})
-    for name in ("feasible_overlap", "feasible_overlap_first_pair", "feasible_overlap_second_pair"):
-        assert wrong_altitude.row[name] == nominal_case.row[name]
+def test_feasible_overlap_does_not_depend_on_the_algorithm(nominal_case: CaseResult) -> None:
+    """An altitude error of 40 % makes DIMES search in wrong areas, and templates of 127 px need more space."""
+    names = ("feasible_overlap", "overlap_width_first_pair_m", "overlap_width_second_pair_m")
+    for changes in ({"faults": {"altitude_error": 0.4}}, {"algorithm": "dimes-custom", "dimes": {"template_px": 127}}):
+        changed = run_descent(**changes)
+        assert [changed.row[name] for name in names] == [nominal_case.row[name] for name in names]
     assert nominal_case.row["feasible_overlap"] is True
 
 
@@ -233,23 +234,6 @@ def test_custom_algorithm_receives_the_measurements() -> None:
     # the wind of 14 m/s, with errors of the inertial velocity of a few m/s
     assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
     assert "tracks" not in result.products
-
-
-@pytest.mark.slow
-def test_slow_algorithm_is_not_in_time_for_the_firing() -> None:
-    """The measured time is scaled by the flight computer's factor: 0.1 s become 60 s, but 14 to 24 s are available."""
-    slow = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:SlowInertialEstimator").row
-    fast = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:InertialEstimator").row
-    assert float(slow["estimation_time_s"]) >= 0.1
-    assert (slow["in_time_measured"], fast["in_time_measured"]) == (False, True)
-    spec = "tests.scenarios.descent.inertial_estimators:SlowInertialEstimator"
-    fast_processor = run_descent(algorithm=spec, landing={"processor_factor": 1.0}).row
-    assert fast_processor["in_time_measured"] is True
-
-
-def test_dimes_run_time_requirement_uses_measured_time() -> None:
-    requirements = {entry.id: entry for entry in load_campaign("dimes-landing").configuration.requirements}
-    assert requirements["DIMES-TIME"].metric == "in_time_measured"
 
 
 def test_exact_instruments_have_no_instrument_errors() -> None:

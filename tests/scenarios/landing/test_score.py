@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,15 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus
+from marsyard.algorithms.hda.details import Ground
+from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
 from marsyard.algorithms.hda.motion import View
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.images import GroundTruth
+from marsyard.scenarios.landing.images import GroundTruth, SampledMap, map_errors
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.score import landing_row, site_populations, site_row, stage_row
+from marsyard.scenarios.landing.score import landing_row, map_row, site_populations, site_row, stage_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset
@@ -95,13 +99,71 @@ def test_flight_without_landing_has_no_touchdown_score() -> None:
     check_metrics(load_campaign("hda-benign").configuration, {**row, "answered": True}, Path())
 
 
-def test_each_population_of_the_hazardous_campaign_has_a_requirement() -> None:
-    requirements = load_campaign("hda-hazardous").configuration.requirements
-    populations = {entry.population for entry in requirements}
-    assert {"no_safe_site_exists", "narrow_site_exists", "wide_site_exists"} <= populations
-    (requirement,) = [entry for entry in requirements if entry.population == "narrow_site_exists"]
-    # The verdict requires a confidence bound.
-    assert (requirement.metric, requirement.decide_by) == ("safe_or_no_site_reported", "confidence")
+@pytest.mark.parametrize(
+    ("n_safe", "outcome", "site", "is_correct"),
+    [
+        (25, SITE_REPORTED, SAFE_SITE, True),
+        (25, SITE_REPORTED, UNSAFE_SITE, False),
+        # refusing is wrong where a safe site with margin exists, and correct where none or only a narrow one exists
+        (25, NO_SITE_REPORTED, None, False),
+        (3, NO_SITE_REPORTED, None, True),
+        (0, NO_SITE_REPORTED, None, True),
+        (0, SITE_REPORTED, UNSAFE_SITE, False),
+        (0, SiteOutcome.NO_MOTION, SAFE_SITE, False),
+    ],
+)
+def test_answer_is_correct_for_the_true_ground(
+    n_safe: int, outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool
+) -> None:
+    row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(n_safe))
+    assert row["answer_correct"] is is_correct
+
+
+def test_clearance_is_relative_to_the_farthest_position() -> None:
+    """One hazard in the corner (-4, -4): the opposite corner is 8 sqrt(2) m away, the centre half as far."""
+    truth = make_truth(0)
+    safe = np.ones_like(truth.covered)
+    safe[0, 0] = False
+    truth = replace(truth, footprints=replace(truth.footprints, safe=safe))
+    assert truth.clearance_fraction(np.array([4.0, 4.0])) == 1.0
+    assert truth.clearance_fraction(np.array([0.0, 0.0])) == pytest.approx(0.5)
+    assert truth.clearance_fraction(np.array([-4.0, -3.0])) == pytest.approx(1.0 / np.hypot(8.0, 8.0))
+    # outside of the images
+    assert truth.clearance_fraction(np.array([9.0, 0.0])) == 0.0
+    far, near = (
+        site_row(SiteEstimate(SITE_REPORTED, np.array([x, x, 0.0])), make_flight(), truth) for x in (3.0, -3.0)
+    )
+    assert (far["site_far_from_hazards"], near["site_far_from_hazards"]) == (True, False)
+    # without a hazard every site is equally far
+    safe[0, 0] = True
+    assert np.isnan(replace(truth, footprints=replace(truth.footprints, safe=safe)).clearance_fraction(np.zeros(2)))
+
+
+@pytest.mark.parametrize(("map_scale", "fraction"), [(0.0, 1.0), (1.0, 0.0), (0.5, 0.5)])
+def test_relief_error_is_1_for_a_plane_and_0_for_an_exact_map(map_scale: float, fraction: float) -> None:
+    """The map contains a fraction of the relief, and an additional tilt that does not count."""
+    truth, flight = make_truth(25), make_flight()
+    start = flight.states[0].position_m
+    cells = ElevationMap(np.zeros((8, 8)), np.array([-3.5, 3.5]) - start[:2], 1.0)
+    rows, columns = np.indices((8, 8))
+    local = cells.positions(np.stack([rows, columns], axis=-1).astype(np.float64))
+    exact = truth.relief.average(start[:2] + local, 1.0) - start[2]
+    plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
+    elevation = replace(cells, elevation_m=map_scale * exact + plane)
+    zeros = np.zeros((8, 8))
+    hazards = HazardMaps(np.zeros((8, 8, 3)), zeros, zeros, zeros, zeros.astype(np.uint8))
+    ground = Ground(Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, hazards, np.zeros(2), None)
+    nothing = np.zeros_like(truth.covered)
+    sampled = SampledMap(nothing, nothing, nothing, np.zeros(nothing.shape))
+    row = map_errors(ground, flight, sampled, truth)
+    assert row["relief_error_fraction"] == pytest.approx(fraction, abs=1e-9)
+
+
+def test_answer_without_a_map_has_no_relief_error() -> None:
+    p = LandingScenarioParameters(site="heli-benign")
+    row = map_row(p, SiteEstimate(SITE_REPORTED, SAFE_SITE), make_flight(), make_truth(25))
+    assert list(row) == ["relief_error_fraction"]
+    assert np.isnan(float(row["relief_error_fraction"]))
 
 
 def test_matches_are_counted_by_outcome() -> None:
