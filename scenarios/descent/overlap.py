@@ -20,8 +20,8 @@ from marsyard.sim.dynamics import State
 
 #: Minimum width of the overlap, m: diameter of the largest circle in it.
 MIN_WIDTH_M = 110.0
-#: Radius of the bright spot around the anti-solar point, which is excluded: beyond it the opposition surge is smooth over
-#: a hundred metres. The paper excludes the spot and gives no radius; this one is assumed.
+#: Radius of the bright spot around the anti-solar point, which is excluded: beyond it the opposition surge is smooth
+#: over a hundred metres. The paper excludes the spot and gives no radius; this one is assumed.
 ZERO_PHASE_RADIUS_RAD = np.deg2rad(4.0)
 #: Ground at larger off-nadir angles is excluded: a pixel covers 15 times as much of it as at the nadir (assumed).
 MAX_OFF_NADIR_RAD = np.deg2rad(75.0)
@@ -43,7 +43,8 @@ def overlap_row(states: Sequence[State], world: World, camera: CameraModel) -> d
     """
     patch_samples = GROUND_PATCH_M / world.surface.spacing_m
     level = int(np.clip(np.rint(np.log2(max(patch_samples, 1.0))), 0, len(world.surface.levels) - 1))
-    ground_m = float(np.mean([world.surface.height(*state.position_m[:2], level) for state in states]))
+    heights = [world.surface.height(state.position_m[0], state.position_m[1], level) for state in states]
+    ground_m = float(np.mean(heights))
     first, second = (
         overlap_width_m(pair, camera, ground_m, np.asarray(world.sun.direction, dtype=np.float64))
         for pair in pairwise(states)
@@ -113,4 +114,4 @@ def _fill(polygon: Polygon, low: Float64[np.ndarray, "2"], shape: tuple[int, ...
     """Return a grid that is 1 inside a polygon and 0 outside."""
     # vertices in 1/16 of a cell
     vertices = np.rint(16.0 * (polygon - low) / _CELL_M).astype(np.int32)
-    return cv2.fillPoly(np.zeros(shape, dtype=np.uint8), [vertices], 1, shift=4)
+    return np.asarray(cv2.fillPoly(np.zeros(shape, dtype=np.uint8), [vertices], (1,), shift=4))

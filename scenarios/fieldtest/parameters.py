@@ -128,9 +128,7 @@ class TripleParameters(Parameters):
     ] = 3.75
     velocity_bias_m_s: Annotated[
         NonNegative,
-        Field(
-            description="SD per axis of the constant error of the horizontal inertial velocity; assumed: that of the wind"
-        ),
+        Field(description="SD per axis of the constant error of the horizontal inertial velocity (assumed: the wind)"),
     ] = 15.0
     max_speed_m_s: Annotated[
         Positive, Field(description="maximum speed: distance divided by the virtual interval, as in DIMES")

@@ -174,8 +174,8 @@ def measure(
     """Create an estimator's inputs: time tags at the virtual interval, and the calibrated camera (paper, III.D).
 
     The inertial velocities are the paper's truth velocities plus a constant horizontal error, drawn from `rng`: "biased
-    IMU velocities" (III.D.3), because an inertial unit measures changes of velocity, but does not know the wind. Without
-    the error the truth would be an input.
+    IMU velocities" (III.D.3), because an inertial unit measures changes of velocity, but does not know the wind.
+    Without the error the truth would be an input.
     """
     bias = np.append(p.triples.velocity_bias_m_s * rng.standard_normal(2), 0.0)
     tags = [number * p.triples.virtual_interval_s for number in range(len(images))]

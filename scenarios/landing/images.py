@@ -214,7 +214,9 @@ class GroundTruth:
         if not np.any(self.visible_hazards):
             return float("nan")
         distances = np.where(self.covered, distance_transform_edt(~self.visible_hazards), 0.0)
-        row, column = divmod(int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T))), distances.shape[1])
+        row, column = divmod(
+            int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T))), distances.shape[1]
+        )
         is_outside = np.hypot(*(self.positions[row, column] - position)) > self.step_m
         largest = float(distances.max())
         return 0.0 if is_outside or largest == 0.0 else float(distances[row, column]) / largest
@@ -355,9 +357,9 @@ def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: Groun
     The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean
     error, `rms` the RMS error, `median_error` the median absolute error. `noise` is the robust standard deviation of
     the errors about a fitted plane; it affects roughness. `relief_error_fraction` is `noise` divided by the same
-    deviation of the exact heights: it is 1 for a plane, which needs no images, and 0 for an exact map. `outliers` is the
-    fraction of errors about the plane beyond five times `noise`. The result is empty for fewer than four cells with an
-    elevation.
+    deviation of the exact heights: it is 1 for a plane, which needs no images, and 0 for an exact map. `outliers` is
+    the fraction of errors about the plane beyond five times `noise`. The result is empty for fewer than four cells with
+    an elevation.
     """
     rows, columns = np.indices(ground.elevation.elevation_m.shape)
     local = ground.elevation.positions(np.stack([rows, columns], axis=-1).astype(np.float64))

@@ -47,8 +47,10 @@ def test_new_campaign_is_valid(working_folder: Path, system: str, scenario: str,
     assert status == 0, output
     configuration = load_campaign("mine.toml").configuration
     assert (configuration.name, configuration.scenario, configuration.cases) == ("mine", scenario, 30)
-    (requirement,) = configuration.requirements
+    requirement, availability = configuration.requirements
     assert bound in (requirement.bound, requirement.probability)
+    # an algorithm that refuses every answer fails the second requirement
+    assert availability.metric in ("answered", "site_reported")
     # every dispersion has a source and every table a comment
     assert all(dispersion.source for dispersion in configuration.dispersions.values())
     lines = (working_folder / "mine.toml").read_text().splitlines()
@@ -73,10 +75,10 @@ def test_new_campaign_without_failures_passes(working_folder: Path) -> None:
     terrains = [campaign.draws(case)["location.terrain"] for case in range(230)]
     frame = pd.DataFrame({"case": range(230), "terrain": terrains, "answered": True, "velocity_error_m_s": 1.0})
     settings = campaign.configuration.model_dump(mode="json")
-    (verdict,) = evaluate_requirements(
+    verdicts = evaluate_requirements(
         frame.assign(outcome="VALID"), settings["requirements"], read_sampling_design(settings)
     )
-    assert (verdict.status, verdict.n, verdict.terrains) == (Status.PASS, 230, 230)
+    assert [(item.status, item.n, item.terrains) for item in verdicts] == 2 * [(Status.PASS, 230, 230)]
 
 
 def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) -> None:

@@ -1,6 +1,5 @@
 """Custom velocity estimators for tests of algorithm selection: they return the measured inertial velocity."""
 
-
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
