@@ -24,12 +24,16 @@ from marsyard.scenarios.interface import conditions_recorded_by
 from marsyard.scenarios.systems import catalogue, systems
 
 MODULE = "marsyard.algorithms.controls"
-#: Title of each control, by the name of its class. Controls of one line run on the same images. Those that answer are
-#: separate from those that fail, because the columns of a failure depend on the algorithm under test.
+#: Title of each control, by the name of its class. Controls of one line run on the same images, except in scenarios of
+#: `CLOSED_LOOP`. Those that answer are separate from those that fail, because the columns of a failure depend on the
+#: algorithm under test.
 ANSWERING = {"NoImage": "no image", "Refusal": "refusal", "Constant": "constant"}
 FAILING = {"NotANumber": "NaN", "Crash": "crash"}
 HANG = {"Hang": "hang"}
 TITLES: Mapping[str, str] = {**ANSWERING, **FAILING, **HANG}
+
+#: Scenarios in which the answers of an algorithm determine its images: each control runs as algorithm under test.
+CLOSED_LOOP = ("rover",)
 
 Row = dict[str, Any]
 
@@ -58,9 +62,9 @@ SETTINGS: Mapping[str, Settings] = {
     "vtt-checkout-3": Settings((0,)),
     "vtt-regression": Settings((0, 1)),
     "vtt-terrains": Settings((0, 1, 2)),
-    # targets of one drive, near the middle of the rock
+    # targets of one drive that stay in view
     "vtt-sideways": Settings((70, 71, 72)),
-    "vtt-straight": Settings((100, 102, 108)),
+    "vtt-straight": Settings((0, 2, 8)),
     "vtt-turn": Settings((45, 46, 54, 55)),
 }
 
@@ -72,7 +76,10 @@ def run_controls(campaign_name: str, settings: Settings) -> tuple[Campaign, dict
     outcome TIMED_OUT.
     """
     rows: dict[str, list[Row]] = {name: [] for name in TITLES}
-    for names in (tuple(ANSWERING), tuple(FAILING)):
+    groups: list[tuple[str, ...]] = [tuple(ANSWERING), tuple(FAILING)]
+    if load_campaign(campaign_name, settings.overrides).configuration.scenario in CLOSED_LOOP:
+        groups = [(name,) for names in groups for name in names]
+    for names in groups:
         specs = [f"{MODULE}:{name}" for name in names]
         campaign = load_campaign(campaign_name, settings.overrides, algorithms=specs)
         for case in settings.cases:
@@ -109,15 +116,19 @@ def find_failed_requirements(campaign: Campaign, frame: pd.DataFrame) -> tuple[l
 
 
 def measure_campaign(campaign_name: str, settings: Settings) -> Measure:
-    """Count the controls that fail no requirement of a campaign; a crash, hang or invalid answer may end with exit status 1."""
-    campaign, frames = run_controls(campaign_name, settings)
+    """Count the controls that fail no requirement of a campaign; those without an answer may end with exit status 1."""
+    return create_measure(*run_controls(campaign_name, settings))
+
+
+def create_measure(campaign: Campaign, frames: Mapping[str, pd.DataFrame]) -> Measure:
+    """Create the row of a campaign from the rows of each control."""
     cells, passing = [], 0
     for name, frame in frames.items():
         failed, exit_code = find_failed_requirements(campaign, frame)
         is_stopped = name not in ANSWERING and exit_code == 1
         passing += not failed and not is_stopped
         cells.append(", ".join(failed) or ("exit status 1" if is_stopped else "**none**"))
-    claim = f"`{campaign_name}`, {len(settings.cases)} cases"
+    claim = f"`{campaign.configuration.name}`, cases: {len(frames['Crash'])}"
     return Measure(claim, float(passing), "1", 0.0, " | ".join(cells))
 
 

@@ -146,9 +146,11 @@ def test_noise_campaign_has_bursts_in_each_run() -> None:
         "Kelso Run 1",
         "Ivanpah Run 1",
         "Ivanpah Run 2",
+        "Pisgah Run 1, intact cable",
     ]
     assert all(noise_parameters.run_detector(number).bursts.bursts == 10.0 for number in range(4))
     without_bursts = make_parameters()
+    assert noise_parameters.run_detector(4) == noise_parameters.detector
     assert without_bursts.run_detector(0) == without_bursts.detector
 
 
@@ -332,7 +334,10 @@ def test_case_is_answered_and_deterministic() -> None:
         runs=[make_parameters().runs[4].model_dump() | {"same_direction": 0, "opposite_direction": 0}]
     )
     compared_parameters = parameters.model_copy(
-        update={"compared": ("phase-correlation",), "scores": (f"{__name__}:score_inputs",)}
+        update={
+            "compared": ("phase-correlation", "marsyard.algorithms.controls:NoImage"),
+            "scores": (f"{__name__}:score_inputs",),
+        }
     )
     result = FieldTestScenario().run(compared_parameters, Streams(5, "test", 0))
     assert result.row["algorithm"] == "dimes"
@@ -344,6 +349,8 @@ def test_case_is_answered_and_deterministic() -> None:
     for label in ("", "phase_correlation."):
         assert result.row[f"{label}score_inputs_error_m_s"] == result.row[f"{label}velocity_error_m_s"]
     assert result.row["score_inputs_position_error_m"] == 0.0
+    # the inertial velocity has an unknown constant error of 15 m/s rms per axis: it does not contain the truth
+    assert 5.0 < float(result.row["NoImage.velocity_error_m_s"]) < 75.0
     repeated_result = FieldTestScenario().run(parameters, Streams(5, "test", 0))
     # Columns of run times, of the compared algorithm and of the score are not compared.
     excluded_columns = re.compile(r"time|\.|score_inputs")

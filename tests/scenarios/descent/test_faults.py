@@ -67,13 +67,13 @@ def test_disabled_faults_have_no_effect() -> None:
     assert add_terrain_fault(no_faults, terrain) == terrain
     assert add_detector_faults(no_faults, detector) == detector
     assert add_time_fault(no_faults, [0.0, 3.75, 7.5]) == [0.0, 3.75, 7.5]
-    assert no_faults.columns == {"fault": "none", "fault_size": 0.0}
+    assert no_faults.columns == {"fault": "none", "fault_size": 0.0, "fault_free": True}
 
 
 @pytest.mark.parametrize(("name", "field"), Faults.model_fields.items())
 def test_fault_name_and_size_are_reported(name: str, field: FieldInfo) -> None:
     size = 2 if field.annotation is int else 0.25
-    assert Faults.model_validate({name: size}).columns == {"fault": name, "fault_size": size}
+    assert Faults.model_validate({name: size}).columns == {"fault": name, "fault_size": size, "fault_free": False}
 
 
 def test_multiple_faults_have_no_size() -> None:
