@@ -55,7 +55,9 @@ SETTINGS: Mapping[str, Settings] = {
     "dimes-offnominal": Settings(overrides=("faults={}",)),
     "hda-faults": Settings((0, 4, 8, 12), ("faults={}",)),
     "hda-threshold": Settings((0, 1, 2, 3, 22)),
-    "loc-faults": Settings(overrides=("faults={}",)),
+    # each descent has a terrain of 178 MB
+    "loc-faults": Settings((0, 1), ("faults={}",)),
+    **{name: Settings((0, 1)) for name in ("loc-coarse", "loc-jezero", "loc-light", "loc-map-error", "loc-sensitivity")},
     # drives of many updates, of which one that fails is sufficient
     "vtt-checkout-1": Settings((0, 1)),
     "vtt-checkout-2": Settings((0, 1)),

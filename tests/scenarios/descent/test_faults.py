@@ -77,8 +77,8 @@ def test_fault_name_and_size_are_reported(name: str, field: FieldInfo) -> None:
 
 
 def test_multiple_faults_have_no_size() -> None:
-    name, size = Faults(haze=1.0, dust_discs=3).columns.values()
-    assert name == "several"
+    name, size, is_free = Faults(haze=1.0, dust_discs=3).columns.values()
+    assert (name, is_free) == ("several", False)
     assert np.isnan(size)
 
 
