@@ -149,6 +149,15 @@ def test_lost_target_is_not_a_valid_answer() -> None:
     assert result.row["losses"] == "LOW_MATCH_SCORE"
 
 
+def test_run_without_stops_remains_in_the_population_of_visible_targets() -> None:
+    """A tracker that never aims has lost sight of nothing: its run counts, as a failure."""
+    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:UnaimedTracker")
+    result = RoverScenario().run(parameters, make_streams())
+    assert not result.answered
+    assert (result.row["updates"], result.row["tracked"]) == (0, False)
+    assert result.row["point_in_view"]
+
+
 def test_missing_answer_is_a_tracker_error() -> None:
     parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:SilentTracker")
     result = RoverScenario().run(parameters, make_streams())

@@ -61,3 +61,11 @@ class SilentTracker(OffsetTracker):
     def update(self, measurements: RoverMeasurements) -> Any:
         """See `TargetTracker`."""
         self.paper_tracker.update(measurements)
+
+
+class UnaimedTracker(OffsetTracker):
+    """A tracker that never points the mast."""
+
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+        """Return no aim."""
+        return None
