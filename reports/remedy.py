@@ -10,8 +10,9 @@ from marsyard.reports.statistics.proportions import minimum_sample_size, proport
 from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import count
 
-#: Confidence of the lower bound of the fraction of the cases that belong to a population.
-_FRACTION_CONFIDENCE = 0.90
+#: Confidence of the lower bound of the fraction of the cases that belong to a population; high, so that the stated
+#: number of cases is sufficient.
+_FRACTION_CONFIDENCE = 0.99
 
 
 @dataclass(frozen=True)

@@ -60,8 +60,8 @@ def write_small_campaign(folder: Path, population: str, unanswered: range) -> Pa
     ("population", "unanswered", "needed", "appended"),
     [
         ("all", range(0), 273, 273),
-        # 24 of 24 answered: at least 0.1^(1/24) = 90.85 % of the cases have an answer, 273 / 0.9085 = 300.5
-        ("valid", range(24, 340, 14), 273, 301),
+        # 24 of 24 answered: at 99 % confidence at least 0.01^(1/24) = 82.5 % of the cases have one; 273 / 0.825 = 331
+        ("valid", range(24, 370, 14), 273, 331),
     ],
 )
 def test_printed_command_decides_the_campaign(
