@@ -77,7 +77,7 @@ def test_rate_decides_for_designs_without_independent_draws(
     assert (met_verdict.status, failed_verdict.status) == (Status.MET_BY_RATE, Status.FAIL)
     assert (met_verdict.n, met_verdict.failures, met_verdict.estimate) == (1000, 20, 0.98)
     assert math.isnan(met_verdict.lower)
-    assert met_verdict.note.startswith("Decided by the rate of these cases. No probability statement: ")
+    assert met_verdict.note.startswith("Evaluated by the observed rate of these cases. No probability statement: ")
     assert message in met_verdict.note
     assert compute_exit_code([met_verdict], crashed=False) == 3
     assert compute_exit_code([met_verdict, failed_verdict], crashed=False) == 1
