@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from marsyard.campaigns.definition.campaign import leaves
 from marsyard.reports import rates
 from marsyard.reports.rates import CONFIDENCE, success_mask
 from marsyard.reports.sampling_design import read_sampling_design
@@ -309,9 +310,15 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[M
 
 def have_same_draws(first: StoredRun, second: StoredRun) -> bool:
     """Whether equal case numbers are the same case in both campaigns."""
-    return all(
-        first.recorded(key) == second.recorded(key) for key in ("name", "scenario", "seed", "dispersions", "design")
+    keys = ("name", "scenario", "seed", "dispersions", "design")
+    return _bank_seeds(first) == _bank_seeds(second) and all(
+        first.recorded(key) == second.recorded(key) for key in keys
     )
+
+
+def _bank_seeds(run: StoredRun) -> dict[str, Any]:
+    """Return the seeds of the terrain banks by parameter path; terrains with other seeds are different terrains."""
+    return {path: value for path, value in leaves(table(run.recorded("parameters"))) if path.endswith("bank_seed")}
 
 
 def have_same_terrains(first: StoredRun, second: StoredRun) -> bool:

@@ -47,6 +47,13 @@ def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, ma
     assert comparisons["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
 
+def test_terrains_of_different_banks_are_not_paired(make_rows: Rows, make_run: MakeRun) -> None:
+    banks = [{"parameters": {"location": {"bank_seed": seed}}} for seed in (1, 2)]
+    runs = [make_run(make_rows(100), name=f"run-{seed}", configuration=bank) for seed, bank in enumerate(banks)]
+    assert not _compare(*runs)[0]
+    assert _compare(runs[0], runs[0])[0]
+
+
 def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
     first = make_run(make_rows(300))
     is_paired, comparisons = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
