@@ -276,7 +276,8 @@ def collect_evidence(
 
     has_own_terrains: whether no other confirmation uses the terrains
     """
-    frame, verdict = sampling.exclude_nominal_case(frame), _empty_verdict(requirement)
+    verdict = _empty_verdict(requirement)
+    frame = _complete_columns(sampling.exclude_nominal_case(frame), verdict)
     if _describe_problem(frame, verdict):
         return None
     try:
@@ -312,6 +313,7 @@ def _evaluate(
     earlier: RequirementEvidence | None = None,
 ) -> Verdict:
     verdict = _empty_verdict(requirement)
+    frame = _complete_columns(frame, verdict)
     problem = _describe_problem(frame, verdict)
     if problem:
         return replace(verdict, reason=problem)
@@ -414,6 +416,15 @@ def compare_bounds(lower: float, upper: float, probability: float) -> Status:
     if lower >= probability:
         return Status.PASS
     return Status.FAIL if upper < probability else Status.INSUFFICIENT
+
+
+def _complete_columns(frame: pd.DataFrame, verdict: Verdict) -> pd.DataFrame:
+    """Add the columns of a requirement that are missing because no case finished; their values are missing."""
+    if frame.empty or not rates.engine_failed(frame).all():
+        return frame
+    flags = [name for name in verdict.population.split(" and ") if name not in ("all", "completed", "valid")]
+    missing = [name for name in (*verdict.metric.split(" + "), *flags) if name not in frame]
+    return frame.assign(**dict.fromkeys(missing, pd.NA)) if missing else frame
 
 
 def _describe_problem(frame: pd.DataFrame, verdict: Verdict) -> str:

@@ -309,6 +309,14 @@ def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[st
     assert verdict.consumer_risk == pytest.approx(0.99**230)
 
 
+@pytest.mark.parametrize("changes", [{"metric": "velocity_error_m_s"}, {"metric": "site_safe", "bound": None}])
+def test_campaign_without_a_finished_case_fails(velocity: dict[str, Any], changes: dict[str, Any]) -> None:
+    """The columns of metric and population are missing if every case crashed; that is no reason for INSUFFICIENT."""
+    frame = _make_rows(30, 0).assign(outcome="CRASHED", answered=False).drop(columns="velocity_error_m_s")
+    verdict = _evaluate(frame, velocity | changes, population="selectable")
+    assert (verdict.status, verdict.failures) == (Status.FAIL, 30)
+
+
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
     assert "answered" in _evaluate(_make_rows(5, 0).drop(columns="answered"), velocity).note
 
