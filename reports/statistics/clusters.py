@@ -147,7 +147,7 @@ def _max_rate(sizes: Sizes, statistic: int, risk: float) -> float:
 
     tail, rate = TailFunction(sizes, statistic), lower
     for _ in range(_MAX_STEPS):
-        probability, pair = _least_favourable(sizes, statistic, rate)
+        probability, pair = _find_supremum(sizes, statistic, rate)
         if probability <= risk * (1.0 + _TOLERANCE):
             break
         # the rate with this p-value for the same pair; the least favourable pair there has a larger p-value
@@ -183,11 +183,11 @@ def _max_tail(sizes: Sizes, statistic: int, rate: float) -> float:
         return math.pow(1.0 - rate, terrains)
     if sizes == ((1, terrains),):
         return float(stats.binom.cdf(statistic, terrains, rate))
-    return _least_favourable(sizes, statistic, rate)[0]
+    return _find_supremum(sizes, statistic, rate)[0]
 
 
 @lru_cache(maxsize=16384)
-def _least_favourable(sizes: Sizes, statistic: int, rate: float) -> tuple[float, Pair]:
+def _find_supremum(sizes: Sizes, statistic: int, rate: float) -> tuple[float, Pair]:
     """Find the largest P(S <= statistic) of the distributions with two support points; return it with the points."""
     tail = TailFunction(sizes, statistic)
     grid = min(_MAX_GRID, max(_MIN_GRID, math.isqrt(_MAX_BATCH // tail.nodes.size)))

@@ -151,7 +151,7 @@ def test_appended_cases_are_announced_in_the_record(
     (entry,) = read_confirmations(tmp_path / RECORD)
     assert (entry.cases, entry.counted_cases, entry.first_cases) == (20, 20, 10)
     (counts,) = entry.counts.values()
-    assert counts["terrains"] == [[0, 0, 1, 1, 10], [1, 0, 0, 0, 10]]
+    assert counts["terrains"] == [[0, 0, 0, 0, 1, 0, 10], [1, 0, 0, 0, 0, 0, 10]]
     # a copy of the folder before the appended cases is not the confirmation
     output = marsyard("report", "copy")
     reason = "The record announces 20 cases of confirmation 1; this folder contains 10."

@@ -55,7 +55,8 @@ def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
     assert run_command("ingest", str(folder), "--out", str(tmp_path / "out"))[0] == 0
     path = tmp_path / "out" / "campaign.toml"
     tables = tomllib.loads(path.read_text())
-    (requirement,) = tables["requirements"]
+    requirement, availability = tables["requirements"]
+    assert availability["metric"] == "answered"
     # images of 1024 x 256 pixels with four summed rows are binned to square pixels
     assert tables["parameters"]["dimes"]["binned_size"] == [256, 256]
     assert (requirement["decide_by"], requirement["population"]) == ("estimate", "valid and truth_known")

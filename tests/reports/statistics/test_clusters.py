@@ -93,7 +93,7 @@ def test_single_cases_have_clopper_pearson_bounds(events: int) -> None:
     [(DESIGNS["8 x 3"], 0.4), (DESIGNS["250 x 4"], 0.01), (DESIGNS["unequal"], 0.05), (((10, 60),), 0.1),
      (((8, 67),), 0.3), (((5, 46),), 0.3), (((1, 30), (12, 5)), 0.6)],
 )  # fmt: skip
-def test_no_distribution_exceeds_the_least_favourable_one(sizes: Sizes, rate: float) -> None:
+def test_no_distribution_exceeds_the_supremum(sizes: Sizes, rate: float) -> None:
     """Random distributions with five support points, and a fine grid of those with two, have no larger probability."""
     statistic = max_statistic(sizes, rate, 0.1)
     supremum = TerrainCounts(sizes, statistic).p_value(rate)
