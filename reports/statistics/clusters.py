@@ -41,7 +41,7 @@ _MIN_MEMBER_RATE = 0.01
 #: Maximum number of values of one batch of distributions, and limits of the number of support points per axis.
 _MAX_BATCH, _MIN_GRID, _MAX_GRID = 2**16, 8, 18
 #: Number of cases on a terrain up to which the squares of numbers of events are not rounded.
-_MAX_SQUARED = 32
+_MAX_SQUARED = 16
 #: Factor of suppression of unresolved coefficients of a generating function; the rounding error is 1e-16 / this.
 _ALIASING = 1e-10
 #: Range of the logits of support points in the search, number of its refinements, and of refined local maxima.
@@ -104,7 +104,7 @@ def count_sizes(cases_on_terrain: Int[np.ndarray, " terrains"]) -> Sizes:
 def event_scores(sizes: Sizes) -> Int[np.ndarray, " _"]:
     """Return the score of 0 to n events on a terrain, for the largest number of cases n.
 
-    It is k^2 for k events if n is at most 32, otherwise k^2 in units of (n / 32)^2, rounded up.
+    It is k^2 for k events if n is at most 16, otherwise k^2 in units of (n / 16)^2, rounded up.
     """
     largest = max(cases for cases, _ in sizes)
     events = np.arange(largest + 1, dtype=np.int64)
@@ -255,11 +255,12 @@ class TailFunction:
         self._weights = (1.0 - ratios**length) / (1.0 - ratios) / count
         self._weights[1:-1] *= 2.0
         self._sizes = sizes
-        # node^score for each size, by the number of events
-        self._factors = []
+        # for each size: numbers of events at which the score changes, and node^score there
+        self._starts, self._factors = [], []
         for cases, _ in sizes:
-            scores = event_scores(sizes)[: cases + 1]
+            scores, starts = np.unique(event_scores(sizes)[: cases + 1], return_index=True)
             scores = scores[-1] - scores if self._is_complement else scores
+            self._starts.append(starts)
             self._factors.append(self.nodes ** scores[:, None])
 
     def of_pairs(
@@ -283,7 +284,9 @@ class TailFunction:
     def _terrain(self, index: int, rates: Float64[np.ndarray, " m"]) -> Complex128[np.ndarray, "m nodes"]:
         """Evaluate the generating function of the score of one terrain, for each rate."""
         cases = self._sizes[index][0]
-        probabilities = stats.binom.pmf(np.arange(cases + 1), cases, rates[:, None])
+        probabilities = np.add.reduceat(
+            stats.binom.pmf(np.arange(cases + 1), cases, rates[:, None]), self._starts[index], axis=1
+        )
         # without BLAS, whose threads cost more than such small products
         return np.asarray(np.einsum("ij,jk->ik", probabilities, self._factors[index]))
 

@@ -64,6 +64,15 @@ def test_tail_equals_enumeration(statistic: int) -> None:
     assert TailFunction(sizes, statistic).of_distribution(rates, weights) == pytest.approx(expected, abs=1e-9)
 
 
+def test_tail_with_rounded_scores_equals_enumeration() -> None:
+    sizes, rates, weights = ((20, 2),), np.array([0.1, 0.6]), np.array([0.7, 0.3])
+    pmf = weights @ stats.binom.pmf(np.arange(21), 20, rates[:, None])
+    scores = event_scores(sizes)
+    for statistic in (3, 40, 300):
+        expected = pmf @ (np.add.outer(scores, scores) <= statistic) @ pmf
+        assert TailFunction(sizes, statistic).of_distribution(rates, weights) == pytest.approx(expected, abs=1e-9)
+
+
 def test_pairs_of_support_points_have_the_mean() -> None:
     sizes, low, high, mean = ((2, 3), (4, 2)), np.array([0.0, 0.1]), np.array([0.3, 1.0]), 0.2
     tail = TailFunction(sizes, 7)
@@ -227,10 +236,10 @@ def test_terrains_are_numbered_consecutively() -> None:
 
 def test_scores_are_squares_or_rounded_up() -> None:
     assert event_scores(((2, 5), (4, 1))).tolist() == [0, 1, 4, 9, 16]
-    scores = event_scores(((64, 3),))
+    scores = event_scores(((32, 3),))
     # in units of 4: 1 / 4 and 4 / 4 are 1, 9 / 4 is 3
     assert scores[:4].tolist() == [0, 1, 1, 3]
-    assert scores[-1] == 32**2
+    assert scores[-1] == 16**2
     assert (np.diff(scores) >= 0).all()
 
 
