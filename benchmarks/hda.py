@@ -27,10 +27,12 @@ from marsyard.sim.measurements import DetectorCalibration, DetectorImage, Landin
 
 #: Sony XC-55 that looks down: focal length 6 mm, pixel pitch 7.4 um.
 CAMERA = Cahv.from_focal_length(0.006, 7.4e-6, (640, 480), axis=(0.0, 0.0, -1.0), right=(0.0, -1.0, 0.0))
+#: Half width of the windows of Table I of the landing paper.
+WINDOW_HALF_PX = 40
 #: As in the landing paper: blocks of 73 px give about 59 tracks, a grid of 20 px gives 600 points.
-PAPER = HdaOptions(block_px=73, grid_px=20)
+PAPER = HdaOptions(block_px=73, window_half_px=WINDOW_HALF_PX, grid_px=20)
 #: Grid of 160 x 120 structure points.
-DENSE = HdaOptions(grid_px=4)
+DENSE = HdaOptions(window_half_px=WINDOW_HALF_PX, grid_px=4)
 #: Size of a texture sample on the ground, metres.
 TEXEL_M = 0.005
 
@@ -91,7 +93,7 @@ def measure_stages(measurements: LandingMeasurements, repeats: int) -> list[Meas
 
     def track() -> None:
         features = select_features(first, PAPER)
-        track_features(first, second, features, expected_pixels(scene, features, PAPER), PAPER)
+        track_features(first, second, features, expected_pixels(scene, features, PAPER), WINDOW_HALF_PX, PAPER)
 
     def estimate_motion() -> None:
         scale_factor(scene.views, motion_from_tracks(scene, tracks, PAPER), points, scene.range_m, PAPER)

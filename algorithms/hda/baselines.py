@@ -195,7 +195,8 @@ def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptio
     first, second = scene.views
     bounds = structure.depth_bounds(motion.depth_range_m, options.depth_margin)
     border = options.search_half_px + 1
-    pixels = structure.pixel_lattice(first.camera.size, options.grid_px, border)
+    spacing = structure.grid_spacing_px(first, motion.depth_range_m, options)
+    pixels = structure.pixel_lattice(first.camera.size, spacing, border)
     coordinates = undistort(first.camera, pixels)
     starts, ends, valid = structure.epipolar_segments(second, motion.second_from_first, coordinates, bounds, border)
     pixels, coordinates, starts, ends = pixels[valid], coordinates[valid], starts[valid], ends[valid]

@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import final
 
 import numpy as np
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
 from marsyard.algorithms.hda import hazards
@@ -22,18 +22,19 @@ from marsyard.algorithms.hda.details import Ground, HdaDetails
 from marsyard.algorithms.hda.motion import (
     LandingScene,
     Motion,
+    MotionStart,
     View,
     build_scene,
     estimate_motion,
     plane_depths,
     points_at_depth,
+    range_starts,
     undistort,
 )
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame, TrackSeed
 from marsyard.algorithms.hda.structure import Matches, dense_structure, scale_factor
-from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features
+from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features, window_half_px
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements
 
 #: Function that estimates the camera motion from accepted tracks; None without a solution.
@@ -71,7 +72,12 @@ def find_site(
     if len(features) < options.min_tracks:
         return _report_failure(SiteOutcome.NO_FEATURES, scene, details)
     tracks = track_features(
-        scene.views[0].counts, scene.views[1].counts, features, expected_pixels(scene, features, options), options
+        scene.views[0].counts,
+        scene.views[1].counts,
+        features,
+        expected_pixels(scene, features, options),
+        window_half_px(scene.views[0], options),
+        options,
     )
     details = details.end_stage(tracks=tracks)
     if np.count_nonzero(tracks.accepted) < options.min_tracks:
@@ -117,12 +123,19 @@ def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions)
 
 
 def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
-    """Solve for the motion by robust least squares, starting from the on-board poses and from zero motion."""
+    """Solve for the motion by robust least squares.
+
+    The published algorithm starts from the slant range alone (section II.B: "the altimetry measurement is used to set
+    the initial depths"). With a start from the poses (option `track_seed`), the motion between the on-board poses, with
+    the depths of level ground, is an additional start.
+    """
     track_pixels = (tracks.first[tracks.accepted], tracks.second[tracks.accepted])
     first, second = (undistort(view.camera, pixels) for view, pixels in zip(scene.views, track_pixels, strict=True))
-    depths = plane_depths(first, scene.range_m, scene.up_camera)
-    initial_motions: tuple[RigidTransform, ...] = (scene.second_from_first, rigid(Rotation.identity(), np.zeros(3)))
-    return estimate_motion(first, second, scene.views[1].focal_px, depths, initial_motions, options)
+    starts = range_starts(first, scene.range_m)
+    if options.track_seed is TrackSeed.POSE:
+        level_depths = plane_depths(first, scene.range_m, scene.up_camera)
+        starts = (MotionStart(scene.second_from_first, level_depths), *starts)
+    return estimate_motion(first, second, scene.views[1].focal_px, starts, options)
 
 
 def check_motion(motion: Motion | None, options: HdaOptions) -> SiteOutcome | None:
@@ -206,6 +219,8 @@ def map_ground(
     elevation = hazards.elevation_map(points)
     if elevation is None:
         return None
+    # no hazard at the lander's limit fits into a filled hole
+    elevation = hazards.fill_small_holes(elevation, options.narrowest_hazard * options.max_roughness_m)
     maps = hazards.hazard_maps(elevation, options)
     if options.check_footprints:
         maps = replace(maps, safety=hazards.check_footprints(maps.safety, elevation, resolution, options))

@@ -5,7 +5,7 @@ Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import cv2
@@ -63,6 +63,49 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     sums, weights = kernels.accumulate_bilinear(row, column, points[:, 2], (rows, columns))
     values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
     return ElevationMap(values, corner, cell)
+
+
+def fill_small_holes(ground: ElevationMap, width_m: float) -> ElevationMap:
+    """Fill the holes of an elevation map that are too small for a disc of the diameter `width_m`; return the new map.
+
+    The elevation of a cell is interpolated along its row and its column between the nearest known cells, and the two
+    values are averaged with the inverse distances between these cells as weights (section II.D: "bilinear interpolation
+    of point elevation is used to deal with the uneven sampling"). Ground outside the map is unknown: cells with known
+    cells on one side only are not filled.
+    """
+    holes = np.isnan(ground.elevation_m)
+    # a hole of n cells contains a cell at the distance (n + 1) / 2 from the nearest known cell
+    radius_cells = 0.5 * (width_m / ground.cell_m + 1.0)
+    margin = int(np.ceil(2.0 * radius_cells)) + 1
+    padded = np.pad(holes, margin, constant_values=True)
+    # morphological opening: the parts of holes that a disc of this diameter covers
+    wide = _dilate(grassfire(~padded) >= radius_cells, radius_cells - 0.5)[margin:-margin, margin:-margin]
+    sums, weights = np.zeros(holes.shape), np.zeros(holes.shape)
+    for values, axis_sums, axis_weights in (
+        (ground.elevation_m, sums, weights),
+        (ground.elevation_m.T, sums.T, weights.T),
+    ):
+        value, gap = _interpolate_rows(values)
+        is_known = np.isfinite(value)
+        axis_sums += np.where(is_known, value, 0.0) / gap
+        axis_weights += is_known / gap
+    filled = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights > 0.0)
+    return replace(ground, elevation_m=np.where(holes & ~wide, filled, ground.elevation_m))
+
+
+def _interpolate_rows(values: Raster) -> tuple[Raster, Raster]:
+    """Interpolate the NaN values of each row linearly; also return the distance between the cells used, at least 1.
+
+    The result is NaN if a row has no known cell on one side.
+    """
+    columns = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    known = np.isfinite(values)
+    left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    right = np.minimum.accumulate(np.where(known, columns, values.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    inside = (left >= 0) & (right < values.shape[1])
+    low, high = (np.take_along_axis(values, np.where(inside, index, 0), axis=1) for index in (left, right))
+    gap = np.maximum(right - left, 1).astype(np.float64)
+    return np.where(inside, low + (high - low) * (columns - left) / gap, np.nan), gap
 
 
 #: Minimum side of the squares for plane fits, cells; a least-median-of-squares fit requires more than a few points.

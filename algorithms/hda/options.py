@@ -25,10 +25,10 @@ class SurfaceFrame(Choice):
 
 
 class TrackSeed(Choice):
-    """Start of the search for a feature in the second image.
+    """Start of the search for a feature in the second image, and of the motion estimation.
 
-    Its position in the first image (as in the paper), or its position according to the on-board poses if the ground is
-    level at the measured range.
+    Unchanged: the position in the first image, and zero motion ("no knowledge of the motion between frames is assumed",
+    section II.A). Poses: the position of level ground at the measured range, and the motion, by the on-board poses.
     """
 
     NOTHING = "unchanged"
@@ -43,7 +43,13 @@ class HdaOptions:
 
     - template_half_px: Half width t of the sparse tracker's templates and of the interest window: 2 t + 1 pixels (Table
       I: 11 x 11)
-    - window_half_px: Half width w of the search window of a feature (Table I: 81 x 81)
+    - window_half_px: Half width w of the search window of a feature. None: the expected displacement of the features
+      (section II.A), which the limits of the image pairs and the camera determine
+      (`marsyard.algorithms.hda.tracking.expected_shift_px`). The example of Table I, 81 x 81 px, is 40.
+    - max_baseline_fraction: Limit of the image pairs: baseline divided by range
+    - max_tilt_change_rad, max_roll_change_rad, max_height_change_fraction: Limits of the image pairs: rotation about an
+      axis in the image plane and about the optical axis, and change of height divided by height. The defaults are those
+      at which the tracker works (section II.A).
     - block_px: Side of the blocks; the best feature of each block is used. 64 px give 80 blocks in 640 x 480 pixels,
       and 50 to 70 tracks; the paper had 59.
     - min_eigenvalue: Minimum eigenvalue lambda_t of Eq. 2, for the mean over the template instead of the sum, squared
@@ -53,7 +59,7 @@ class HdaOptions:
     - min_aligned_correlation: Minimum correlation of the aligned track with the warped template. Over 25 rendered pairs
       at the paper's limits, 99 % of the correct tracks of each pair have at least 0.91. Two thirds of the wrong tracks,
       most of which left the image, have less than 0.88.
-    - track_seed: Start of the search for a feature in the second image
+    - track_seed: Start of the search for a feature in the second image, and of the motion estimation
     - align: Whether Gauss-Newton alignment with an affine warp follows the biquadratic fit of the paper. The fit has a
       bias towards whole pixels of up to 0.09 px and neglects rotation and scale. A track that cannot be aligned is
       rejected: over rocks, at small changes of the view, only 6 of 276 such tracks were correct. Of 1,199 aligned
@@ -66,6 +72,9 @@ class HdaOptions:
       depth errors exceed 5 % at a smaller shift.
     - depth_margin: Relative margin added to the features' depth range (section II.C: 0.2 to 0.4)
     - grid_px: Spacing of the grid of pixels that are matched for structure
+    - refine_grid: Whether the spacing is reduced until the grid resolves the narrowest hazard
+      (`marsyard.algorithms.hda.structure.grid_spacing_px`). Section II.C: "it could be set automatically based on the
+      size of the helicopter (or lander) and the pixel resolution".
     - search_half_px: Half width of the windows compared along epipolar segments, pixels
     - min_match_correlation: Minimum correlation (Eq. 3) of a structure match
     - max_forward_backward_px: Maximum forward-backward error, pixels: each structure match is matched back from the
@@ -95,7 +104,11 @@ class HdaOptions:
     """
 
     template_half_px: int = 5
-    window_half_px: int = 40
+    window_half_px: int | None = None
+    max_baseline_fraction: float = 0.2
+    max_tilt_change_rad: float = float(np.deg2rad(20.0))
+    max_roll_change_rad: float = float(np.deg2rad(10.0))
+    max_height_change_fraction: float = 0.2
     block_px: int = 64
     min_eigenvalue: float = 1.0
     min_track_correlation: float = 0.6
@@ -109,6 +122,7 @@ class HdaOptions:
     min_parallax_px: float = 2.0
     depth_margin: float = 0.3
     grid_px: int = 8
+    refine_grid: bool = False
     search_half_px: int = 5
     min_match_correlation: float = 0.7
     max_forward_backward_px: float | None = None
@@ -130,15 +144,18 @@ class HdaOptions:
 
     def __post_init__(self) -> None:
         for name, minimum in ((name, minimum) for minimum, names in _NAMES_BY_MINIMUM.items() for name in names):
-            if not getattr(self, name) >= minimum:
+            if getattr(self, name) is not None and not getattr(self, name) >= minimum:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be at least {minimum}")
         for name in _POSITIVE_NAMES:
             if getattr(self, name) is not None and not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} is {getattr(self, name)}; it must be positive")
         if not self.max_slope_rad < np.pi / 2:
             raise ValueError(f"max_slope_rad is {self.max_slope_rad}; it must be below pi/2")
-        if not self.depth_margin < 1.0:
-            raise ValueError(f"depth_margin is {self.depth_margin}; it must be below 1")
+        for name in ("depth_margin", "max_height_change_fraction"):
+            if not getattr(self, name) < 1.0:
+                raise ValueError(f"{name} is {getattr(self, name)}; it must be below 1")
+        if not self.max_tilt_change_rad < np.pi / 2:
+            raise ValueError(f"max_tilt_change_rad is {self.max_tilt_change_rad}; it must be below pi/2")
 
 
 #: Names of the options by their minimum value.
@@ -146,6 +163,7 @@ _NAMES_BY_MINIMUM = {
     0: (
         *("depth_margin", "hazard_growth", "unknown_growth", "margin_deviations"),
         *("match_error_px", "level_error_rad", "seed"),
+        *("max_baseline_fraction", "max_tilt_change_rad", "max_roll_change_rad", "max_height_change_fraction"),
     ),
     1: ("grid_px", "search_half_px", "plane_trials"),
     2: ("template_half_px", "window_half_px", "block_px"),
@@ -165,6 +183,7 @@ IMPROVEMENTS: Mapping[str, Any] = MappingProxyType(
         "track_seed": TrackSeed.POSE,
         "align": True,
         "max_forward_backward_px": 1.5,
+        "refine_grid": True,
         "refine_planes": True,
         "check_footprints": True,
     }

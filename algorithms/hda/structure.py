@@ -63,6 +63,20 @@ def depth_bounds(depth_range_m: tuple[float, float], margin: float) -> tuple[flo
     return (1.0 - margin) * depth_range_m[0], (1.0 + margin) * depth_range_m[1]
 
 
+#: Minimum number of grid points along the width of the narrowest hazard (option `refine_grid`): a map cell is then at
+#: most a sixth of this width, and its averages reduce the height of the hazard by less than a tenth.
+GRID_POINTS_PER_HAZARD = 6
+
+
+def grid_spacing_px(view: View, depth_range_m: tuple[float, float], options: HdaOptions) -> int:
+    """Spacing of the grid, pixels: `grid_px`, or less if `refine_grid` requires it at the mean of the depth range."""
+    if not options.refine_grid:
+        return options.grid_px
+    width_m = options.narrowest_hazard * options.max_roughness_m
+    resolving = int(view.focal_px * width_m / (GRID_POINTS_PER_HAZARD * 0.5 * sum(depth_range_m)))
+    return max(min(options.grid_px, resolving), 1)
+
+
 def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Points2:
     """Pixels (u, v) of a centred grid over an image of size (columns, rows), inside the border."""
     axes = []
@@ -185,7 +199,8 @@ def dense_structure(
     views: Views, second_from_first: RigidTransform, depth_range_m: tuple[float, float], options: HdaOptions
 ) -> Matches:
     """Match a grid of pixels within the widened depth range of the features."""
-    pixels = pixel_lattice(views[0].camera.size, options.grid_px, options.search_half_px + 1)
+    spacing = grid_spacing_px(views[0], depth_range_m, options)
+    pixels = pixel_lattice(views[0].camera.size, spacing, options.search_half_px + 1)
     return match_pixels(views, second_from_first, pixels, depth_bounds(depth_range_m, options.depth_margin), options)
 
 

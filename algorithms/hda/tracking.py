@@ -12,7 +12,8 @@ from jaxtyping import Float, Int
 
 from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Vector, Vector2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.motion import View
+from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
 from marsyard.algorithms.image.correlation import halve
 from marsyard.algorithms.image.interest import structure_tensor
 from marsyard.algorithms.image.registration import Limits, register_template
@@ -30,25 +31,48 @@ class LevelSize:
     window_half: int
 
 
-def level_sizes(template_half: int, window_half: int) -> tuple[LevelSize, ...]:
-    """Compute the sizes at each pyramid level, finest level first (Eqs. 4 and 5).
+def level_sizes(template_half: int, window_half: int, size: tuple[int, int]) -> tuple[LevelSize, ...]:
+    """Compute the sizes at each pyramid level, finest level first (Eqs. 4 and 5), for images of size (columns, rows).
 
     The w of Eq. 4 is assumed to be the half width of Eq. 5. With n = log2(w) - 2 levels, rounded down, the coarsest
-    window has a half width of 4 to 8.
+    window has a half width of 4 to 8. Levels whose image is smaller than the template are omitted.
     """
-    coarsest = max(int(np.log2(window_half)) - 2, 0)
-    sizes = []
-    for level in range(coarsest + 1):
-        template = max(MIN_HALF_PX, int(template_half / 2**level + 0.5))
-        window = max(MIN_HALF_PX, int(window_half / 2**level + 0.5)) if level == coarsest else MIN_HALF_PX
-        sizes.append(LevelSize(template, window))
-    return tuple(sizes)
+    levels = max(int(np.log2(window_half)) - 2, 0)
+    templates = [max(MIN_HALF_PX, int(template_half / 2**level + 0.5)) for level in range(levels + 1)]
+    fits = [2 * template + 1 <= min(size) >> level for level, template in enumerate(templates)]
+    coarsest = max(level for level in range(levels + 1) if level == 0 or all(fits[: level + 1]))
+    windows = [MIN_HALF_PX] * coarsest + [max(MIN_HALF_PX, int(window_half / 2**coarsest + 0.5))]
+    return tuple(LevelSize(template, window) for template, window in zip(templates, windows, strict=False))
 
 
 def feature_border_px(options: HdaOptions) -> int:
-    """Minimum distance of features from the image border, pixels: templates fit at all levels with a 1 px margin."""
-    sizes = level_sizes(options.template_half_px, options.window_half_px)
-    return max((size.template_half + 1) << level for level, size in enumerate(sizes))
+    """Minimum distance of features from the image border, pixels: the template fits with a margin of 1 px."""
+    return options.template_half_px + 1
+
+
+def expected_shift_px(view: View, options: HdaOptions) -> int:
+    """Largest expected displacement of a feature from the start of its search, whole pixels: w of Eqs. 4 and 5.
+
+    It is the displacement of level ground on the optical axis by translation and tilt, plus that of an image corner by
+    rotation about the optical axis and by the magnification of a descent; at most the longer side of the image.
+    A start from the poses (option `track_seed`) leaves the parallax of ground that is higher than level ground by the
+    fraction `depth_margin` of the range.
+    """
+    columns, rows = view.camera.size
+    if options.track_seed is TrackSeed.POSE:
+        nearest = 1.0 / (1.0 - options.depth_margin)
+        shift_px = view.focal_px * options.max_baseline_fraction * (nearest - 1.0)
+    else:
+        magnification = 1.0 / (1.0 - options.max_height_change_fraction)
+        axis_px = view.focal_px * (magnification * options.max_baseline_fraction + np.tan(options.max_tilt_change_rad))
+        corner = magnification - 1.0 + 2.0 * np.sin(0.5 * options.max_roll_change_rad)
+        shift_px = float(axis_px + 0.5 * np.hypot(columns, rows) * corner)
+    return int(np.clip(np.ceil(shift_px), MIN_HALF_PX, max(columns, rows)))
+
+
+def window_half_px(view: View, options: HdaOptions) -> int:
+    """Half width of the search window: the option of this name, by default the expected displacement."""
+    return expected_shift_px(view, options) if options.window_half_px is None else options.window_half_px
 
 
 def pyramid(counts: Counts, levels: int) -> tuple[Float[np.ndarray, "_ _"], ...]:
@@ -112,14 +136,16 @@ class Tracks:
 
 
 def track_features(
-    first: Counts, second: Counts, features: Points2, expected_pixels: Points2, options: HdaOptions
+    first: Counts, second: Counts, features: Points2, expected_pixels: Points2, window_half: int, options: HdaOptions
 ) -> Tracks:
     """Track features by correlation, coarse to fine, within the window around their expected pixels (u, v).
 
-    Twice the best shift of a level is the start of the search at the next finer level. The result is the biquadratic
-    peak of the correlations around the best pixel; with `align` it is refined by registration.
+    The window has the half width `window_half`, pixels. Twice the best shift of a level is the start of the search at
+    the next finer level. A template that leaves the first image at a coarse level is moved to the nearest position
+    inside: neighbouring ground has nearly the same displacement, and the finer levels search the rest. The result is
+    the biquadratic peak of the correlations around the best pixel; with `align` it is refined by registration.
     """
-    sizes = level_sizes(options.template_half_px, options.window_half_px)
+    sizes = level_sizes(options.template_half_px, window_half, (first.shape[1], first.shape[0]))
     first_levels, second_levels = (pyramid(counts, len(sizes)) for counts in (first, second))
     pixels = np.rint(features[:, ::-1]).astype(np.int64)
     max_shift = float(max(first.shape))
@@ -127,8 +153,10 @@ def track_features(
     shifts = np.rint(expected_shifts / 2 ** (len(sizes) - 1)).astype(np.int64)
     for level in range(len(sizes) - 1, -1, -1):
         size = sizes[level]
+        last = np.array(first_levels[level].shape) - 1 - size.template_half
+        positions = np.clip(pixels >> level, size.template_half, last)
         shifts, _ = matching.find_best_shifts(
-            first_levels[level], second_levels[level], pixels >> level, shifts, size.template_half, size.window_half
+            first_levels[level], second_levels[level], positions, shifts, size.template_half, size.window_half
         )
         shifts = 2 * shifts if level else shifts
     second_pixels, correlations = matching.refine_positions(

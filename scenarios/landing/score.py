@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.hda import STAGES, HdaDetails, MatchStatus, hda_products
+from marsyard.algorithms.hda import STAGES, HdaDetails, MatchStatus, Safety, hda_products
 from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import contrast_columns, ground_columns, optics_columns, sun_columns
@@ -45,7 +45,7 @@ MOTION_COLUMNS = (
     "inliers",
     "parallax_px", "rotation_error_deg", "direction_error_deg", "length_error_m", "baseline_error_fraction",
     "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
-    "matches_dissimilar", "matches_out_of_bounds", "matches_inconsistent",
+    "matches_dissimilar", "matches_out_of_bounds", "matches_inconsistent", "empty_fraction", "unknown_fraction",
 )  # fmt: skip
 #: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
 GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m", "margin")
@@ -239,7 +239,11 @@ def motion_errors(estimated: RigidTransform, true: RigidTransform) -> dict[str, 
 
 
 def stage_row(details: HdaDetails) -> dict[str, Scalar]:
-    """Compute the columns of inliers, matches and map size; only for stages that were reached."""
+    """Compute the columns of inliers, matches and map; only for stages that were reached.
+
+    `empty_fraction` is the fraction of the map's cells without an elevation, after small holes were filled;
+    `unknown_fraction` is the fraction of cells that the safe landing map classifies as unknown.
+    """
     row: dict[str, Scalar] = {}
     if details.motion is not None:
         row |= {
@@ -254,6 +258,8 @@ def stage_row(details: HdaDetails) -> dict[str, Scalar]:
     if details.ground is not None:
         rows, columns = details.ground.elevation.elevation_m.shape
         row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
+        row["empty_fraction"] = float(np.mean(np.isnan(details.ground.elevation.elevation_m)))
+        row["unknown_fraction"] = float(np.mean(details.ground.hazards.safety == Safety.UNKNOWN))
     return row
 
 

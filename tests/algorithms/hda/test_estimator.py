@@ -297,16 +297,27 @@ def test_any_image_returns_an_estimate(name: str, measurements: LandingMeasureme
         assert isinstance(result.outcome, SiteOutcome)
 
 
-def test_predicted_feature_positions_allow_a_wide_baseline(scene: Pass) -> None:
-    # A baseline of 1.5 m moves the ground by at least 60 px, beyond the search window without a prediction.
+@pytest.mark.parametrize("seed", TrackSeed)
+def test_wide_baseline_has_a_map(scene: Pass, seed: TrackSeed) -> None:
+    # A baseline of 1.5 m moves the ground by at least 60 px, beyond the window of Table I.
     wide_pass = Pass(scene.height, (scene.poses[0], make_pose(0.1, -1.5, 10.1, 7.0, 2.0, -1.0)))
     inputs = measure_pass(wide_pass)
-    with_prediction = HdaEstimator(replace(OPTIONS, track_seed=TrackSeed.POSE)).estimate(inputs)
-    assert with_prediction.outcome.converged
-    assert get_motion(with_prediction).parallax_px > 50.0
-    errors = compute_map_errors(wide_pass, with_prediction)
+    estimate = HdaEstimator(replace(OPTIONS, track_seed=seed)).estimate(inputs)
+    assert estimate.outcome.converged
+    assert get_motion(estimate).parallax_px > 50.0
+    errors = compute_map_errors(wide_pass, estimate)
     assert np.sqrt(np.mean(errors**2)) < 0.005 * 10.0
-    assert not HdaEstimator(OPTIONS).estimate(inputs).outcome.converged
+    assert not HdaEstimator(replace(OPTIONS, window_half_px=40)).estimate(inputs).outcome.converged
+
+
+def test_published_motion_does_not_depend_on_the_poses(measurements: LandingMeasurements) -> None:
+    """With poses of an unrelated motion the published algorithm gives the same motion; section II.A assumes none."""
+    first, second = measurements.poses
+    turned = rigid(second.world_from_body.rotation * Rotation.from_rotvec([0.3, 0.4, 1.0]), np.array([5.0, 3.0, 20.0]))
+    wrong_poses = replace(measurements, poses=(first, replace(second, world_from_body=turned)))
+    motions = [get_motion(HdaEstimator(OPTIONS).estimate(inputs)) for inputs in (measurements, wrong_poses)]
+    np.testing.assert_array_equal(motions[0].second_from_first.as_matrix(), motions[1].second_from_first.as_matrix())
+    np.testing.assert_array_equal(motions[0].depths, motions[1].depths)
 
 
 def test_image_size_must_match_camera(measurements: LandingMeasurements) -> None:

@@ -15,6 +15,7 @@ from marsyard.algorithms.hda.hazards import (
     Resolution,
     check_footprints,
     elevation_map,
+    fill_small_holes,
     grassfire,
     roughness_limit_m,
     safe_landing_map,
@@ -252,6 +253,35 @@ def test_map_holes_are_not_interpolated() -> None:
     maps = hazard_maps(replace(flat, elevation_m=elevation), OPTIONS)
     assert np.all(maps.safety[30:70, 30:70] == Safety.UNKNOWN)
     assert np.any(maps.safety == Safety.SAFE)
+
+
+def test_small_holes_are_interpolated_and_wide_holes_are_not() -> None:
+    """On a plane the interpolation is exact. A hole of 3 cells contains no disc of 4 cells, a hole of 5 cells does."""
+    rows, columns = np.mgrid[0.0:40.0, 0.0:60.0]
+    plane = 2.0 + 0.03 * rows - 0.05 * columns
+    elevation = plane.copy()
+    elevation[5:8, 5:8] = elevation[20, 10:40] = elevation[30, 30] = np.nan
+    elevation[10:15, 45:50] = np.nan
+    elevation[:3] = np.nan
+    filled = fill_small_holes(ElevationMap(elevation, np.zeros(2), CELL_M), 4.0 * CELL_M).elevation_m
+    is_wide = np.zeros((40, 60), dtype=bool)
+    is_wide[11:14, 46:49] = True
+    assert np.all(np.isnan(filled[is_wide]))
+    assert np.all(np.isnan(filled[:3]))
+    outside = np.ones((40, 60), dtype=bool)
+    outside[10:15, 45:50] = outside[:3] = False
+    np.testing.assert_allclose(filled[outside], plane[outside], rtol=0, atol=1e-12)
+
+
+def test_single_empty_cells_do_not_hide_the_ground() -> None:
+    """Every fifth cell of level ground is empty: a lander's radius around each of them would be the whole map."""
+    flat = make_ground(60, 60)
+    elevation = flat.elevation_m.copy()
+    elevation[::5, ::5] = np.nan
+    holed = replace(flat, elevation_m=elevation)
+    assert not np.any(hazard_maps(holed, OPTIONS).safety == Safety.SAFE)
+    filled = fill_small_holes(holed, 2.0 * CELL_M)
+    assert np.mean(hazard_maps(filled, OPTIONS).safety == Safety.SAFE) > 0.5
 
 
 def test_out_of_range_options_are_reported() -> None:

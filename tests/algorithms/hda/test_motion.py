@@ -9,7 +9,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.hda import HdaOptions, Motion
 from marsyard.algorithms.hda.estimator import check_motion
 from marsyard.algorithms.hda.kernels import motion as kernels
-from marsyard.algorithms.hda.motion import estimate_motion, plane_depths
+from marsyard.algorithms.hda.motion import MotionStart, estimate_motion, plane_depths, range_starts
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
 
@@ -42,7 +42,7 @@ def project_points(points: np.ndarray, depths: np.ndarray, true_motion: RigidTra
 
 def solve_motion(points: np.ndarray, second: np.ndarray, start: RigidTransform = NO_MOTION_START) -> Motion:
     """Estimate the motion from tracks; the initial depths are 10 m."""
-    return estimate_motion(points, second, FOCAL_PX, np.full(len(points), 10.0), (start,), OPTIONS)
+    return estimate_motion(points, second, FOCAL_PX, (MotionStart(start, np.full(len(points), 10.0)),), OPTIONS)
 
 
 def motion_errors(result: Motion, true_motion: RigidTransform, scale: float) -> tuple[float, float]:
@@ -128,8 +128,9 @@ def test_best_of_two_initial_motions_is_selected() -> None:
     true_motion = draw_motion(rng)
     second = project_points(points, depths, true_motion)
     wrong_start = rigid(Rotation.from_rotvec([0.0, 0.0, 2.5]), np.zeros(3))
-    for starts in ((wrong_start, true_motion), (true_motion, wrong_start)):
-        result = estimate_motion(points, second, FOCAL_PX, np.full(len(points), 10.0), starts, OPTIONS)
+    for motions in ((wrong_start, true_motion), (true_motion, wrong_start)):
+        starts = tuple(MotionStart(motion, np.full(len(points), 10.0)) for motion in motions)
+        result = estimate_motion(points, second, FOCAL_PX, starts, OPTIONS)
         assert motion_errors(result, true_motion, depths[0] / result.depths[0])[0] < 1e-6
 
 
@@ -174,6 +175,30 @@ def test_residuals_are_reprojection_errors_in_pixels() -> None:
     motion = kernels.Motion(true_motion.rotation.as_quat(scalar_first=True), true_motion.translation, 1.0 / depths)
     residuals = kernels.residuals(kernels.Matches(points, second, FOCAL_PX, 1.0), motion)
     np.testing.assert_allclose(residuals, -0.01 * FOCAL_PX, rtol=1e-9)
+
+
+def test_slant_range_alone_determines_a_motion_by_the_baseline_of_the_campaigns() -> None:
+    """Motions by 0.2 of the range with rotations of 4 deg, over inclined ground with rocks: from the range alone."""
+    rng = np.random.default_rng(6)
+    solved = {"plane perpendicular to the axis": 0, "all planes": 0}
+    for _ in range(40):
+        points = rng.uniform([-0.39, -0.29], [0.39, 0.29], (200, 2))
+        normal = np.array([*np.tan(np.deg2rad(rng.normal(0.0, 12.0, 2))), 1.0])
+        depths = plane_depths(points, 10.0, normal) * (1.0 + 0.04 * rng.standard_normal(len(points)))
+        course = rng.uniform(0.0, 2.0 * np.pi)
+        true_motion = rigid(
+            Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, 4.0, 3))),
+            2.0 * np.array([np.cos(course), np.sin(course), 0]),
+        )
+        second = project_points(points, depths, true_motion)
+        second[:20] += rng.uniform(-0.1, 0.1, (20, 2))
+        starts = range_starts(points, 10.0)
+        for name, used in (("plane perpendicular to the axis", starts[:1]), ("all planes", starts)):
+            result = estimate_motion(points, second, FOCAL_PX, used, OPTIONS)
+            rotation_error = (result.second_from_first.rotation * true_motion.rotation.inv()).magnitude()
+            solved[name] += rotation_error < np.deg2rad(0.1)
+    assert solved["all planes"] >= 39
+    assert solved["plane perpendicular to the axis"] < solved["all planes"]
 
 
 def test_level_ground_depths_match_a_plane() -> None:

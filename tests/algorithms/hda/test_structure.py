@@ -17,6 +17,7 @@ from marsyard.algorithms.hda.structure import (
     depth_bounds,
     epipolar_segments,
     forward_backward_error,
+    grid_spacing_px,
     match_pixels,
     pixel_lattice,
     scale_factor,
@@ -235,3 +236,13 @@ def test_segments_are_clipped_at_the_image_border() -> None:
     ends = np.array([[60.0, 40.0], [110.0, 80.0], [0.0, 20.0], [np.nan, 10.0]])
     result = clip_to_image((100, 80), starts, ends, 10.0)
     np.testing.assert_allclose(result, [[60.0, 40.0], [50.0 + 60.0 * 19.0 / 30.0, 69.0], [10.0, 10.0], [50.0, 10.0]])
+
+
+def test_refined_grid_resolves_the_narrowest_hazard(landing_scene: LandingScene) -> None:
+    """At 10 m a hazard of 0.3 m is f 0.03 = 12.2 px wide (f = 405 px): at least six grid points are 2 px apart."""
+    view = landing_scene.views[0]
+    options = replace(OPTIONS, grid_px=16, refine_grid=True, narrowest_hazard=1.5, max_roughness_m=0.2)
+    assert grid_spacing_px(view, (9.0, 11.0), options) == 2
+    assert grid_spacing_px(view, (900.0, 1100.0), options) == 1
+    assert grid_spacing_px(view, (0.9, 1.1), options) == 16
+    assert grid_spacing_px(view, (9.0, 11.0), replace(options, refine_grid=False)) == 16

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import HdaOptions
+from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.algorithms.hda.kernels import matching
+from marsyard.algorithms.hda.motion import View
 from marsyard.algorithms.hda.tracking import (
     LevelSize,
     eigenvalue_test,
@@ -17,8 +19,10 @@ from marsyard.algorithms.hda.tracking import (
     pyramid,
     select_features,
     track_features,
+    window_half_px,
 )
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
+from marsyard.sim.frames import rigid
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_camera, make_plane, make_pose, render_image
 
 OPTIONS = HdaOptions(block_px=32, align=True)
@@ -61,7 +65,7 @@ def test_straight_edges_and_uniform_images_have_no_features() -> None:
 
 def test_best_feature_of_each_block_is_selected() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
-    options = HdaOptions(block_px=40, window_half_px=8, align=True)
+    options = HdaOptions(block_px=40, align=True)
     features = select_features(counts, options)
     border = feature_border_px(options)
     interest = eigenvalue_test(counts.astype(np.float32), 11, options.min_eigenvalue)
@@ -80,9 +84,53 @@ def test_best_feature_of_each_block_is_selected() -> None:
 def test_pyramid_levels_of_the_papers_window() -> None:
     # Landing paper, Table I: half widths of template t = 5 and window w = 40. Eq. 4 gives log2(40) - 2 = 3.3 levels
     # below full resolution. Half widths on the coarsest level by Eq. 5: 5 / 8 + 0.5 < 2 and 40 / 8 + 0.5 = 5.5.
-    assert level_sizes(5, 40) == (LevelSize(5, 2), LevelSize(3, 2), LevelSize(2, 2), LevelSize(2, 5))
+    assert level_sizes(5, 40, (640, 480)) == (LevelSize(5, 2), LevelSize(3, 2), LevelSize(2, 2), LevelSize(2, 5))
     # A window that fits on one level is searched at full resolution.
-    assert level_sizes(5, 6) == (LevelSize(5, 6),)
+    assert level_sizes(5, 6, (640, 480)) == (LevelSize(5, 6),)
+    # Eq. 4 gives 7 levels for a window of 640 px; at level 7 the image has 3 rows, fewer than the template.
+    sizes = level_sizes(5, 640, (640, 480))
+    assert len(sizes) == 7
+    assert sizes[-1] == LevelSize(2, 10)
+
+
+def make_view(columns: int = 320) -> View:
+    camera = make_camera(columns)
+    counts = np.zeros(camera.size[::-1], dtype=np.uint16)
+    return View(counts, camera, rigid(Rotation.identity(), np.zeros(3)))
+
+
+def test_window_contains_the_expected_displacement() -> None:
+    """Baseline of 0.2 of the range and tilt of 3 deg: f (0.2 + tan 3 deg) on the axis."""
+    options = HdaOptions(max_tilt_change_rad=np.deg2rad(3.0), max_roll_change_rad=0.0, max_height_change_fraction=0.0)
+    view = make_view()
+    expected = view.focal_px * (0.2 + np.tan(np.deg2rad(3.0)))
+    assert window_half_px(view, options) == pytest.approx(expected, abs=1.0)
+    assert window_half_px(make_view(640), options) == pytest.approx(2.0 * expected, abs=1.0)
+    # a descent by a fifth magnifies the image by 1.25, which moves its corners by a quarter of their distance
+    descent = replace(options, max_height_change_fraction=0.2, max_tilt_change_rad=0.0)
+    assert window_half_px(view, descent) == pytest.approx(view.focal_px * 0.25 + 0.25 * np.hypot(160.0, 120.0), abs=1.0)
+    # the paper's limits of rotation exceed the image
+    assert window_half_px(make_view(640), HdaOptions()) == 640
+    # from the poses, the parallax of ground that is higher by the depth margin: f 0.2 (1 / 0.8 - 1)
+    from_poses = HdaOptions(track_seed=TrackSeed.POSE, depth_margin=0.2)
+    assert window_half_px(view, from_poses) == pytest.approx(0.05 * view.focal_px, abs=1.0)
+    assert window_half_px(view, replace(options, window_half_px=40)) == 40
+
+
+@pytest.mark.parametrize(("window_half", "fraction"), [(102, 0.8), (320, 0.7)])
+def test_displacement_by_the_baseline_of_the_campaigns_is_tracked(window_half: int, fraction: float) -> None:
+    """A baseline of 0.2 of the range moves the image by 81 of 320 px; the search starts at the first position."""
+    scene = make_pass((0.0, -2.0, 10.0, 20.0))
+    first, second = (render_image(scene, i).counts for i in (0, 1))
+    features = select_features(first, OPTIONS)
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    is_inside = np.all((true_pixels > 12) & (true_pixels < np.array([307, 227])), axis=1)
+    tracks = track_features(first, second, features, features, window_half, replace(OPTIONS, align=False))
+    is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)
+    assert is_inside.sum() >= 20
+    assert np.mean(is_correct[is_inside]) >= fraction
+    narrow = track_features(first, second, features, features, 40, replace(OPTIONS, align=False))
+    assert np.sum(narrow.accepted & (np.hypot(*(narrow.second - true_pixels).T) < 1.0)) < 0.2 * is_inside.sum()
 
 
 def test_pyramid_levels_are_block_means(noise: np.ndarray) -> None:
@@ -124,7 +172,7 @@ def test_integer_shifts_within_the_window_are_recovered(shift: tuple[int, int]) 
     features = select_features(first, OPTIONS)
     # Only features that are not affected by the periodic border.
     features = features[np.all((features > 60) & (features < np.array([260, 180])), axis=1)]
-    tracks = track_features(first, second, features, features, replace(OPTIONS, align=False))
+    tracks = track_features(first, second, features, features, 40, replace(OPTIONS, align=False))
     assert len(features) > 10
     # The biquadratic fit is biased on texture as fine as pixels.
     is_correct = np.all(np.abs(tracks.second - features - shift) < 0.3, axis=1)
@@ -146,7 +194,7 @@ def test_tracks_over_relief_match_exact_scene() -> None:
     features = select_features(first, OPTIONS)
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
     unaligned, aligned = (
-        track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
+        track_features(first, second, features, features, 40, replace(OPTIONS, align=align)) for align in (False, True)
     )
     assert aligned.accepted.sum() >= 40
     is_correct = aligned.accepted & (np.hypot(*(unaligned.second - true_pixels).T) < 1.0)
@@ -179,7 +227,7 @@ def test_largest_changes_of_the_paper_are_tracked(second: tuple[float, ...]) -> 
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
     # at least 12 px inside the second image of 320 x 240 pixels
     is_visible = np.all((true_pixels >= 12.0) & (true_pixels <= np.array([307.0, 227.0])), axis=1)
-    tracks = track_features(first_counts, second_counts, features, true_pixels + 3.0, OPTIONS)
+    tracks = track_features(first_counts, second_counts, features, true_pixels + 3.0, 40, OPTIONS)
     is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)
     assert is_visible.sum() >= 15
     assert np.mean(is_correct[is_visible]) >= 0.9
@@ -190,9 +238,9 @@ def test_largest_changes_of_the_paper_are_tracked(second: tuple[float, ...]) -> 
 def test_features_leaving_the_image_are_rejected() -> None:
     scene = make_pass((0.0, -1.0, 10.0, 20.0))
     first, second = (render_image(scene, i).counts for i in (0, 1))
-    features = select_features(first, replace(OPTIONS, window_half_px=60))
+    features = select_features(first, OPTIONS)
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
-    tracks = track_features(first, second, features, features, replace(OPTIONS, window_half_px=60))
+    tracks = track_features(first, second, features, features, 60, OPTIONS)
     is_outside = ~make_camera().in_frame(true_pixels)
     assert is_outside.sum() >= 3
     assert not np.any(tracks.accepted & is_outside)
@@ -205,8 +253,8 @@ def test_search_starts_at_predicted_positions() -> None:
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
     is_inside = np.all((true_pixels > 30) & (true_pixels < np.array([290, 210])), axis=1)
     # Features move by at least 70 px: without a prediction they leave the search window.
-    unpredicted = track_features(first, second, features, features, OPTIONS)
-    predicted = track_features(first, second, features, true_pixels + 9.0, OPTIONS)
+    unpredicted = track_features(first, second, features, features, 40, OPTIONS)
+    predicted = track_features(first, second, features, true_pixels + 9.0, 40, OPTIONS)
     assert np.mean(np.hypot(*(unpredicted.second - true_pixels).T)[is_inside] < 1.0) < 0.1
     assert np.mean(np.hypot(*(predicted.second - true_pixels).T)[is_inside] < 1.0) > 0.9
 
@@ -219,7 +267,7 @@ def test_tracks_near_boulders_are_correct_or_rejected() -> None:
     features = select_features(first, OPTIONS)
     true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
     unaligned, aligned = (
-        track_features(first, second, features, features, replace(OPTIONS, align=align)) for align in (False, True)
+        track_features(first, second, features, features, 40, replace(OPTIONS, align=align)) for align in (False, True)
     )
     is_wrong = np.hypot(*(aligned.second - true_pixels).T) > 0.5
     # Correlation alone would accept features that left the image and occluding edges.

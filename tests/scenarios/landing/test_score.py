@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus
+from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety
 from marsyard.algorithms.hda.details import Ground
 from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
 from marsyard.algorithms.hda.motion import View
@@ -180,3 +180,20 @@ def test_matches_are_counted_by_outcome() -> None:
         "matches_out_of_bounds": 3,
         "matches_inconsistent": 2,
     }
+
+
+def test_unknown_cells_of_a_map_are_counted() -> None:
+    elevation_m = np.zeros((20, 30))
+    elevation_m[:2] = np.nan
+    elevation = ElevationMap(elevation_m, np.zeros(2), 0.1)
+    safety = np.full((20, 30), Safety.SAFE, dtype=np.uint8)
+    safety[:5], safety[-3:] = Safety.UNKNOWN, Safety.HAZARD
+    maps = HazardMaps(np.zeros((1, 1, 3)), elevation_m, elevation_m, elevation_m, safety)
+    ground = Ground(
+        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), site_cell=None
+    )
+    camera = preset("xc-55").cameras()[0]
+    view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
+    row = stage_row(HdaDetails((view, view), ground=ground))
+    assert row["empty_fraction"] == pytest.approx(2 / 20)
+    assert row["unknown_fraction"] == pytest.approx(5 / 20)
