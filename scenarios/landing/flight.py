@@ -154,8 +154,8 @@ def choose_pair(
     """Choose the pair with the highest score; among equal scores, the earliest pair (landing paper, section V).
 
     The choice uses on-board data: poses of the filter, ranges of the laser, and the calibrated camera; level ground is
-    assumed. The commanded height replaces a missing range. A pair is usable if its overlap is at least `min_overlap`
-    and the motion of the ground in the image is at most `max_shift_px`. Other pairs are used only if no pair is usable.
+    assumed. The commanded height replaces a missing range. Pairs with an overlap below `min_overlap` are used only if
+    no pair has this overlap.
 
     Raises ValueError if there are fewer than two images.
     """
@@ -167,19 +167,17 @@ def choose_pair(
     centres_m, axes = transforms.apply(np.array(camera.c)), transforms.rotation.apply(np.array(camera.a))
     corner_rays = np.stack([transforms.rotation.apply(ray) for ray in rays], axis=1)
     best, best_score = None, (False, -np.inf)
-    max_shift_px = np.inf if parameters.max_shift_px is None else parameters.max_shift_px
     for first, axis in enumerate(axes[:-1]):
         distance = float(ranges_m[first]) if np.isfinite(ranges_m[first]) else height_m
         steps_m = centres_m[first:] - centres_m[first]
         baselines_m = np.linalg.norm(steps_m - (steps_m @ axis)[:, None] * axis, axis=1)
         footprints = _level_footprints(corner_rays[first:], steps_m, distance * axis[2])
         area = cv2.contourArea(footprints[0])
-        shifts_px = np.linalg.norm(footprints - footprints[0], axis=2).max(axis=1) / np.sqrt(area / (columns * rows))
         for k in range(1, len(footprints)):
             # an image that shows the horizon has no footprint
-            has_overlap = np.isfinite(shifts_px[k])
+            has_overlap = np.isfinite(footprints[[0, k]]).all()
             overlap = cv2.intersectConvexConvex(footprints[0], footprints[k])[0] / area if has_overlap else 0.0
-            is_usable = bool(overlap >= parameters.min_overlap and shifts_px[k] <= max_shift_px)
+            is_usable = bool(overlap >= parameters.min_overlap)
             score = overlap * min(baselines_m[k] / (parameters.max_baseline_fraction * distance), 1.0)
             if (is_usable, score) > best_score:
                 best_score = (is_usable, score)

@@ -21,7 +21,7 @@ from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
+from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
 from marsyard.sim.sensor import (
     PRESETS,
     AutoExposureParameters,
@@ -157,9 +157,6 @@ class PairParameters(Parameters):
 
     max_baseline_fraction: float = Field(default=0.2, gt=0.0, le=2.0, description="limit of baseline divided by range")
     min_overlap: float = Field(default=0.5, ge=0.0, le=1.0, description="fraction of the first image's ground")
-    max_shift_px: Annotated[
-        Positive | None, Field(description="maximum predicted motion of level ground in the image; default: no limit")
-    ] = None
 
 
 class LanderParameters(Parameters):
