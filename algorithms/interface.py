@@ -26,7 +26,7 @@ class VelocityOutcome(Enum):
     """Outcome of a velocity estimate. All members except VALID are expected failures: no velocity is reported."""
 
     VALID = "a velocity is reported"
-    NO_TEMPLATE_AREA = "an image pair has no feasible overlap for a template and its search window"
+    NO_TEMPLATE_AREA = "an image pair has no feasible overlap for a template"
     NO_VALID_TRACK = "in an image pair no template passed the validity checks"
     IMU_MISMATCH = "no combination of tracks agrees with the change of velocity measured by the IMU"
 

@@ -124,7 +124,7 @@ def _draw_descent_errors(
         first, second = measured_views[pair], measured_views[pair + 1]
         candidates = template_candidates(first, second, search_geometry(first, second, options), no_sun, options)
         scores = rng.uniform(size=len(candidates.pixels))
-        indices = best_candidates(scores, candidates.pixels, candidates.preferred, 2, options.exclusion_px)
+        indices = best_candidates(scores, candidates.pixels, candidates.preference, 2, options.exclusion_px)
         if len(indices) < 2:
             return None
         heights = inputs.feature_height_sd_m * rng.standard_normal(2)

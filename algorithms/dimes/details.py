@@ -26,7 +26,8 @@ class Track:
       same offset from the later nadir point.
     - template, window: Rectified and corrected patches, counts, north up
     - match: Row and column in `window` of the matched template's centre
-    - surface: Correlation at every shift; its centre is zero motion
+    - surface: Correlation at every shift; its centre is zero motion. It is -1 where the later image does not show the
+      complete template.
     - failed: Validity checks that the track failed
     - velocity_m_s: Mean velocity of the camera over the pair (east, north); also given for invalid tracks
     """

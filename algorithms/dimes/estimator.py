@@ -5,11 +5,12 @@ The method is section II of Johnson et al., "Field Testing of the MER DIMES".
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Patch, Vector2, Vector3
 from marsyard.algorithms.dimes import overlap
@@ -21,6 +22,15 @@ from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, high
 from marsyard.algorithms.image.registration import refine_shift
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
+
+#: Smallest value of the correlation, at positions where the second image does not show the complete template.
+MIN_CORRELATION = -1.0
+
+
+def mark_border(peak: Peak, searchable: Bool[np.ndarray, "s s"]) -> Peak:
+    """Mark a peak that is next to a position that cannot be searched as a peak on the border."""
+    rows, columns = slice(max(peak.row - 1, 0), peak.row + 2), slice(max(peak.column - 1, 0), peak.column + 2)
+    return replace(peak, on_border=peak.on_border or not searchable[rows, columns].all())
 
 
 def match_corner(
@@ -61,8 +71,9 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
         ground = candidates.ground[candidate]
         template = rectify(first, ground, geometry.template_px, geometry.gsd_m)
         window = rectify(second, ground, geometry.window_px, geometry.gsd_m)
-        surface = pseudo_normalized_correlation(template, window)
-        peak = highest_peak(surface)
+        searchable = overlap.searchable_positions(second, ground, geometry, options)
+        surface = np.where(searchable, pseudo_normalized_correlation(template, window), MIN_CORRELATION)
+        peak = mark_border(highest_peak(surface), searchable)
         corner = match_corner(template, window, surface, peak, options)
         metrics = track_metrics(float(contrast), surface, peak, options)
         displacement = camera_displacement(corner, geometry)

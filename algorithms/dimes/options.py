@@ -18,7 +18,7 @@ class DimesOptions:
 
     - binned_size: Columns and rows of the binned image (paper: 256 x 256)
     - max_speed_m_s: Largest horizontal speed expected (paper: 30 m/s). The search range is this speed times the time
-      between the images.
+      between the images, 112.5 m in 3.75 s. The overlap of a pair must be at least as wide (paper: 110 m).
     - search_margin_px: Additional search range on each side, rectified pixels. Attitude and altitude errors also shift
       the match (0.3 deg between two images is 9 m, 1.6 px, at 1700 m), and a peak must not lie on the border.
     - template_px: Side of the rectified template, odd. 31 px is 172 m at 1700 m.

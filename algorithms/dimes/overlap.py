@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
 from marsyard.algorithms.dimes import binning
@@ -21,11 +23,13 @@ from marsyard.algorithms.image.interest import harris_interest, local_mean, stru
 class SearchGeometry:
     """Sizes of template and search window in the virtual camera of a pair.
 
+    - max_displacement_m: Largest horizontal displacement expected, and minimum width of the overlap
     - gsd_m: Ground sample distance: one binned pixel of the second view at its nadir
     - template_px: Side of the template
     - search_px: Largest shift searched in each direction
     """
 
+    max_displacement_m: float
     gsd_m: float
     template_px: int
     search_px: int
@@ -50,7 +54,8 @@ def search_geometry(first: binning.View, second: binning.View, options: DimesOpt
     """Compute the sizes of template and search window from the second view, the image interval and the options."""
     gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
-    return SearchGeometry(gsd, options.template_px, int(np.ceil(max_displacement_m / gsd)) + options.search_margin_px)
+    search_px = int(np.ceil(max_displacement_m / gsd)) + options.search_margin_px
+    return SearchGeometry(max_displacement_m, gsd, options.template_px, search_px)
 
 
 def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
@@ -101,33 +106,70 @@ def outside_zero_phase(
     return np.asarray(dot_products < np.cos(radius_rad) * ranges)
 
 
+def overlap_width_m(
+    first: binning.View, second: binning.View, gsd_m: float, sun_direction: Vector3, options: DimesOptions
+) -> float:
+    """Compute the diameter of the largest circle of ground in both views at zero motion, outside the zero-phase spot.
+
+    The result is 0 without common ground; its resolution is the ground sample distance `gsd_m`.
+    """
+    limit, views = options.max_off_nadir_rad, (first, second)
+    outlines = [binning.ground_from_pixels(view, border_pixels(view.size), limit)[0] for view in views]
+    low = np.max([outline.min(axis=0) for outline in outlines], axis=0)
+    high = np.min([outline.max(axis=0) for outline in outlines], axis=0)
+    if np.any(high <= low):
+        return 0.0
+    columns, rows = (int(n) for n in np.ceil((high - low) / gsd_m) + 1)
+    ground = np.stack(np.meshgrid(low[0] + gsd_m * np.arange(columns), low[1] + gsd_m * np.arange(rows)), axis=-1)
+    overlap = np.ones((rows, columns), dtype=np.uint8)
+    for view, outline in zip(views, outlines, strict=True):
+        # vertices in 1/16 of a cell
+        vertices = np.rint(16.0 * (outline - low) / gsd_m).astype(np.int32)
+        overlap &= cv2.fillPoly(np.zeros_like(overlap), [vertices], (1,), shift=4).astype(np.uint8)
+        overlap &= outside_zero_phase(view, ground, sun_direction, options.zero_phase_radius_rad)
+    # cells outside the grid belong to the ground outside the overlap
+    distances = cv2.distanceTransform(np.pad(overlap, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return 2.0 * gsd_m * float(distances.max())
+
+
 @dataclass(frozen=True)
 class Candidates:
-    """Feasible template positions: the template fits the first view, and its search window fits the second view.
+    """Feasible template positions: the template fits the first view, and its centre lies in the overlap region.
 
     - pixels, ground: Template centres: pixels (u, v) of the first view, and ground points (east, north)
-    - preferred: Whether the complete search window is outside the zero-phase spot. The template itself is always
-      outside the spot at zero motion.
+    - preference: Number of conditions that hold; candidates with a larger number precede the others. The template is
+      inside the second view at zero motion; so is the complete search window; and the window is outside the zero-phase
+      spot. Each condition requires those before it. The template itself is always outside the spot at zero motion.
     """
 
     pixels: Points2
     ground: Points2
-    preferred: Flags
+    preference: Int[np.ndarray, "n"]
 
 
 def template_candidates(
     first: binning.View, second: binning.View, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
 ) -> Candidates:
-    """Find all feasible template positions on the coarse grid."""
+    """Find all feasible template positions on the coarse grid.
+
+    There is none if the overlap is narrower than the largest displacement, 30 m/s in 3.75 s (paper: "at least 110 m
+    across"). The paper does not require that the complete search window lies inside the second image.
+    """
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
     ground, visible = binning.ground_from_pixels(first, pixels, limit)
+    width_m = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options)
+    visible &= width_m >= geometry.max_displacement_m
     pixels, ground = pixels[visible], ground[visible]
-    # a fast test of the template centre first, to reduce the number of positions
-    for view, half_m in ((second, 0.0), (first, geometry.template_half_m), (second, geometry.window_half_m)):
-        outline = binning.square_outline(half_m, 3) if half_m > 0.0 else np.zeros((1, 2))
-        feasible = binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
-        pixels, ground = pixels[feasible], ground[feasible]
+
+    def fits(view: binning.View, half_m: float) -> Flags:
+        outline = binning.square_outline(half_m, 3)
+        return np.asarray(binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1))
+
+    feasible = binning.inside_frame(second, ground, 0.0, limit)
+    pixels, ground = pixels[feasible], ground[feasible]
+    feasible = fits(first, geometry.template_half_m)
+    pixels, ground = pixels[feasible], ground[feasible]
 
     def is_outside_spot(view: binning.View, half_m: float, per_side: int) -> Flags:
         points = ground[:, None] + binning.square_lattice(half_m, per_side)
@@ -135,8 +177,20 @@ def template_candidates(
         return np.asarray(outside.all(axis=1))
 
     valid = is_outside_spot(first, geometry.template_half_m, 4) & is_outside_spot(second, geometry.template_half_m, 4)
-    preferred = is_outside_spot(second, geometry.window_half_m, 7)
-    return Candidates(pixels[valid], ground[valid], preferred[valid])
+    complete = fits(second, geometry.window_half_m)
+    outside = is_outside_spot(second, geometry.window_half_m, 7)
+    preference = np.sum([fits(second, geometry.template_half_m), complete, complete & outside], axis=0)
+    return Candidates(pixels[valid], ground[valid], preference[valid])
+
+
+def searchable_positions(
+    second: binning.View, centre: Vector2, geometry: SearchGeometry, options: DimesOptions
+) -> Bool[np.ndarray, "s s"]:
+    """Whether the second view shows the complete template at each position of the search around `centre` (ground)."""
+    lattice = binning.ground_lattice(centre, geometry.window_px, geometry.gsd_m)
+    inside = binning.inside_frame(second, lattice, options.border_px, options.max_off_nadir_rad)
+    half = geometry.template_px // 2
+    return np.asarray(ndimage.minimum_filter(inside, size=geometry.template_px)[half:-half, half:-half])
 
 
 #: Lower limit of the mean signal before division, as a fraction of the full scale.
@@ -156,15 +210,17 @@ def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vec
     )
 
 
-def best_candidates(contrasts: Vector, pixels: Points2, preferred: Flags, count: int, exclusion_px: float) -> list[int]:
-    """Indices of up to `count` candidates by decreasing contrast; preferred candidates precede all others.
+def best_candidates(
+    contrasts: Vector, pixels: Points2, preference: Int[np.ndarray, "n"], count: int, exclusion_px: float
+) -> list[int]:
+    """Indices of up to `count` candidates by decreasing preference, and by decreasing contrast for equal preference.
 
     Each selected candidate excludes those closer than `exclusion_px` in both column and row.
     """
     available = np.ones(len(contrasts), dtype=bool)
     indices: list[int] = []
     while len(indices) < count and available.any():
-        eligible = available & preferred if np.any(available & preferred) else available
+        eligible = available & (preference == preference[available].max())
         best = int(np.argmax(np.where(eligible, contrasts, -np.inf)))
         indices.append(best)
         available &= np.abs(pixels - pixels[best]).max(axis=1) >= exclusion_px
@@ -176,5 +232,7 @@ def select_templates(
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
     contrasts, pixels = template_contrasts(view, candidates.pixels, options.template_px), candidates.pixels
-    indices = best_candidates(contrasts, pixels, candidates.preferred, options.templates_per_pair, options.exclusion_px)
+    indices = best_candidates(
+        contrasts, pixels, candidates.preference, options.templates_per_pair, options.exclusion_px
+    )
     return indices, contrasts[indices]

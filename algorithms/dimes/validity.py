@@ -36,7 +36,8 @@ class TrackMetrics:
     - peak: Height of the correlation peak, at most 1
     - peak_width_px: Full width of the peak at three quarters of its height, in its longest direction, rectified pixels
     - second_peak_ratio: Second-highest local maximum divided by the peak; 1 without a positive peak
-    - on_border: Whether the highest correlation lies on the border of the search range
+    - on_border: Whether the highest correlation lies on the border of the search range, or next to a position where the
+      second image does not show the complete template
     """
 
     contrast: float

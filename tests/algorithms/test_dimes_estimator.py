@@ -168,6 +168,28 @@ def test_velocity_is_correct_from_images_without_summed_rows() -> None:
     np.testing.assert_allclose(valid_velocity(answer), [12.0, -7.0], atol=0.1)
 
 
+#: Attitudes that tilt by 19 deg to opposite sides: the overlap of two images is about 240 m wide, less than a complete
+#: search window of 456 m.
+TILTED_APART = (tilt_body(19.0, 0.0, 0.0), tilt_body(19.0, 180.0, 0.0), tilt_body(19.0, 0.0, 0.0))
+
+
+def test_velocity_is_estimated_without_complete_search_windows() -> None:
+    answer = ESTIMATOR.estimate(render(steady_flight((6.0, -9.0), TILTED_APART)))
+    np.testing.assert_allclose(valid_velocity(answer), [6.0, -9.0], atol=0.2)
+    tracks = get_details(answer).tracks
+    # positions where the second image does not show the complete template
+    assert all((track.surface == -1.0).any() for track in tracks)
+
+
+def test_match_outside_the_second_image_is_rejected() -> None:
+    # At 30 m/s along the strip's width, features move by up to 112 m, out of the second image of one of both pairs.
+    for velocity in ((29.0, 0.0), (-29.0, 0.0)):
+        tracks = get_details(ESTIMATOR.estimate(render(steady_flight(velocity, TILTED_APART)))).tracks
+        is_wrong = [np.hypot(*(track.velocity_m_s - velocity)) > 2.0 for track in tracks]
+        assert any(is_wrong)
+        assert not any(track.valid for track, wrong in zip(tracks, is_wrong, strict=True) if wrong)
+
+
 def test_featureless_terrain_has_no_contrast() -> None:
     answer = ESTIMATOR.estimate(render(steady_flight((10.0, 0.0)), draw_terrain(3, 0.0), np.random.default_rng(4)))
     assert answer.outcome is VelocityOutcome.NO_VALID_TRACK

@@ -180,14 +180,14 @@ def test_condition_columns_have_the_simulated_values(nominal_case: CaseResult) -
 
 @pytest.mark.parametrize(("altitude_m", "is_feasible"), [(2000.0, True), (1000.0, False)])
 def test_refusal_counts_if_the_true_overlap_is_sufficient(altitude_m: float, is_feasible: bool) -> None:
-    """The camera swings by 42 deg to opposite sides, and DIMES has no space for its windows.
+    """The camera swings by 42 deg to opposite sides, and DIMES has no two tracks that agree with the IMU.
 
     From 2000 m both images of the second pair show ground of more than 110 m, and from 1000 m of less: the sizes of
     the footprints are proportional to the altitude.
     """
     wide_swing = {"cone_angle_deg": 42.0, "cone_phase_deg": 0.0, "cone_minor_fraction": 0.0}
     result = run_descent(descent=DESCENT | wide_swing | {"altitude_first_m": altitude_m})
-    assert result.outcome == "NO_TEMPLATE_AREA"
+    assert result.outcome != "VALID"
     assert result.row["feasible_overlap"] is is_feasible
     assert (float(result.row["overlap_width_second_pair_m"]) >= 110.0) is is_feasible
     assert not result.answered
