@@ -57,7 +57,7 @@ class DimesOptions:
     - imu_threshold_m_s: Largest horizontal discrepancy between the velocity change of a combination of tracks and that
       of the IMU. Derived by Monte Carlo (`benchmarks.threshold_derivation`, stored in `imu_threshold.json`; see
       `docs/adr/0008-threshold-of-the-imu-check.md`): the discrepancy is smaller in 99.5 % of descents with one correct
-      track in each pair and errors as specified.
+      track in each pair and the errors of the simulated instruments.
     """
 
     binned_size: tuple[int, int] = (256, 256)
@@ -78,7 +78,7 @@ class DimesOptions:
     max_peak_width_px: float = 16.0
     max_second_peak_ratio: float = 0.8
     second_peak_exclusion_px: float = 3.0
-    imu_threshold_m_s: float = 4.5
+    imu_threshold_m_s: float = 3.5
 
     def __post_init__(self) -> None:
         if self.template_px < 5 or self.template_px % 2 == 0:

@@ -37,7 +37,8 @@ FOCAL_PX, HALF_PX = 14.67e-3 / 48e-6, 127.5
 TEMPLATE_PX, MIN_DISTANCE_PX, MARGIN_PX = 31, 31.0, 4
 #: Maximum off-nadir angle of ground that is used (`DimesOptions.max_off_nadir_rad`), degrees.
 MAX_OFF_NADIR_DEG = 55.0
-#: Number of random template positions per pair; with fewer than two usable ones, the pair has no feasible overlap.
+#: Number of random template positions per pair; with fewer than two usable ones, the pair has no feasible overlap. The
+#: minimum width of the overlap is not checked: templates hardly fit into a smaller one.
 CANDIDATES = 200
 #: Maximum error of a correct velocity, m/s (requirement DIMES-VEL).
 REQUIRED_M_S = 5.0
@@ -106,12 +107,12 @@ def _discrepancies(
 
 
 def _draw_descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> Float[np.ndarray, "2 2 2"] | None:
-    """Draw velocity errors by pair and template; None if a pair has no feasible overlap for two templates."""
+    """Draw velocity errors by pair and template; None if a pair has no two templates that the next image shows."""
     heights, interval = np.array(inputs.altitudes_m), inputs.interval_s
     attitudes = [_draw_attitude(inputs, rng) for _ in heights]
     speed, course = inputs.max_speed_m_s * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
     displacement = interval * speed * np.array([np.cos(course), np.sin(course)])
-    height_errors = inputs.altitude_sd * rng.standard_normal(3)
+    height_errors = inputs.common_altitude_sd * rng.standard_normal() + inputs.altitude_sd * rng.standard_normal(3)
     rotations = _draw_attitude_errors(inputs, rng)
     errors = np.empty((2, 2, 2))
     for pair in range(2):
@@ -120,6 +121,8 @@ def _draw_descent_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> F
             return None
         (h1, h2), (a1, a2), (e1, e2) = (values[pair : pair + 2] for values in (heights, height_errors, rotations))
         second_slopes = (h1 * slopes - displacement) / h2
+        if not _is_inside(attitudes[pair + 1], second_slopes, 0.0).all():
+            return None
         relief = inputs.feature_height_sd_m * rng.standard_normal((2, 1))
         position_errors = h1 * (a1 * slopes + _rotate_slopes(e1, slopes)) - h2 * (
             a2 * second_slopes + _rotate_slopes(e2, second_slopes)
@@ -143,11 +146,7 @@ def _draw_attitude_errors(inputs: ThresholdInputs, rng: np.random.Generator) -> 
     """Draw the rotation of each measured attitude relative to the true attitude, radians, world axes."""
     common_error = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
     independent_errors = np.radians(inputs.attitude_sd_deg) * rng.standard_normal((3, 3))
-    rates = np.radians(inputs.max_rate_deg_s) * rng.uniform(size=3)
-    azimuths = rng.uniform(0.0, 2.0 * np.pi, 3)
-    tag_errors_s = inputs.tag_sd_s * rng.standard_normal(3)
-    axes = np.column_stack([np.cos(azimuths), np.sin(azimuths), np.zeros(3)])
-    return np.asarray(common_error + independent_errors + (rates * tag_errors_s)[:, None] * axes)
+    return np.asarray(common_error + independent_errors)
 
 
 def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
@@ -160,7 +159,7 @@ def _rotate_slopes(error: Float[np.ndarray, "3"], slopes: Float[np.ndarray, "n 2
 def _draw_templates(
     attitudes: list[Rotation], heights: Float[np.ndarray, "2"], inputs: ThresholdInputs, rng: np.random.Generator
 ) -> Float[np.ndarray, "2 2"] | None:
-    """Draw the slopes of two templates in the first view with feasible overlap; None if there are none."""
+    """Draw the slopes of two templates in the first view and the overlap region; None if there are none."""
     pixels = rng.uniform(-HALF_PX, HALF_PX, (CANDIDATES, 2))
     rays = attitudes[0].apply(np.column_stack([pixels / FOCAL_PX, -np.ones(CANDIDATES)]))
     down = -rays[:, 2]
@@ -170,8 +169,12 @@ def _draw_templates(
     search_px = np.ceil(inputs.max_speed_m_s * inputs.interval_s / gsd_m) + MARGIN_PX
     half_sides_m = 0.5 * TEMPLATE_PX * gsd_m, (0.5 * TEMPLATE_PX + search_px) * gsd_m
     is_feasible = _is_inside(attitudes[0], slopes, half_sides_m[0] / heights[0])
-    is_feasible &= _is_inside(attitudes[1], slopes * heights[0] / heights[1], half_sides_m[1] / heights[1])
-    pixels, slopes = pixels[is_feasible], slopes[is_feasible]
+    second_slopes = slopes * heights[0] / heights[1]
+    is_feasible &= _is_inside(attitudes[1], second_slopes, 0.0)
+    # templates whose complete search window is in the second image precede others that fit, and these precede the rest
+    preference = np.sum([_is_inside(attitudes[1], second_slopes, half / heights[1]) for half in half_sides_m], axis=0)
+    order = [k for k in np.argsort(-preference, kind="stable") if is_feasible[k]]
+    pixels, slopes = pixels[order], slopes[order]
     if len(pixels) == 0:
         return None
     distant = np.flatnonzero(np.abs(pixels - pixels[0]).max(axis=1) >= MIN_DISTANCE_PX)

@@ -108,8 +108,8 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
         return 0.5 * draw_correct_track_errors(inputs, rng)
 
     monkeypatch.setattr(dimes_checks, "draw_correct_track_errors", halve_errors, raising=False)
-    # half of the threshold of 4.5 m/s, rounded up to 0.1 m/s
-    options = dimes_checks.DimesOptions(imu_threshold_m_s=2.3)
+    # half of the threshold of 3.5 m/s, rounded up to 0.1 m/s
+    options = dimes_checks.DimesOptions(imu_threshold_m_s=1.8)
     monkeypatch.setattr(dimes_checks, "DimesOptions", lambda: options)
     claims = failed_claims(list(dimes_checks.check_imu_threshold(quick=True)))
     assert "discrepancy of correct tracks: 99.5 % quantile against the threshold" in claims
@@ -118,7 +118,11 @@ def test_wrong_threshold_derivation_is_detected(monkeypatch: pytest.MonkeyPatch)
 
 def test_matching_is_the_only_error_of_a_reference_with_exact_instruments() -> None:
     inputs = ThresholdInputs(
-        altitude_sd=0.0, common_attitude_sd_deg=0.0, attitude_sd_deg=0.0, tag_sd_s=0.0, feature_height_sd_m=0.0
+        common_altitude_sd=0.0,
+        altitude_sd=0.0,
+        common_attitude_sd_deg=0.0,
+        attitude_sd_deg=0.0,
+        feature_height_sd_m=0.0,
     )
     errors = VelocityErrors.draw(inputs, 300, np.random.default_rng(1))
     np.testing.assert_allclose(errors.tracks_m_s.std(), inputs.match_sd_m_s, rtol=0.1)
