@@ -426,7 +426,7 @@ def _complete_columns(frame: pd.DataFrame, verdict: Verdict) -> pd.DataFrame:
         return frame
     flags = [name for name in verdict.population.split(" and ") if name not in ("all", "completed", "valid")]
     missing = [name for name in (*verdict.metric.split(" + "), *flags) if name not in frame]
-    return frame.assign(**dict.fromkeys(missing, pd.NA)) if missing else frame
+    return frame.reindex(columns=[*frame.columns, *dict.fromkeys(missing)])
 
 
 def _describe_problem(frame: pd.DataFrame, verdict: Verdict) -> str:
