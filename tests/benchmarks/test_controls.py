@@ -18,7 +18,7 @@ from marsyard.scenarios.systems import catalogue
 #: Small campaigns, by system: cases and changes of the campaign file.
 SMALL: Mapping[str, Settings] = {
     "dimes-smoke": Settings((0, 1), ("terrain.samples=512",)),
-    "hda-hazardous": Settings((0, 1, 2, 3), ("terrain.samples=512",)),
+    "hda-hazardous": Settings((0, 1, 2, 3)),
     "vtt-checkout-2": Settings((0,), ("world.samples=512", "start.distance_m=3.0", "target.diameter_m=0.5")),
     "loc-smoke": Settings(
         (0,), ("terrain.samples=1024", "map.side_px=512", "camera.pixels=256", "camera.pixel_mrad=6.68")
