@@ -53,7 +53,7 @@ SETTINGS: Mapping[str, Settings] = {
     "dimes-fieldtest": Settings((12, 36, 42, 5, 13, 20)),
     "dimes-fieldtest-noise": Settings((0, 5, 1, 7, 4, 13)),
     "dimes-offnominal": Settings(overrides=("faults={}",)),
-    "hda-faults": Settings((0, 4, 8, 12), ("faults={}",)),
+    "hda-faults": Settings(tuple(range(12)), ("faults={}",)),
     "hda-threshold": Settings((0, 1, 2, 3, 22)),
     # each descent has a terrain of 178 MB
     "loc-faults": Settings((0, 1), ("faults={}",)),
