@@ -54,6 +54,7 @@ SETTINGS: Mapping[str, Settings] = {
     "dimes-fieldtest-noise": Settings((0, 5, 1, 7, 4, 13)),
     "dimes-offnominal": Settings(overrides=("faults={}",)),
     "hda-faults": Settings(tuple(range(12)), ("faults={}",)),
+    "hda-mars": Settings(tuple(range(12))),
     "hda-threshold": Settings((0, 1, 2, 3, 22)),
     # each descent has a terrain of 178 MB
     "loc-faults": Settings((0, 1), ("faults={}",)),
