@@ -74,11 +74,6 @@ class TerrainCounts:
         sizes = count_sizes(cases)
         return cls(sizes, int(event_scores(sizes)[events].sum()))
 
-    @property
-    def terrains(self) -> int:
-        """Number of terrains."""
-        return sum(terrains for _, terrains in self.sizes)
-
     def with_single_cases(self, cases: int) -> TerrainCounts:
         """Return the counts with additional cases without the event, each on a new terrain."""
         if cases == 0:
