@@ -21,6 +21,7 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.figures import ELLIPSE
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.sampling_design import read_sampling_design
@@ -41,7 +42,6 @@ from marsyard.reports.statistics.changes import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
-from marsyard.reports.verdicts import evaluate_requirements
 from marsyard.reports.wording import (
     NOTHING,
     axis_columns,

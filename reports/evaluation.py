@@ -16,13 +16,14 @@ import pandas as pd
 from marsyard.campaigns.definition.claims import requirement_key
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.store.confirmations import add_result
+from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.remedy import find_remedy
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
 from marsyard.reports.stored import StoredRun, read_run, table
-from marsyard.reports.verdicts import ESTIMATE, Status, Verdict, collect_evidence, evaluate_requirements
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count
 from marsyard.scenarios.systems import RowColumns, row_columns
 

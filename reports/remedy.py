@@ -66,13 +66,19 @@ def _cases_for(verdict: Verdict, needed: int, cases: int) -> int:
 
 
 def _new_campaign_text(verdicts: Sequence[Verdict], cases: int, total: int) -> str:
-    """State the cases of a new campaign with one look, if it needs fewer than `total`; empty after a failure."""
-    if any(verdict.failures or verdict.clustered is not None or verdict.decide_by == ESTIMATE for verdict in verdicts):
+    """State the cases of a new campaign with one look, if it needs fewer than `total`.
+
+    Empty after a failure, because a new campaign would discard it.
+    """
+    if any(verdict.failures or verdict.decide_by == ESTIMATE for verdict in verdicts):
         return ""
     needed = max(
         _cases_for(verdict, minimum_sample_size(verdict.probability, verdict.confidence), cases) for verdict in verdicts
     )
     if needed >= total:
         return ""
+    design = "another seed"
+    if any(verdict.clustered is not None for verdict in verdicts):
+        design += ", and a terrain for each case,"
     needed_text = f"{count(needed, 'case')} (-n {needed})"
-    return f" A new campaign with another seed needs only {needed_text}, because it has one look."
+    return f" A new campaign with {design} needs only {needed_text}, because it has one look."

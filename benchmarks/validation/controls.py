@@ -16,10 +16,11 @@ from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.faults import Fault
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import compute_exit_code
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.verdicts import Status, evaluate_requirements
+from marsyard.reports.verdicts import Status
 from marsyard.scenarios.interface import conditions_recorded_by
 from marsyard.scenarios.systems import catalogue, systems
 

@@ -46,12 +46,12 @@ def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
     return run_command
 
 
-def write_small_campaign(folder: Path, population: str, unanswered: range) -> Path:
+def write_small_campaign(folder: Path, population: str, unanswered: range, dispersions: str = DISPERSIONS) -> Path:
     return write_campaign(
         folder,
         f"unanswered_cases = {list(unanswered)}",
         top_level_keys=TOP_LEVEL_KEYS.replace("cases = 12", "cases = 24"),
-        dispersions=DISPERSIONS,
+        dispersions=dispersions,
         requirement=REQUIREMENT.replace("POPULATION", population),
     )
 
@@ -83,6 +83,16 @@ def test_new_campaign_of_the_stated_size_is_decided(marsyard: Command, tmp_path:
     _, output = marsyard("run", str(path), "--out", "run", "--jobs", "2")
     (cases,) = re.findall(r"A new campaign with another seed needs only \d+ cases \(-n (\d+)\)", output)
     assert cases == "230"
+    assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
+
+
+def test_new_campaign_has_a_terrain_for_each_case(marsyard: Command, tmp_path: Path) -> None:
+    """Cases on shared terrains need more: a new campaign without shared terrains is named, and is decided."""
+    shared = DISPERSIONS.replace("99999", "11")
+    _, output = marsyard("run", str(write_small_campaign(tmp_path, "all", range(0), shared)), "--out", "run")
+    (cases,) = re.findall(r"with another seed, and a terrain for each case, needs only \d+ cases \(-n (\d+)\)", output)
+    assert cases == "230"
+    path = write_small_campaign(tmp_path, "all", range(0))
     assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
 
 

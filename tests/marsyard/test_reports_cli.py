@@ -26,11 +26,11 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
 from marsyard.cli.outcome import create_server, run_until_decided
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import next_look
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
-from marsyard.reports.verdicts import evaluate_requirements
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, write_campaign
 
 pytestmark = [

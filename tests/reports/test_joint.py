@@ -21,10 +21,11 @@ from marsyard.cli.options import console
 from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.case_evidence import CaseEvidence, RequirementEvidence
 from marsyard.reports.dashboard.entries import read_entries
+from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics.proportions import proportion_lower
-from marsyard.reports.verdicts import Status, collect_evidence, evaluate_requirements
+from marsyard.reports.verdicts import Status
 from marsyard.result import open_result
 from tests.reports.conftest import VELOCITY
 

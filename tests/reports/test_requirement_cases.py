@@ -16,13 +16,13 @@ import pytest
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation, gallery_cases, thumbnail
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder, compute_margins
-from marsyard.reports.verdicts import evaluate_requirements
 from marsyard.reports.vtt.presentation import VTT
 
 Rows = Callable[..., pd.DataFrame]

@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.table import Table
 
 from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.rates import fraction_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
-from marsyard.reports.verdicts import evaluate_requirements
 from marsyard.reports.wording import (
     axis_columns,
     category_column,

@@ -12,9 +12,9 @@ from xml.etree import ElementTree as Xml
 import pandas as pd
 
 from marsyard.reports.campaign import write_report
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import combine_verdicts
 from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_evidence, verification_csv
-from marsyard.reports.verdicts import evaluate_requirements
 
 Rows = Callable[..., pd.DataFrame]
 #: Text that a spreadsheet would evaluate and XML cannot contain.

@@ -18,7 +18,8 @@ from marsyard.algorithms.interface import (
     VelocityEstimate,
     VelocityOutcome,
 )
-from marsyard.reports.verdicts import Status, evaluate_requirements
+from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.verdicts import Status
 from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.conformance.inputs import descent
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by

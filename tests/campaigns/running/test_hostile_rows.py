@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from marsyard.reports.campaign import write_report
+from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.stored import read_run
-from marsyard.reports.verdicts import Status, evaluate_requirements
+from marsyard.reports.verdicts import Status
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
 from tests.campaigns.hostile_scenario import FAULTS
 

@@ -1,0 +1,281 @@
+"""Decision of requirements from stored rows: the cases of each population, and the verdict that they result in."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from itertools import zip_longest
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from marsyard.reports import rates
+from marsyard.reports.bounds import Looks, RequiredRate, clustered_bounds, independent_bounds
+from marsyard.reports.case_evidence import CaseEvidence, Mask, RequirementEvidence
+from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
+from marsyard.reports.statistics import proportions
+from marsyard.reports.statistics.proportions import SequentialTest
+from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, AllCases, Status, Verdict, min_cases_for_rate
+from marsyard.reports.wording import count
+
+
+def _add_bounds(verdict: Verdict, evidence: CaseEvidence, looks: Looks) -> tuple[Verdict, int]:
+    """Add bounds of the success rate of at least one case; also return the additional cases for PASS."""
+    required = RequiredRate(verdict.probability, verdict.confidence)
+    plain, clustered = independent_bounds(evidence.success, evidence.member, required, looks), evidence.clustered
+    bounds = plain if clustered is None else clustered_bounds(clustered, required, looks)
+    verdict = replace(
+        verdict,
+        lower=bounds.lower,
+        upper=bounds.upper,
+        plain_lower=plain.lower,
+        plain_upper=plain.upper,
+        bounds_confidence=bounds.lower_confidence,
+        upper_confidence=bounds.upper_confidence,
+        consumer_risk=bounds.consumer_risk,
+        clustered=bounds.clustered,
+    )
+    return verdict, bounds.further_cases
+
+
+def evaluate_requirements(
+    frame: pd.DataFrame,
+    requirements: Sequence[Mapping[str, Any]],
+    sampling: SamplingDesign = INDEPENDENT,
+    from_truth: Mapping[str, str] = MappingProxyType({}),
+    configured: Sequence[str] = (),
+    earlier: Sequence[RequirementEvidence | None] = (),
+) -> list[Verdict]:
+    """Evaluate each requirement on all rows of a campaign; missing columns or numbers result in INSUFFICIENT.
+
+    - sampling: the sampling design; without independent random samples, verdicts have no bounds
+    - from_truth: columns that the flight system cannot know, with their definitions; mentioned in the statement of a
+      requirement
+    - configured: columns, or patterns of names, that the configuration of a case determines; they remain conditions
+      over all cases
+    - earlier: evidence of other confirmations of the same claim for each requirement; may be empty
+    """
+    frame = sampling.exclude_nominal_case(frame)
+    verdicts = []
+    for requirement, earlier_evidence in zip_longest(requirements, earlier):
+        verdict = _evaluate(frame, requirement, sampling, earlier_evidence)
+        names = [name for name in verdict.population.split(" and ") if name in from_truth]
+        if names:
+            title = f"{GIVEN_TRUTH} ({', '.join(name.replace('_', ' ') for name in names)}): "
+            texts = {name.replace("_", " "): from_truth[name] for name in names if from_truth[name]}
+            definitions = "; ".join(f"'{name}' means: {text}" for name, text in texts.items())
+            verdict = replace(verdict, statement=f"{title}{verdict.statement}", definitions=definitions)
+        verdicts.append(replace(verdict, all_cases=_evaluate_all_cases(frame, requirement, sampling, configured)))
+    return verdicts
+
+
+def _evaluate_all_cases(
+    frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, configured: Sequence[str]
+) -> AllCases | None:
+    """Evaluate a requirement on all cases of its configuration; None if its population is the same, or has no case."""
+    population = str(requirement.get("population", "all"))
+    remaining_conditions = tuple(
+        name for name in population.split(" and ") if any(fnmatchcase(name, flag) for flag in configured)
+    )
+    wider_population = " and ".join(remaining_conditions) or "all"
+    if population == wider_population:
+        return None
+    result = _evaluate(frame, {**requirement, "population": wider_population}, sampling)
+    if not result.n:
+        return None
+    return AllCases(
+        result.status, result.n, result.failures, result.estimate, result.lower, result.upper, remaining_conditions
+    )
+
+
+def collect_evidence(
+    frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, *, has_own_terrains: bool
+) -> RequirementEvidence | None:
+    """Collect the results of the cases of a requirement; None if it cannot be evaluated.
+
+    has_own_terrains: whether no other confirmation uses the terrains
+    """
+    verdict = _empty_verdict(requirement)
+    frame = _complete_columns(sampling.exclude_nominal_case(frame), verdict)
+    if _describe_problem(frame, verdict):
+        return None
+    try:
+        masks = [mask(frame, verdict.population) for mask in (rates.population_mask, rates.population_mask_if_answered)]
+    except ValueError:
+        return None
+    return RequirementEvidence(
+        *(_case_evidence(verdict, mask, sampling, frame, has_own_terrains=has_own_terrains) for mask in masks)
+    )
+
+
+def _case_evidence(
+    verdict: Verdict, member: Mask, sampling: SamplingDesign, frame: pd.DataFrame, *, has_own_terrains: bool = True
+) -> CaseEvidence:
+    """Collect the results of all cases (`frame`) with regard to a population (`member`)."""
+    _, has_unknown_flag = rates.population_and_unknown_masks(frame, verdict.population.split(" and "))
+    success = rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag & member
+    in_first_look = sampling.mask_first_look(frame)
+    if in_first_look is None:
+        in_first_look = np.ones(member.size, dtype=np.bool_)
+    groups = rates.terrain_groups(frame) if member.size else None
+    if groups is None or has_own_terrains:
+        return CaseEvidence(success, member, groups, in_first_look)
+    first_rows = np.unique(groups, return_index=True)[1]
+    labels = tuple(f"terrain {value}" for value in frame["terrain"].iloc[first_rows])
+    return CaseEvidence(success, member, groups, in_first_look, labels)
+
+
+def _evaluate(
+    frame: pd.DataFrame,
+    requirement: Mapping[str, Any],
+    sampling: SamplingDesign,
+    earlier: RequirementEvidence | None = None,
+) -> Verdict:
+    verdict = _empty_verdict(requirement)
+    frame = _complete_columns(frame, verdict)
+    problem = _describe_problem(frame, verdict)
+    if problem:
+        return replace(verdict, reason=problem)
+    try:
+        members = rates.population_mask(frame, verdict.population)
+        members_and_unfinished = rates.population_mask_if_answered(frame, verdict.population)
+    except ValueError as error:
+        text = str(error)
+        return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
+    if not members.any():
+        needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
+        reason = f"No case belongs to the population '{verdict.population}'."
+        return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
+    own = [
+        _case_evidence(verdict, mask, sampling, frame, has_own_terrains=_has_own_terrains(earlier))
+        for mask in (members, members_and_unfinished)
+    ]
+    joined = (
+        own
+        if earlier is None
+        else [
+            part.join_own(own_part)
+            for part, own_part in zip((earlier.population, earlier.with_unfinished), own, strict=True)
+        ]
+    )
+    decided = _decide(verdict, joined[0], sampling, frame)
+    if earlier is None and (members == members_and_unfinished).all():
+        return decided
+    return _withhold_if_uncertain(decided, _decide(verdict, joined[1], sampling, frame))
+
+
+def _has_own_terrains(earlier: RequirementEvidence | None) -> bool:
+    """Whether no other confirmation uses the terrains."""
+    return earlier is None or earlier.population.labels is None
+
+
+def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdict:
+    """Replace PASS or MET BY RATE by INSUFFICIENT if the verdict changes with unfinished cases as failures.
+
+    `valid` and `completed` exclude unfinished cases. Without this check, crashes instead of wrong answers could lead to
+    PASS.
+    """
+    if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
+        return verdict
+    n_unfinished = with_unfinished.n - verdict.n
+    reason = (
+        f"{count(n_unfinished, 'case')} did not finish and {'belongs' if n_unfinished == 1 else 'belong'} to no "
+        f"population of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore "
+        "withheld."
+    )
+    return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
+
+
+def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
+    """Decide the verdict from the results of a population of at least one case.
+
+    frame: all cases of the campaign
+    """
+    n, failures, decides_by_rate = evidence.n, evidence.failures, verdict.decide_by == ESTIMATE
+    rate = (n - failures) / n
+    with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=evidence.terrains)
+    if not sampling.independent:
+        reason = (
+            f"{'Evaluated by the observed rate of these cases. ' if decides_by_rate else ''}{sampling.no_probability}"
+        )
+        status = _status_by_rate(rate, n, verdict.probability) if decides_by_rate else verdict.status
+        return replace(with_counts, status=status, reason=reason)
+    in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look
+    looks = Looks(in_first_look, sampling.risk_fraction_at(len(frame)))
+    verdict_with_bounds, additional = _add_bounds(with_counts, evidence, looks)
+    status = verdict_with_bounds.confident_status
+    decides_by_rate = decides_by_rate and status is not Status.PASS
+    if decides_by_rate:
+        status = _status_by_rate(rate, n, verdict.probability)
+    verdict_with_bounds = replace(verdict_with_bounds, status=status)
+    if status is not Status.INSUFFICIENT:
+        return verdict_with_bounds
+    if decides_by_rate:
+        return replace(verdict_with_bounds, further_cases=min_cases_for_rate(verdict.probability) - n)
+    # number of additional cases, or advice if the campaign has too few terrains for them
+    clustered, supply = verdict_with_bounds.clustered, sampling.terrains
+    if clustered is None or supply is None or clustered.terrains + additional <= supply.terrains:
+        return replace(verdict_with_bounds, further_cases=additional)
+    needed_terrains = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
+    return replace(verdict_with_bounds, advice=supply.advice(needed_terrains, verdict.probability, verdict.confidence))
+
+
+def _status_by_rate(rate: float, n: int, probability: float) -> Status:
+    if rate < probability:
+        return Status.FAIL
+    return Status.MET_BY_RATE if n >= min_cases_for_rate(probability) else Status.INSUFFICIENT
+
+
+def _complete_columns(frame: pd.DataFrame, verdict: Verdict) -> pd.DataFrame:
+    """Add the columns of a requirement that are missing because no case finished; their values are missing."""
+    if frame.empty or not rates.engine_failed(frame).all():
+        return frame
+    flags = [name for name in verdict.population.split(" and ") if name not in ("all", "completed", "valid")]
+    missing = [name for name in (*verdict.metric.split(" + "), *flags) if name not in frame]
+    return frame.reindex(columns=[*frame.columns, *dict.fromkeys(missing)])
+
+
+def _describe_problem(frame: pd.DataFrame, verdict: Verdict) -> str:
+    """Describe why a requirement cannot be evaluated; empty if it can."""
+    for name in ("probability", "confidence"):
+        value = getattr(verdict, name)
+        if not 0.0 < value < 1.0:
+            return f"The requirement's {name} is {value}; it must lie between 0 and 1, both excluded."
+    missing_column = next((part for part in verdict.metric.split(" + ") if part not in frame), None)
+    if missing_column is not None:
+        return f"The rows have no column '{missing_column}', which is the requirement's metric."
+    if not math.isfinite(verdict.bound) and not rates.is_flag(frame, verdict.metric):
+        return "The requirement has no bound, and its metric is not a column of true and false."
+    return ""
+
+
+def _empty_verdict(requirement: Mapping[str, Any]) -> Verdict:
+    """Create the verdict without evidence; a decision by rate is added to the statement."""
+    decide_by, statement = str(requirement.get("decide_by", "confidence")), str(requirement.get("statement", ""))
+    if decide_by == ESTIMATE:
+        statement = f"{statement.rstrip('.')} (evaluated by observed rate).".lstrip()
+    return Verdict(
+        requirement_id=str(requirement.get("id", "?")),
+        statement=statement,
+        metric=str(requirement.get("metric", "?")),
+        bound=_to_float(requirement.get("bound")),
+        probability=_to_float(requirement.get("probability")),
+        confidence=_to_float(requirement.get("confidence")),
+        population=str(requirement.get("population", "all")),
+        decide_by=decide_by,
+        source=str(requirement.get("source") or ""),
+        kind=str(requirement.get("kind") or ""),
+        scale=_to_float(requirement.get("scale", 1.0)),
+        accept_rate=requirement.get("accept_rate") is True,
+    )
+
+
+def _to_float(value: object) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type]  # anything a JSON file may hold
+    except (TypeError, ValueError):
+        return math.nan
