@@ -17,8 +17,6 @@ from marsyard.algorithms.faults import Fault
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import compute_exit_code
-from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.verdicts import Status
 from marsyard.scenarios.interface import conditions_recorded_by
@@ -110,30 +108,25 @@ def _run_case(campaign: Campaign, names: Sequence[str], case: int) -> tuple[Row,
     return conditions, rows
 
 
-def find_failed_requirements(campaign: Campaign, frame: pd.DataFrame) -> tuple[list[str], int]:
-    """Evaluate a campaign's requirements on rows; return the ids of those that fail, and the exit status."""
+def find_failed_requirements(campaign: Campaign, frame: pd.DataFrame) -> list[str]:
+    """Evaluate a campaign's requirements on rows; return the ids of those that fail."""
     requirements = [item.model_dump() for item in campaign.configuration.requirements]
     sampling = read_sampling_design(campaign.configuration.model_dump(mode="json"))
     verdicts = evaluate_requirements(frame, requirements, sampling)
-    failed = [verdict.requirement_id for verdict in verdicts if verdict.status is Status.FAIL]
-    return failed, compute_exit_code(verdicts, bool(engine_failed(frame).any()))
+    return [verdict.requirement_id for verdict in verdicts if verdict.status is Status.FAIL]
 
 
 def measure_campaign(campaign_name: str, settings: Settings) -> Measure:
-    """Count the controls that fail no requirement of a campaign; those without an answer may end with exit status 1."""
+    """Count the controls that fail no requirement of a campaign."""
     return create_measure(*run_controls(campaign_name, settings))
 
 
 def create_measure(campaign: Campaign, frames: Mapping[str, pd.DataFrame]) -> Measure:
     """Create the row of a campaign from the rows of each control."""
-    cells, passing = [], 0
-    for name, frame in frames.items():
-        failed, exit_code = find_failed_requirements(campaign, frame)
-        is_stopped = name not in ANSWERING and exit_code == 1
-        passing += not failed and not is_stopped
-        cells.append(", ".join(failed) or ("exit status 1" if is_stopped else "**none**"))
+    failed = [find_failed_requirements(campaign, frame) for frame in frames.values()]
     claim = f"`{campaign.configuration.name}`, cases: {len(frames['Crash'])}"
-    return Measure(claim, float(passing), "1", 0.0, " | ".join(cells))
+    cells = " | ".join(", ".join(names) or "**none**" for names in failed)
+    return Measure(claim, float(failed.count([])), "1", 0.0, cells)
 
 
 def _check_controls(quick: bool) -> Iterator[Measure]:

@@ -1,4 +1,4 @@
-"""Tests of the negative controls: each fails a requirement, or ends with exit status 1, on small campaigns."""
+"""Tests of the negative controls: each fails a requirement on small campaigns."""
 
 from __future__ import annotations
 
