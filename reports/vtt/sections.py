@@ -300,12 +300,15 @@ def terrains_section(subject: Subject) -> Section | None:
     rows, data = [], []
     for name in ordered_names:
         runs = frame[frame["incline"].eq(name)]
-        selectable_runs, slips = selectable_targets(runs), rates.finite_values(runs, "slip_max")
+        is_stuck, slips = rates.flag_mask(runs, "stuck"), rates.finite_values(runs, "slip_max")
+        mobile_runs, stuck_runs = runs[~is_stuck], selectable_targets(runs[is_stuck])
+        selectable_runs = selectable_targets(mobile_runs)
         lost_runs = selectable_runs[~rates.flag_mask(selectable_runs, "tracked")]
         cause_counts = dict(Counter(failure_cause(row) for _, row in lost_runs.iterrows()).most_common())
         failure_fraction, failure_fraction_all = (
-            rates.flag_fraction(group, "tracked", value=False) for group in (selectable_runs, runs)
+            rates.flag_fraction(group, "tracked", value=False) for group in (selectable_runs, mobile_runs)
         )
+        held_fraction = rates.fraction_of(rates.flag_mask(stuck_runs, "target_held"), stuck_runs)
         slip = float(slips.max()) if slips.size else float("nan")
         row = printed_rows.get(name)
         paper = [NOTHING] * 2 if row is None else [f"{row['failures']} of {row['trials']}", row["reason"]]
@@ -315,12 +318,14 @@ def terrains_section(subject: Subject) -> Section | None:
             rates.interval_text(failure_fraction),
             causes,
             rates.fraction_text(failure_fraction_all),
+            rates.fraction_text(held_fraction) if held_fraction.n else NOTHING,
         ]
         rows.append([name, *paper, *simulated_texts, percent(slip)])
         fractions = {"failed": asdict(failure_fraction), "failed_all": asdict(failure_fraction_all)}
+        fractions["stuck_held"] = asdict(held_fraction)
         data.append({"name": name, **fractions, "causes": cause_counts, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
-    head += ["Cause, ours", "Failures, all targets", "Maximum wheel slip"]
+    head += ["Cause, ours", "Failures, all targets", "Stuck: target held", "Maximum wheel slip"]
     note = note_text("vtt.table_2", limit=f"{EXCESSIVE_DEG:g}")
     title = "Tracking with visual odometry on four kinds of ground (Table II of the paper)"
     return Section("table-2", "Kinds of ground", title, [Block(grid=Grid(head, rows), note=note)], {"terrains": data})

@@ -306,10 +306,27 @@ class CameraParameters(Parameters):
         return detector.model_copy(update={"optics": detector.optics.model_copy(update=changes)})
 
 
-class ScoreParameters(Parameters):
-    """Criterion for a tracked target, and number of updates that are stored in columns."""
+class MobilityParameters(Parameters):
+    """Criterion for a stuck rover, whose run ends: its true displacement over successive steps.
 
-    tracked_px: Positive = Field(default=10.0, description="maximum distance of a tracked target from the true pixel")
+    With a slip above the default an approach from 10 m to 2 m needs more than 80 steps of 10 % instead of 16.
+    """
+
+    stuck_slip: Annotated[
+        float, Field(gt=0.0, le=1.0, description="slip over `stuck_steps` successive steps above which a rover is stuck")
+    ] = 0.8
+    stuck_steps: Annotated[int, Field(ge=1, le=200, description="number of steps over which slip is measured")] = 5
+
+
+class ScoreParameters(Parameters):
+    """Criteria for tracked and falsely tracked targets, and number of updates that are stored in columns."""
+
+    tracked_px: Positive = Field(
+        default=5.0, description='maximum distance of a tracked target from the true pixel ("several pixels")'
+    )
+    false_track_px: Positive = Field(
+        default=10.0, description='distance from the true pixel above which a report is false ("extreme" drift)'
+    )
     stored_updates: int = Field(default=0, ge=0, le=100, description="number of first updates stored in columns")
 
 
@@ -328,6 +345,14 @@ class NavigationParameters(Parameters):
     elevation_deg: Annotated[float, bounded_field(-60.0, 0.0, "elevation of the mast for these images")] = -30.0
 
 
+class RunVariantParameters(Parameters):
+    """One of several different runs of a campaign: its leg, ground and rock replace those of the campaign."""
+
+    leg: Annotated[LegParameters, Field(description="the only leg of the run")] = LegParameters()
+    incline: InclineParameters = InclineParameters()
+    diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the target's rock")] = 0.8
+
+
 class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     """All parameters of the rover scenario."""
 
@@ -339,7 +364,10 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     obstacles: tuple[ObstacleParameters, ...] = ()
     start: StartParameters = StartParameters()
     legs: Annotated[tuple[LegParameters, ...], Field(min_length=1, description="legs, in order")] = (LegParameters(),)
+    variants: Annotated[tuple[RunVariantParameters, ...], Field(description="list of different runs")] = ()
+    variant: Annotated[int, Field(ge=0, description="number of the run in `variants`, from 0")] = 0
     slip: SlipParameters = SlipParameters()
+    mobility: MobilityParameters = MobilityParameters()
     navigation: NavigationParameters = NavigationParameters()
     odometry: OdometryParameters = OdometryParameters()
     pointing: PointingParameters = PointingParameters()
@@ -354,6 +382,26 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     vtt: VttOptions = Field(default=VttOptions(), description="tracker options; pure-ncc ignores scale and roll")
     score: ScoreParameters = ScoreParameters()
     backend: Backend = Field(default_factory=default_backend, description="OpenGL context provider")
+
+    @model_validator(mode="after")
+    def _check_variant(self) -> RoverScenarioParameters:
+        if self.variant >= max(len(self.variants), 1):
+            raise ValueError(f"variant is {self.variant}; allowed: 0 to {max(len(self.variants), 1) - 1}")
+        return self
+
+    def select_variant(self) -> RoverScenarioParameters:
+        """Return the parameters of the run `variant`; the same parameters without `variants`."""
+        if not self.variants:
+            return self
+        run = self.variants[self.variant]
+        changes = {
+            "legs": (run.leg,),
+            "world": self.world.model_copy(update={"incline": run.incline}),
+            "target": self.target.model_copy(update={"diameter_m": run.diameter_m}),
+            "variants": (),
+            "variant": 0,
+        }
+        return self.model_copy(update=changes)
 
     @property
     def bearing_rad(self) -> float:

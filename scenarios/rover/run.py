@@ -11,7 +11,7 @@ Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -36,7 +36,7 @@ from marsyard.scenarios.rover.flight_software import (
     plan_step,
 )
 from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, NavigationCameras, oracle_heights
-from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.parameters import LegParameters, MobilityParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
 from marsyard.scenarios.rover.stops import (
     DesignatedTarget,
@@ -85,13 +85,28 @@ class Setup:
         return Setup(world, rig, Vehicle.at_start(p, world, rig, streams), camera, navigation_cameras)
 
 
+@dataclass(frozen=True)
+class Step:
+    """Commanded path and true displacement of a step, metres."""
+
+    commanded_m: float
+    displacement_m: float
+
+
+def is_stuck(steps: Sequence[Step], mobility: MobilityParameters) -> bool:
+    """Whether the rover hardly moved over its last steps; False before `mobility.stuck_steps` steps."""
+    last = steps[-mobility.stuck_steps :]
+    commanded_m, displacement_m = sum(step.commanded_m for step in last), sum(step.displacement_m for step in last)
+    return len(last) == mobility.stuck_steps and displacement_m < (1.0 - mobility.stuck_slip) * commanded_m
+
+
 @dataclass
 class Run(Setup):
     """State of a run in progress or finished."""
 
     target: DesignatedTarget
     stops: list[Stop] = field(default_factory=list)  #: stops with a tracking update, in order
-    outcome: RunOutcome = RunOutcome.STUCK
+    outcome: RunOutcome = RunOutcome.NOT_AT_GOAL
     handed_over: bool = False  #: whether the target was handed over to the arm at the end
     visual_odometry_updates: int = 0
     visual_odometry_failures: int = 0  #: updates without an estimate; wheel odometry was used
@@ -100,6 +115,7 @@ class Run(Setup):
     odometry_pair: tuple[Stance, StereoMeasurement] | None = None  #: last pair of visual odometry, and its stance
     time_s: float = 0.0  #: time since the start
     drives_since_stop: list[Drive] = field(default_factory=list)
+    steps: list[Step] = field(default_factory=list)  #: all steps with a commanded path, in order
 
     @classmethod
     def from_setup(cls, setup: Setup, target: DesignatedTarget) -> Run:
@@ -247,7 +263,7 @@ def track_target(p: RoverScenarioParameters, run: Run) -> Run:
     else:
         has_goal = not last_leg.ends_with_steps and last_leg.motion in ("approach", "back-off")
         is_complete = not has_goal or is_finished(last_leg, 0, guide.target(run))
-        run.outcome = RunOutcome.COMPLETED if is_complete else RunOutcome.STUCK
+        run.outcome = RunOutcome.COMPLETED if is_complete else RunOutcome.NOT_AT_GOAL
     if run.outcome is RunOutcome.COMPLETED and last_leg.motion == "approach":
         goal = GoalCriterion(last_leg.goal_m, 2.0 * GOAL_TOLERANCE_M)
         result = hand_off(run.stops[-1].update, goal, run.rig.calibrated)
@@ -264,6 +280,8 @@ def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome
             map_terrain(p, run, leg, guide.target(run))
         while failure is None and not is_finished(leg, step_count, guide.target(run)):
             failure = drive_step(p, run, leg, step_count, guide.target(run)) or visit_stop(p, run, guide, number)
+            # a loss at this stop remains a failure of the tracker
+            failure = failure or (RunOutcome.STUCK if is_stuck(run.steps, p.mobility) else None)
             step_count += 1
     return failure
 
@@ -302,6 +320,7 @@ def drive_step(
         if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
             return RunOutcome.NO_PATH
         commands = plan.commands
+    start, commanded_m = run.vehicle.stance, 0.0
     for command in commands:
         part_count = 1
         if leg.visual_odometry:
@@ -312,6 +331,10 @@ def drive_step(
             run.time_s += part_count * p.timing.visual_odometry_s
         run.drives_since_stop += [drive_part(p, run, leg, command.part(1.0 / part_count)) for _ in range(part_count)]
         run.time_s += p.timing.drive_s
+        commanded_m += command.length_m
+    if commanded_m > 0.0:
+        ends = (stance.world_from_rover.translation for stance in (start, run.vehicle.stance))
+        run.steps.append(Step(commanded_m, float(np.linalg.norm(np.subtract(*ends)))))
     return None
 
 

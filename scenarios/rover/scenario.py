@@ -238,6 +238,10 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
     def __init__(self) -> None:
         super().__init__(MAX_GROUNDS)
 
+    def check_parameters(self, parameters: BaseModel) -> RoverScenarioParameters:
+        """Return the parameters of the selected run. Raises TypeError for parameters of another scenario."""
+        return super().check_parameters(parameters).select_variant()
+
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the runs."""
         return self.list_stored_terrains(self.check_parameters(parameters).world.bank)

@@ -51,9 +51,11 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
 
     - `tracked`: whether the run is completed and the last tracked pixel is within `tracked_px` of the true
       projection of the designated point
+    - `target_held`: the same at the last stop of a run with any outcome, for example of a stuck rover
+    - `stuck`, `mobile`: whether the rover hardly moved at the end (outcome STUCK), and the opposite
     - `position_error_m`: distance of the last reported position from the designated point; NaN if the run was not
       completed
-    - `false_updates`: number of updates that report the target farther than `tracked_px` from the true projection
+    - `false_updates`: number of updates that report the target farther than `false_track_px` from the true projection
     """
     errors = errors_px(run)
     error_sizes_px = np.hypot(*errors.T)
@@ -67,13 +69,17 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         line_of_sight = stop.point_rover - viewpoint
         range_error = float(error_m @ line_of_sight / np.linalg.norm(line_of_sight))
         cross_error = float(np.sqrt(np.maximum(float(error_m @ error_m) - range_error * range_error, 0.0)))
-    false_updates = int(np.count_nonzero(error_sizes_px > p.score.tracked_px))
+    false_updates = int(np.count_nonzero(error_sizes_px > p.score.false_track_px))
     drift = float(np.hypot(*last_error_px))
-    is_tracked = is_completed and drift <= p.score.tracked_px
+    is_held = bool(len(error_sizes_px) and error_sizes_px[-1] <= p.score.tracked_px)
+    is_tracked, is_stuck = is_completed and is_held, run.outcome is RunOutcome.STUCK
     loss_reasons = next((stop.update.losses for stop in run.stops if stop.update.losses), ())
     return {
         "tracked": is_tracked,
         "not_tracked": not is_tracked,
+        "target_held": is_held,
+        "stuck": is_stuck,
+        "mobile": not is_stuck,
         "no_false_track": false_updates == 0,
         "false_updates": false_updates,
         "position_error_m": float(np.linalg.norm(error_m)),
@@ -83,7 +89,7 @@ def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "drift_u_px": float(last_error_px[0]),
         "drift_v_px": float(last_error_px[1]),
         "worst_error_px": _finite_max(error_sizes_px),
-        "track_margin_px": p.score.tracked_px - _finite_max(error_sizes_px),
+        "track_margin_px": p.score.false_track_px - _finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), NAN),
         "handed_over": run.handed_over,
@@ -267,7 +273,7 @@ def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
         sun = run.world.sun.direction(stop.time_s)
         if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
             return True
-        if not error <= p.score.tracked_px:  # also for NaN: the target was not tracked
+        if not error <= p.score.false_track_px:  # also for NaN: the target was not tracked
             return False
     return False
 

@@ -136,14 +136,18 @@ class StereoCamera:
 
 
 class RunOutcome(Enum):
-    """Outcome of a run. All outcomes except COMPLETED are expected failures: no position is reported at the goal."""
+    """Outcome of a run. All outcomes except COMPLETED are expected failures: no position is reported at the goal.
+
+    NOT_SEEDED and LOST are failures of the tracker. STUCK is a property of rover and ground: the target may be tracked.
+    """
 
     COMPLETED = "the run was completed and the target was tracked at its end"
     NOT_SEEDED = "the target was not found in the first images"
     LOST = "the target was lost and was not found again"
     OUT_OF_REACH = "the mast or the cameras cannot show the target"
     NO_PATH = "the navigator found no path"
-    STUCK = "the maximum number of steps was reached before the goal"
+    STUCK = "the rover hardly moved over several steps"
+    NOT_AT_GOAL = "the maximum number of steps was reached before the goal"
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ def make_rows(cases: int, **columns: Any) -> pd.DataFrame:
     defaults: dict[str, Any] = {
         "case": np.arange(cases),
         "outcome": "COMPLETED",
-        **dict.fromkeys(("answered", "tracked", "no_false_track", "selectable", "clear_sky"), True),
-        **dict.fromkeys(("not_tracked", "visual_odometry", "autonav"), False),
+        **dict.fromkeys(("answered", "tracked", "target_held", "no_false_track", "selectable", "clear_sky"), True),
+        **dict.fromkeys(("not_tracked", "stuck", "visual_odometry", "autonav"), False),
         "position_error_m": 0.004,
         "range_error_m": 0.003,
         "cross_error_m": 0.002,
