@@ -29,7 +29,7 @@ MAX_ERROR_M, QUANTILE = 0.03, 0.99
 #: Names of the rates of a camera's runs at selectable targets, and their keys in `summarize_cameras`.
 _RATES: Mapping[str, str] = {
     "Completed": "completed",
-    "Within 10 px of the true projection at the goal": "tracked",
+    "Within 5 px of the true projection at the goal": "tracked",
     f"Within {100.0 * MAX_ERROR_M:g} cm (of completed runs)": "within",
     "False track": "false_tracks",
 }
@@ -61,9 +61,16 @@ def is_closed_loop(frame: pd.DataFrame) -> bool:
     return is_tracking(frame) and "skipped_stops" not in frame
 
 
-def selectable_targets(frame: pd.DataFrame) -> pd.DataFrame:
-    """Select rows with selectable targets: sunlit, in both images to the end, on the rock's face, not on its edge."""
-    return frame[rates.all_flags(frame, "selectable", "in_view", "on_face")]
+def selectable_targets(frame: pd.DataFrame, face: bool = True) -> pd.DataFrame:
+    """Select rows with selectable targets: sunlit, in both images to the end, not on the rock's edge.
+
+    In shared drives, whose path does not depend on the tracker, the rover's shadow is never on the target. With `face`,
+    the target is also on the rock's face, where the campaign defines it.
+    """
+    names = ["selectable", "in_view", *(["on_face"] if face else [])]
+    if "skipped_stops" in frame:
+        names.append("no_rover_shadow_on_target")
+    return frame[rates.all_flags(frame, *names)]
 
 
 def goal_rows(subject: Subject) -> Rows | None:
@@ -195,7 +202,7 @@ def losses_note(frame: Rows) -> str:
         f"{loss.name.replace('_', ' ').capitalize()}: {loss.value}." for loss in TargetLoss if loss.name in occurring
     ]
     text = (
-        'The runs ended without the target within 10 px of its true projection. "Lost by" gives the criteria (section '
+        'The runs ended without the target within 5 px of its true projection at the goal. "Lost by" gives the criteria (section '
         "4.6 of the paper) of the first update that lost the target. Ranges are medians, with minimum to maximum in "
         "brackets. The azimuth change is that of the line of sight in the world between two updates with a match."
     )

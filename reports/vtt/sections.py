@@ -165,8 +165,8 @@ _LINE_COLUMNS = ("algorithm", "search_px")
 _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
 _OBLIQUITY_NOTE = (
     "Obliquity: angle between the line of sight and the surface normal at the target; 0 is face-on. Rows are classes "
-    "of its maximum over the stops, columns are steps. Cells: tracked targets, of sunlit targets in view to the end. "
-    "The template is scaled and rolled, but not foreshortened like the image of a rotating oblique patch."
+    "of its maximum over the stops, columns are steps. Cells: tracked targets, of selectable targets. The template is "
+    "scaled and rolled, but not foreshortened like the image of an oblique patch, in the next image or in the right one."
 )
 #: Edges of the classes of maximum obliquity, deg.
 _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)
@@ -211,7 +211,7 @@ def steps_section(subject: Subject) -> Section | None:
     grid = build_grid(steps, columns)
     svg_figures = [svg_figure(rate_figure(lines, (xlabel, "targets tracked")), "steps", caption)]
     blocks = [Block(text=motion["text"], figures=svg_figures), Block(grid=grid, note=_STEPS_NOTE)]
-    oblique = None if motion["per_cent"] else _obliquity_grid(subject.frame)
+    oblique = _obliquity_grid(subject.frame, "%" if motion["per_cent"] else "deg")
     if oblique is not None:
         blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=_OBLIQUITY_NOTE))
     keys = ("good", "all_targets", "false_tracks")
@@ -269,19 +269,27 @@ def _group_by_line(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
         yield name, frame[frame[column].eq(value)]
 
 
-def _obliquity_grid(frame: Rows) -> Grid | None:
-    """Create a table of tracked targets by maximum obliquity and step size; None if rows contain no obliquities."""
+def _obliquity_grid(frame: Rows, unit: str) -> Grid | None:
+    """Create a table of tracked targets by maximum obliquity and step size; None if rows contain no obliquities.
+
+    Trackers have separate rows; search windows are pooled.
+    """
     if "obliquity_max_deg" not in frame:
         return None
-    visible = frame[rates.all_flags(frame, "selectable", "in_view") & frame["obliquity_max_deg"].notna().to_numpy()]
+    visible = selectable_targets(frame[frame["obliquity_max_deg"].notna()], face=False)
     steps = sorted(visible["step"].unique())
+    has_trackers = "algorithm" in visible and visible["algorithm"].nunique() > 1
     rows = []
-    for low, high in pairwise(_OBLIQUITY_EDGES_DEG):
-        class_rows = visible[visible["obliquity_max_deg"].between(low, high, inclusive="left")]
-        if len(class_rows):
-            fractions = [rates.flag_fraction(class_rows[class_rows["step"].eq(step)], "tracked") for step in steps]
-            rows.append([f"{low:g} to {high:g}", *(f"{fraction.hits:,} of {fraction.n:,}" for fraction in fractions)])
-    return Grid(["Maximum obliquity (deg)", *(f"{step:g} deg" for step in steps)], rows) if rows else None
+    for name, line_rows in _group_by_line(visible) if has_trackers else [("", visible)]:
+        for low, high in pairwise(_OBLIQUITY_EDGES_DEG):
+            class_rows = line_rows[line_rows["obliquity_max_deg"].between(low, high, inclusive="left")]
+            if len(class_rows):
+                fractions = [rates.flag_fraction(class_rows[class_rows["step"].eq(step)], "tracked") for step in steps]
+                cells = [f"{low:g} to {high:g}", *(f"{fraction.hits:,} of {fraction.n:,}" for fraction in fractions)]
+                rows.append([name, *cells] if has_trackers else cells)
+    scale = 100.0 if unit == "%" else 1.0
+    head = ["Maximum obliquity (deg)", *(f"{scale * step:.3g} {unit}" for step in steps)]
+    return Grid(["Tracker", *head] if has_trackers else head, rows) if rows else None
 
 
 #: Minimum change of azimuth that the paper calls excessive, degrees (section 5.5).

@@ -313,7 +313,8 @@ class MobilityParameters(Parameters):
     """
 
     stuck_slip: Annotated[
-        float, Field(gt=0.0, le=1.0, description="slip over `stuck_steps` successive steps above which a rover is stuck")
+        float,
+        Field(gt=0.0, le=1.0, description="slip over `stuck_steps` successive steps above which a rover is stuck"),
     ] = 0.8
     stuck_steps: Annotated[int, Field(ge=1, le=200, description="number of steps over which slip is measured")] = 5
 

@@ -23,6 +23,7 @@ from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
 from marsyard.algorithms.navigation.planner import NavigationOutcome
 from marsyard.algorithms.navigation.visual_odometry import VisualOdometry, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.placement import Placement
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
 from marsyard.scenarios.algorithm_run import InputCopy, answer_time_s
 from marsyard.scenarios.base import LoadGround
@@ -108,6 +109,7 @@ class Run(Setup):
     stops: list[Stop] = field(default_factory=list)  #: stops with a tracking update, in order
     outcome: RunOutcome = RunOutcome.NOT_AT_GOAL
     handed_over: bool = False  #: whether the target was handed over to the arm at the end
+    placement: Placement | None = None  #: placement of the instrument; None without a hand-over
     visual_odometry_updates: int = 0
     visual_odometry_failures: int = 0  #: updates without an estimate; wheel odometry was used
     autonav_updates: int = 0

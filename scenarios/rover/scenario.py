@@ -33,7 +33,7 @@ from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import compute_scores
-from marsyard.scenarios.rover import score
+from marsyard.scenarios.rover import placement, score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run import (
     DesignationGuide,
@@ -219,13 +219,17 @@ def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | N
     return run
 
 
-def evaluate_drive_visibility(drive: SharedDrive, point: PointParameters, options: VttOptions) -> Visibility:
-    """Evaluate the visibility of a target along a drive."""
+def evaluate_drive_visibility(
+    p: RoverScenarioParameters, drive: SharedDrive, point: PointParameters, options: VttOptions
+) -> tuple[Visibility, dict[str, Scalar]]:
+    """Evaluate the visibility of a target along a drive, and the columns of the rover's shadow on it, at all stops."""
     world, rig, first = drive.run.world, drive.run.rig, drive.views[0]
     position = point.across, point.up
     target = designate_point(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
     heads = [view.world_from_head for view in drive.views]
-    return evaluate_visibility(world, rig, target.point_world, heads, options)
+    visibility = evaluate_visibility(world, rig, target.point_world, heads, options)
+    run = Run.from_setup(drive.run, target)
+    return visibility, score.shadow_columns(p.model_copy(update={"vtt": options}), run, drive.views)
 
 
 class RoverScenario(TerrainScenario[RoverScenarioParameters]):
@@ -259,14 +263,14 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         p = self.check_parameters(parameters)
         start_s = time.process_time()
         first = prepare_run(p, streams, self.load_ground)
-        shared = score.fixed_conditions(p, first)
+        shared = {**score.fixed_conditions(p, first), **placement.placement_truth(first)}
 
         def evaluate(algorithm: str) -> CaseResult:
             is_tested = algorithm == p.algorithm
             candidate = p.model_copy(update={"algorithm": algorithm})
             run_start_s = start_s if is_tested else time.process_time()
             run = first if is_tested else prepare_run(candidate, streams, self.load_ground)
-            return _evaluate(p, lambda: track_target(candidate, run), shared, is_tested, run_start_s)
+            return _evaluate(p, lambda: place_target(track_target(candidate, run)), shared, is_tested, run_start_s)
 
         return case_result(p.algorithms, evaluate, shared)
 
@@ -284,7 +288,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         super().__init__(MAX_GROUNDS)
         self._drive = lru_cache(maxsize=MAX_DRIVES)(partial(render_drive, load_ground=self.load_ground))
         self._visibility = lru_cache(maxsize=MAX_VISIBILITIES)(
-            lambda key, point, options: evaluate_drive_visibility(self._drive(key), point, options)
+            lambda key, point, options: evaluate_drive_visibility(key.drive, self._drive(key), point, options)
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
@@ -307,7 +311,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         key, point, algorithm = DriveKey.from_parameters(p, streams), p.targets[p.target], p.drive.algorithm
         drive = self._drive(key)
         case = key.drive.model_copy(update={"algorithm": algorithm, "vtt": p.drive.vtt})
-        visibility = self._visibility(key, point, p.drive.vtt)
+        visibility, shadow_columns = self._visibility(key, point, p.drive.vtt)
         shared = {
             **score.fixed_conditions(case, prepare_shared_run(p, drive)),
             "run": p.run,
@@ -320,6 +324,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             "pure_ncc": algorithm == "pure-ncc",
             **{entry.name: bool(entry.min <= p.step <= entry.max) for entry in p.step_ranges},
             **asdict(visibility),
+            **shadow_columns,
             "on_face": visibility.in_view
             and (p.max_obliquity_deg is None or visibility.obliquity_max_deg <= p.max_obliquity_deg),
         }
@@ -328,6 +333,15 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             return _evaluate(case, lambda: track_views(p, drive, name), shared, name == algorithm)
 
         return case_result(p.drive.algorithms, evaluate, shared)
+
+
+def place_target(run: Run) -> Run:
+    """Place the instrument on a target that was handed over to the arm; return the run."""
+    target = run.stops[-1].update.position_rover if run.handed_over else None
+    if target is not None:
+        measurements = run.stops[-1].measurements(run.rig.calibrated)
+        run.placement = placement.auto_place(measurements, np.asarray(target))
+    return run
 
 
 def _evaluate(
@@ -352,6 +366,7 @@ def _evaluate(
     run, row = algorithm_run.answer
     if start_s is not None:
         row["run_time_s"] = time.process_time() - start_s
+        row |= placement.placement_row(run)
         row |= score.visibility_columns(p, run) if is_tested else {}
     if is_tested:
         digest = hashlib.sha256(b"".join(stop.images.digest for stop in run.stops)).hexdigest()

@@ -5,7 +5,7 @@ Tables and figures are those of Kim et al., "Targeted Driving Using Visual Track
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 
 import numpy as np
@@ -19,8 +19,7 @@ from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.scenarios.rover.run import Run
-from marsyard.scenarios.rover.stops import RunOutcome, evaluate_visibility
-from marsyard.sim.measurements import RoverMeasurements
+from marsyard.scenarios.rover.stops import RunOutcome, View, evaluate_visibility
 
 NAN = float("nan")
 #: Quantities of each update, in the order of the columns of stored updates.
@@ -229,10 +228,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         pose_error = float(np.linalg.norm(position_error))
     sun = [world.sun.direction(time_s) for time_s in times]
     exposures = np.array([stop.images.exposure_s for stop in stops], dtype=np.float64)
-    is_shadowed = _is_rover_shadow_on_target(p, run)
     return {
-        "rover_shadow_on_target": is_shadowed,
-        "no_rover_shadow_on_target": not is_shadowed,
         "range_start_m": ranges[0],
         "range_end_m": ranges[1],
         "tilt_max_deg": float(np.degrees(_finite_max(np.array([stop.stance.tilt_rad for stop in stops])))),
@@ -250,32 +246,35 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
 
 
 def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
-    """Compute the columns of the designated point's visibility at the stops of a run.
+    """Compute the columns of the designated point's visibility at the stops of a run, and of the rover's shadow on it.
+
+    Stops count up to the first one with a lost or falsely tracked point: later poses follow from the tracker's error.
 
     A run without stops has not lost sight of the point: it counts, as a failure, in the population of visible targets.
     """
     if not run.stops:
-        return {"point_in_view": True, "obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
+        obliquity = {"obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
+        return {"point_in_view": True, **obliquity, **shadow_columns(p, run, [])}
     heads = [stop.world_from_head for stop in run.stops]
     columns = asdict(evaluate_visibility(run.world, run.rig, run.target.point_world, heads, p.vtt))
-    return {"point_in_view": columns.pop("in_view"), **columns}
+    # NaN (not tracked) is an error, too
+    errors = np.nan_to_num(np.hypot(*errors_px(run).T), nan=np.inf) > p.score.false_track_px
+    end = int(np.argmax(errors)) + 1 if np.any(errors) else len(run.stops)
+    return {"point_in_view": columns.pop("in_view"), **columns, **shadow_columns(p, run, run.stops[:end])}
 
 
-def _is_rover_shadow_on_target(p: RoverScenarioParameters, run: Run) -> bool:
-    """Return whether the rover's shadow was on the template up to the first stop with a lost or falsely tracked point.
-
-    The poses at later stops are a consequence of the tracker's error.
-    """
+def shadow_columns(p: RoverScenarioParameters, run: Run, views: Sequence[View]) -> dict[str, Scalar]:
+    """Compute the columns of the rover's shadow: whether it is on the template of the designated point in any view."""
     half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
-    for stop, error in zip(run.stops, np.hypot(*errors_px(run).T), strict=True):
-        viewpoint = run.rig.camera_positions(stop.world_from_head)[0]
+
+    def is_in_shadow(view: View) -> bool:
+        viewpoint = run.rig.camera_positions(view.world_from_head)[0]
         patch = sample_template(viewpoint, run.target.point_world, half_angle)
-        sun = run.world.sun.direction(stop.time_s)
-        if p.rover_shadow and rover_shades_patch(run.vehicle.rover, stop.stance, mast, stop.angles_rad, patch, sun):
-            return True
-        if not error <= p.score.false_track_px:  # also for NaN: the target was not tracked
-            return False
-    return False
+        sun = run.world.sun.direction(view.time_s)
+        return rover_shades_patch(run.vehicle.rover, view.stance, mast, view.angles_rad, patch, sun)
+
+    is_shadowed = p.rover_shadow and any(is_in_shadow(view) for view in views)
+    return {"rover_shadow_on_target": is_shadowed, "no_rover_shadow_on_target": not is_shadowed}
 
 
 def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
@@ -348,9 +347,6 @@ def create_scored_run(run: Run) -> ScoredRun:
         target_world=run.target.point_world.copy(),
         world_from_rover=tuple(stop.stance.world_from_rover for stop in run.stops),
         point_px=np.array([stop.point_px for stop in run.stops]).reshape(-1, 2),
-        measurements=tuple(
-            RoverMeasurements(stop.images.left, stop.images.right, mast, *stop.angles_rad, stop.estimated_pose)
-            for stop in run.stops
-        ),
+        measurements=tuple(stop.measurements(mast) for stop in run.stops),
         answers=tuple(stop.update for stop in run.stops),
     )

@@ -30,6 +30,7 @@ from marsyard.sim.measurements import (
     MastCalibration,
     MastImage,
     PixelTarget,
+    RoverMeasurements,
     RoverTarget,
     SiteTarget,
     TargetDesignation,
@@ -162,6 +163,10 @@ class View:
     world_from_head: RigidTransform  #: true pose of the mast's head
     images: StereoImages
     drives: tuple[Drive, ...]  #: drives since the previous stop
+
+    def measurements(self, mast: MastCalibration) -> RoverMeasurements:
+        """Return the measurements of the stop, with the calibrated mast."""
+        return RoverMeasurements(self.images.left, self.images.right, mast, *self.angles_rad, self.estimated_pose)
 
 
 @dataclass(frozen=True)

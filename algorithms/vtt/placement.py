@@ -1,0 +1,152 @@
+"""Placement of an instrument on the target: surface from stereo, collision check, re-selection (section 7.4).
+
+After the hand-off of the target, the flight software AutoPlace measures the surface around it by stereo, predicts
+collisions of the arm's tools with the terrain, and selects another target nearby if necessary (on sol 1216 a target 8 mm
+away). The paper states neither its algorithm nor the tools; those of this module are assumptions (docs/adr/0017).
+
+The section is that of Kim et al., "Targeted Driving Using Visual Tracking".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from jaxtyping import Float64
+
+from marsyard.algorithms.arrays import Points3, Vector3
+from marsyard.algorithms.navigation.stereo import RectifiedPair
+from marsyard.sim.measurements import RoverMeasurements, StereoMeasurement
+
+#: Spacing of the positions that are checked, metres.
+_SPACING_M = 0.002
+#: Minimum number of surface points on the contact disc.
+_MIN_POINTS = 20
+#: Depths of surface points, divided by the target's depth.
+_DEPTHS = (0.7, 1.5)
+
+
+class PlacementOutcome(Enum):
+    """Outcome of a placement. PLACED and RESELECTED are successes."""
+
+    PLACED = "the instrument is placed on the target"
+    RESELECTED = "the instrument is placed on another position near the target"
+    COLLISION = "at all positions near the target the tools would collide with the terrain"
+    NO_SURFACE = "stereo measured too few points of the surface"
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """The tools on the arm: a contact disc, and around it a disc of tools that is further back.
+
+    - contact_m: radius of the contact disc
+    - tools_m: radius of the disc that contains the tools
+    - clearance_m: distance of the tools behind the contact disc
+    - max_reselection_m: maximum distance of a re-selected position from the target
+    """
+
+    contact_m: float = 0.02
+    tools_m: float = 0.05
+    clearance_m: float = 0.015
+    max_reselection_m: float = 0.008
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Outcome of a placement, and position and outward normal of the contact disc, rover frame; None if not placed."""
+
+    outcome: PlacementOutcome
+    position_rover: Vector3 | None = None
+    normal_rover: Vector3 | None = None
+
+
+def measure_surface(measurements: RoverMeasurements, target_rover: Vector3) -> Points3:
+    """Measure the surface around a target by dense stereo of the mast's pair, rover frame, metres."""
+    left, right, mast = measurements.left, measurements.right, measurements.mast
+    images, sizes = (left, right), [np.array(image.counts.shape[::-1]) for image in (left, right)]
+    # one box that contains both subframes: the rectified images then have a common field of view
+    corners = np.array([left.corner, right.corner])
+    start = corners.min(axis=0)
+    columns, rows = (corners + sizes).max(axis=0) - start
+    counts = [np.zeros((rows, columns), dtype=np.uint16) for _ in images]
+    for canvas, image, corner, size in zip(counts, images, corners - start, sizes, strict=True):
+        canvas[corner[1] : corner[1] + size[1], corner[0] : corner[0] + size[0]] = image.counts
+    rover_from_head = mast.geometry.rover_from_head(measurements.azimuth_rad, measurements.elevation_rad)
+    box = int(start[0]), int(start[1]), (int(columns), int(rows))
+    cameras = (mast.left.transform(rover_from_head).crop(*box), mast.right.transform(rover_from_head).crop(*box))
+    pair = RectifiedPair.from_measurement(StereoMeasurement(counts[0], counts[1], cameras))
+    depth = float((target_rover - pair.camera.c) @ pair.camera.a)
+    return pair.points(_DEPTHS[0] * depth, _DEPTHS[1] * depth)
+
+
+def surface_heights(
+    surface: Points3, position: Vector3, normal: Vector3, radius_m: float
+) -> Float64[np.ndarray, "points"]:
+    """Compute the heights along `normal` above `position` of the surface points within a radius of the axis."""
+    offsets = surface - position
+    heights = offsets @ normal
+    distances = np.linalg.norm(offsets - heights[:, None] * normal, axis=1)
+    return np.asarray(heights[distances <= radius_m])
+
+
+def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3, instrument: Instrument) -> float:
+    """Compute how far the surface protrudes beyond the tools with the contact disc at its median height under the disc.
+
+    A positive overlap is a collision; negative values are the remaining clearance. NaN without points at the contact.
+    """
+    contact = surface_heights(surface, position, normal, instrument.contact_m)
+    if not contact.size:
+        return float("nan")
+    tools = surface_heights(surface, position, normal, instrument.tools_m)
+    return float(tools.max() - np.median(contact) - instrument.clearance_m)
+
+
+def fit_plane(points: Points3, viewpoint: Vector3) -> tuple[Vector3, Vector3]:
+    """Fit a plane by least squares; return its centre and the unit normal towards the viewpoint."""
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][2]
+    return centre, normal if normal @ (viewpoint - centre) > 0.0 else -normal
+
+
+def place_instrument(
+    surface: Points3, target: Vector3, viewpoint: Vector3, instrument: Instrument | None = None
+) -> Placement:
+    """Place the instrument at the position nearest to the target at which its tools do not collide.
+
+    `surface` contains measured points, `viewpoint` is the position of the camera; all in the rover frame, metres.
+    """
+    instrument = Instrument() if instrument is None else instrument
+    reach_m = instrument.tools_m + instrument.max_reselection_m
+    nearby = surface[np.linalg.norm(surface - target, axis=1) <= 2.0 * reach_m]
+    around = nearby[np.linalg.norm(nearby - target, axis=1) <= instrument.tools_m]
+    if len(around) < _MIN_POINTS:
+        return Placement(PlacementOutcome.NO_SURFACE)
+    _, across = fit_plane(around, viewpoint)
+    is_measured = False
+    for offset in _offsets(across, instrument.max_reselection_m):
+        centre = target + offset
+        offsets = nearby - centre
+        in_plane = np.linalg.norm(offsets - (offsets @ across)[:, None] * across, axis=1)
+        contact = nearby[in_plane <= instrument.contact_m]
+        if len(contact) < _MIN_POINTS:
+            continue
+        is_measured = True
+        point, normal = fit_plane(contact, viewpoint)
+        position = centre + ((point - centre) @ normal) / (across @ normal) * across
+        if tool_overlap_m(nearby, position, normal, instrument) <= 0.0:
+            outcome = PlacementOutcome.PLACED if not np.any(offset) else PlacementOutcome.RESELECTED
+            return Placement(outcome, position, normal)
+    return Placement(PlacementOutcome.COLLISION if is_measured else PlacementOutcome.NO_SURFACE)
+
+
+def _offsets(normal: Vector3, radius_m: float) -> Points3:
+    """Create the offsets of a square grid within a radius, perpendicular to a normal, from near to far."""
+    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    first /= np.linalg.norm(first)
+    count = int(radius_m / _SPACING_M + 1e-9)
+    steps = _SPACING_M * np.arange(-count, count + 1)
+    grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    radii = np.hypot(*grid.T)
+    grid = grid[np.argsort(radii, kind="stable")][: int(np.count_nonzero(radii <= radius_m + 1e-9))]
+    return np.asarray(grid @ np.stack([first, np.cross(normal, first)]))
