@@ -1,8 +1,8 @@
 """Placement of an instrument on the target: surface from stereo, collision check, re-selection (section 7.4).
 
 After the hand-off of the target, the flight software AutoPlace measures the surface around it by stereo, predicts
-collisions of the arm's tools with the terrain, and selects another target nearby if necessary (on sol 1216 a target 8 mm
-away). The paper states neither its algorithm nor the tools; those of this module are assumptions (docs/adr/0017).
+collisions of the arm's tools with the terrain, and selects another target nearby if necessary (on sol 1216 a target
+8 mm away). The paper states neither its algorithm nor the tools; both are assumptions (docs/adr/0017).
 
 The section is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """

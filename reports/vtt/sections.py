@@ -166,7 +166,7 @@ _STEPS_NOTE = note_text("vtt.steps", confidence=format_fraction(CONFIDENCE))
 _OBLIQUITY_NOTE = (
     "Obliquity: angle between the line of sight and the surface normal at the target; 0 is face-on. Rows are classes "
     "of its maximum over the stops, columns are steps. Cells: tracked targets, of selectable targets. The template is "
-    "scaled and rolled, but not foreshortened like the image of an oblique patch, in the next image or in the right one."
+    "scaled and rolled, but not foreshortened like the image of an oblique patch, in the next image or the right one."
 )
 #: Edges of the classes of maximum obliquity, deg.
 _OBLIQUITY_EDGES_DEG = (0.0, 45.0, 60.0, 65.0, 70.0, 90.0)

@@ -1,4 +1,4 @@
-"""Tests of the placement of the instrument at the end of a run: measured surface, re-selection, and the true overlap."""
+"""Tests of the placement of the instrument at the end of a run: measured surface, position, and true overlap."""
 
 from typing import Any
 
@@ -39,8 +39,8 @@ def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, Run]) -> Non
     assert (row["placed"], row["placement_safe"]) == (True, True)
     assert run.placement is not None
     # along the normal the contact is on the measured surface, within 3 cm; across, within 8 mm
-    assert row["placement_error_m"] < 0.03
-    assert row["tool_overlap_m"] <= 0.0
+    assert float(row["placement_error_m"]) < 0.03
+    assert float(row["tool_overlap_m"]) <= 0.0
 
 
 def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, Run]) -> None:
@@ -59,7 +59,7 @@ def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, Run]) -> 
 
 
 def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, Run]) -> None:
-    """A tool axis tilted by 60 deg from the surface normal buries the tools: 5 cm x tan(60 deg) exceeds the clearance."""
+    """A tool axis tilted by 60 deg from the surface normal: 5 cm x tan(60 deg) exceeds the clearance."""
     _, run = placed_run
     assert run.placement is not None
     assert run.placement.normal_rover is not None
