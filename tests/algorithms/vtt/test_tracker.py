@@ -248,6 +248,28 @@ def test_warp_increases_the_stereo_score_of_a_slanted_face() -> None:
     assert scores["shift"] < scores["bend"] - 0.1
 
 
+def test_stereo_criterion_loses_slanted_faces_at_any_step_size() -> None:
+    """The stereo score depends on the last pair only: steps of 5 % and 23 % lose the same target, although it is matched.
+
+    The right camera sees a face at 66 deg compressed; the minimum score of 0.7 is not reached near the goal.
+    """
+    target, slant = np.array([4.0, 0.0, 0.5]), np.radians(66.0)
+    face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
+    for fraction in (0.05, 0.23):
+        last_updates = []
+        for min_score in (0.7, 0.0):
+            tracker = VisualTargetTracker(VttOptions(search_px=101, min_stereo_score=min_score))
+            drive = Drive(make_scene(face, target, 3), navcam(), tracker)
+            stops = drive_to_target(drive, target, fraction)
+            error_px = np.linalg.norm(get_pixel(stops[-1][1]) - drive.true_pixel(stops[-1][0], target))
+            last_updates.append((stops[-1][1], float(error_px)))
+        (lost_update, error_at_loss_px), (tracked_update, error_px) = last_updates
+        assert lost_update.losses == (TargetLoss.LOW_STEREO_SCORE,)
+        assert tracked_update.tracked
+        # several pixels (5 px), as in the paper
+        assert max(error_at_loss_px, error_px) < 5.0
+
+
 def test_slip_appears_as_a_position_correction() -> None:
     # The rover drives 4 % less than estimated: 4 cm in the first metre, a displacement of at most 5 px in the image.
     target = np.array([8.0, 0.1, 0.2])
