@@ -357,8 +357,10 @@ def regression_section(subject: Subject) -> Section | None:
     if subject.run.name != REGRESSION or not is_closed_loop(frame) or "visual_odometry" not in frame:
         return None
     map_source = frame["map_by"] if "map_by" in frame else pd.Series("none", index=frame.index)
-    driving_text = np.where(frame["visual_odometry"].astype(bool), "visual odometry", "blind")
-    autonav_text = ("Autonav by " + map_source.astype(str) + " cameras").to_numpy()
+    has_odometry = frame["visual_odometry"].astype(bool)
+    driving_text = np.where(has_odometry, "visual odometry", "blind")
+    odometry_text = np.where(has_odometry, ", visual odometry", "")
+    autonav_text = ("Autonav by " + map_source.astype(str) + " cameras" + odometry_text).to_numpy()
     rows_with_labels = frame.assign(
         driving=np.where(frame["autonav"].astype(bool), autonav_text, driving_text),
         rock=np.where(numbers(frame, "rock_height_m") <= MAX_SMALL_ROCK_M, "small", "large"),

@@ -242,14 +242,15 @@ def test_table_2_has_the_printed_sums() -> None:
 
 
 def test_regression_runs_are_listed_by_driving_mode() -> None:
-    frame = make_rows(4, visual_odometry=[False, True, False, False], autonav=[False, False, True, True])
-    frame = frame.assign(map_by=["none", "none", "body", "mast"], rock_height_m=[0.09, 0.09, 0.5, 0.5])
+    frame = make_rows(5, visual_odometry=[False, True, False, False, True], autonav=[False, False, True, True, True])
+    frame = frame.assign(map_by=["none", "none", "body", "mast", "mast"], rock_height_m=[0.09, 0.09, 0.5, 0.5, 0.5])
     set_values(frame, 3, tracked=False, outcome="NO_PATH", losses="none")
     section = regression_section(make_subject(frame, REGRESSION))
     mode_rows = [(row["Driving"], row["Rock"], row["Tracked to the goal"]) for row in read_table(section)]
     assert mode_rows == [
         ("Autonav by body cameras", "large", "1 of 1: 100 %"),
         ("Autonav by mast cameras", "large", "0 of 1: 0 %"),
+        ("Autonav by mast cameras, visual odometry", "large", "1 of 1: 100 %"),
         ("blind", "small", "1 of 1: 100 %"),
         ("visual odometry", "small", "1 of 1: 100 %"),
     ]
