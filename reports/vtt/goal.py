@@ -203,8 +203,9 @@ def losses_note(frame: Rows) -> str:
     ]
     text = (
         'The runs ended without the target within 5 px of its true projection at the goal. "Lost by" gives the '
-        "criteria (section 4.6 of the paper) of the first update that lost the target. Ranges are medians, with minimum "
-        "to maximum in brackets. The azimuth change is that of the line of sight in the world between two updates with a match."
+        "criteria (section 4.6 of the paper) of the first update that lost the target. Ranges are medians, with "
+        "minimum to maximum in brackets. The azimuth change is that of the line of sight in the world between two "
+        "updates with a match."
     )
     return " ".join([text, *meanings])
 

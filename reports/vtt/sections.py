@@ -357,13 +357,14 @@ def regression_section(subject: Subject) -> Section | None:
     if subject.run.name != REGRESSION or not is_closed_loop(frame) or "visual_odometry" not in frame:
         return None
     map_source = frame["map_by"] if "map_by" in frame else pd.Series("none", index=frame.index)
-    has_odometry = frame["visual_odometry"].astype(bool)
-    driving_text = np.where(has_odometry, "visual odometry", "blind")
-    odometry_text = np.where(has_odometry, ", visual odometry", "")
-    autonav_text = ("Autonav by " + map_source.astype(str) + " cameras" + odometry_text).to_numpy()
+    driving_text = [
+        f"Autonav by {cameras} cameras{', visual odometry' * bool(odometry)}"
+        if autonav
+        else ("visual odometry" if odometry else "blind")
+        for autonav, odometry, cameras in zip(frame["autonav"], frame["visual_odometry"], map_source, strict=True)
+    ]
     rows_with_labels = frame.assign(
-        driving=np.where(frame["autonav"].astype(bool), autonav_text, driving_text),
-        rock=np.where(numbers(frame, "rock_height_m") <= MAX_SMALL_ROCK_M, "small", "large"),
+        driving=driving_text, rock=np.where(numbers(frame, "rock_height_m") <= MAX_SMALL_ROCK_M, "small", "large")
     )
     grid = build_grid(
         list(rows_with_labels.groupby(["driving", "rock", "incline"], sort=True)),
