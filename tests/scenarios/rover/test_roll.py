@@ -17,7 +17,7 @@ from tests.scenarios.rover.short_run import SHORT_RUN
 
 
 def test_drive_past_the_target_rolls_the_image_by_30_deg_in_few_steps() -> None:
-    """The two images of the paper, at 6.8 m and 1.8 m, differ by 30 deg; a single step rolls the image by over 5 deg."""
+    """The two images of the paper, at 6.8 m and 1.8 m, differ by 30 deg; one step rolls the image by over 5 deg."""
     p = RoverScenario().check_parameters(load_campaign("vtt-roll").parameters(0))
     mast, azimuth = p.camera.mast(), np.radians(p.start.target_azimuth_deg)
     # the rover drives along x; the start distance is that of the mast's base
