@@ -29,6 +29,7 @@ class VelocityOutcome(Enum):
     NO_TEMPLATE_AREA = "an image pair has no feasible overlap for a template"
     NO_VALID_TRACK = "in an image pair no template passed the validity checks"
     IMU_MISMATCH = "no combination of tracks agrees with the change of velocity measured by the IMU"
+    INCLINED_GROUND = "the ground is more inclined than slopes and attitude errors explain"
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from marsyard.algorithms.dimes.binning import View, ground_from_pixels, pixels_from_ground
+from marsyard.algorithms.dimes.tilt import GroundFit
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
 
 
@@ -78,11 +79,13 @@ class DimesDetails:
     - pairs: Both pairs of images; empty for unusable times, altitudes or attitudes
     - combinations: All combinations of valid tracks, best agreement with the IMU first
     - selected: The combination of the reported velocity, or None
+    - ground: Fit of ground and motion that corrects the velocity for the common tilt; None without this correction
     """
 
     pairs: tuple[PairDetails, ...]
     combinations: tuple[Combination, ...]
     selected: Combination | None
+    ground: GroundFit | None = None
 
     @property
     def tracks(self) -> tuple[Track, ...]:

@@ -6,20 +6,18 @@ The method is section II of Johnson et al., "Field Testing of the MER DIMES".
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.algorithms.arrays import Patch, Vector2, Vector3
-from marsyard.algorithms.dimes import overlap
+from marsyard.algorithms.arrays import Vector2, Vector3
+from marsyard.algorithms.dimes import overlap, tilt
 from marsyard.algorithms.dimes.binning import View, build_views, pixels_from_ground, rectify_patch
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
-from marsyard.algorithms.image.registration import refine_shift
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
@@ -33,20 +31,10 @@ def mark_border(peak: Peak, searchable: Bool[np.ndarray, "s s"]) -> Peak:
     return replace(peak, on_border=peak.on_border or not searchable[rows, columns].all())
 
 
-def match_corner(
-    template: Patch,
-    window: Float[np.ndarray, "w w"],
-    surface: Float[np.ndarray, "s s"],
-    peak: Peak,
-    options: DimesOptions,
-) -> Vector2:
+def match_corner(surface: Float[np.ndarray, "s s"], peak: Peak, options: DimesOptions) -> Vector2:
     """Match position (row, column) of the template's upper left pixel in the window, refined as `options` select."""
     integer_peak = np.array([peak.row, peak.column], dtype=np.float64)
-    if not options.subpixel:
-        return integer_peak
-    start = integer_peak + biquadratic_offset(surface, peak)
-    refined_corner = refine_shift(template, window, start) if options.align and not peak.on_border else None
-    return start if refined_corner is None else refined_corner
+    return integer_peak + biquadratic_offset(surface, peak) if options.subpixel else integer_peak
 
 
 def camera_displacement(corner: Vector2, geometry: overlap.SearchGeometry) -> Vector2:
@@ -65,16 +53,15 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
     geometry = overlap.search_geometry(first, second, options)
     candidates = overlap.template_candidates(first, second, geometry, sun_direction, options)
     selection, contrasts = overlap.select_templates(first, candidates, options)
-    rectify = partial(rectify_patch, full_camera=options.full_camera)
     tracks = []
     for index, (candidate, contrast) in enumerate(zip(selection, contrasts, strict=True)):
         ground = candidates.ground[candidate]
-        template = rectify(first, ground, geometry.template_px, geometry.gsd_m)
-        window = rectify(second, ground, geometry.window_px, geometry.gsd_m)
+        template = rectify_patch(first, ground, geometry.template_px, geometry.gsd_m, full_camera=False)
+        window = rectify_patch(second, ground, geometry.window_px, geometry.gsd_m, full_camera=False)
         searchable = overlap.searchable_positions(second, ground, geometry, options)
         surface = np.where(searchable, pseudo_normalized_correlation(template, window), MIN_CORRELATION)
         peak = mark_border(highest_peak(surface), searchable)
-        corner = match_corner(template, window, surface, peak, options)
+        corner = match_corner(surface, peak, options)
         metrics = track_metrics(float(contrast), surface, peak, options)
         displacement = camera_displacement(corner, geometry)
         match_pixel, _ = pixels_from_ground(second, ground - displacement)
@@ -129,7 +116,8 @@ class DimesEstimator:
         first, second, third = views
         sun = measurements.sun_direction
         pairs = (track_pair(0, first, second, sun, self.options), track_pair(1, second, third, sun, self.options))
-        return combine_pairs(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
+        answer = combine_pairs(pairs, measurements.interval_velocities_m_s, self.options.imu_threshold_m_s)
+        return correct_tilt(answer, sun, self.options) if self.options.correct_tilt else answer
 
 
 def combine_pairs(
@@ -145,3 +133,33 @@ def combine_pairs(
     if not all(pair.tracks for pair in pairs):
         outcome = VelocityOutcome.NO_TEMPLATE_AREA
     return VelocityEstimate(outcome, None, DimesDetails(pairs, candidates, None))
+
+
+def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: DimesOptions) -> VelocityEstimate:
+    """Correct a valid answer for the common tilt of the attitudes, which the inclination of the ground shows.
+
+    The published answer remains if there are too few tracks, or if the fit contradicts the errors of the instruments.
+    An inclination that neither tilt nor slope explains is refused, unless its effect on the velocity is small.
+    """
+    details = answer.details
+    if not isinstance(details, DimesDetails) or details.selected is None:
+        return answer
+    selected = (details.selected.first, details.selected.second)
+    velocities = [pair.tracks[index].velocity_m_s for pair, index in zip(details.pairs, selected, strict=True)]
+    grids = [
+        tilt.track_grid(*pair.views, velocity, sun_direction, options)
+        for pair, velocity in zip(details.pairs, velocities, strict=True)
+    ]
+    if min(len(grid.first) for grid in grids) < tilt.MIN_TRACKS:
+        return answer
+    fit = tilt.fit_ground(grids, velocities, options)
+    if min(fit.tracks) < tilt.MIN_TRACKS or not fit.agrees_with_instruments:
+        return answer
+    details = replace(details, ground=fit)
+    if tilt.is_plausible(fit.inclination, options):
+        velocity = tilt.levelled_velocity(fit, grids[1].interval_s, options)
+        return replace(answer, velocity_m_s=velocity, details=details)
+    apparent_m_s = np.hypot(*fit.inclination) * abs(fit.displacements_m[1, 2]) / grids[1].interval_s
+    if apparent_m_s < options.imu_threshold_m_s:
+        return replace(answer, details=details)
+    return VelocityEstimate(VelocityOutcome.INCLINED_GROUND, None, details)

@@ -34,12 +34,8 @@ class DimesOptions:
     - templates_per_pair: Templates selected in each pair of images (paper: 2)
     - exclusion_px: Minimum distance (in column or row, binned pixels) between template centres, so that the templates
       do not overlap and fail independently.
-    - full_camera: Whether each pixel of a rectified patch is projected with the full camera model. Otherwise a
-      homography rectifies the patch, as in the paper: it maps the patch's corners exactly, and neglects the lens
-      distortion between them.
     - subpixel: Whether the correlation peak is refined to sub-pixel accuracy by a quadratic fit (not specified for
       DIMES in the paper; the hazard detection of the same authors has this fit)
-    - align: Whether the peak fit is refined by Gauss-Newton alignment, which removes its bias towards whole pixels
     - min_contrast: Minimum Harris interest of a template divided by its mean signal, per binned pixel. Images of noise
       only, at the flight camera's signal-to-noise ratio of 102, have 0.0022 to 0.0029.
     - min_peak: Minimum correlation at the peak, derived on random terrains of 0.2 to 15 % contrast with that noise. On
@@ -58,6 +54,19 @@ class DimesOptions:
       of the IMU. Derived by Monte Carlo (`benchmarks.threshold_derivation`, stored in `imu_threshold.json`; see
       `docs/adr/0008-threshold-of-the-imu-check.md`): the discrepancy is smaller in 99.5 % of descents with one correct
       track in each pair and the errors of the simulated instruments.
+    - correct_tilt: Whether the inclination of the ground corrects the velocity for the common tilt of the attitudes
+      (`marsyard.algorithms.dimes.tilt`). The options below belong to this correction.
+    - grid_template_px: Side and spacing of its templates, rectified pixels: about 60 tracks in each pair
+    - track_sd_px: Minimum standard deviation of its tracks. Errors of neighbouring tracks are correlated: calibration
+      of the distortion (0.3 px of the full image, 0.08 px binned) and relief (10 m move a track by 0.05 px).
+    - tilt_sd_rad: Standard deviation per horizontal axis of the attitude error common to all images: 0.89 to 0.94 deg
+      in simulated descents (Gusev and Meridiani, calibration seed 5406)
+    - slope_sd_rad: Standard deviation per axis of the slope of the ground over the overlap, about 1 km. Selected MER
+      landing sites have slopes below 2 deg over 1.2 km (Anderson et al. 2003, JGR 108(E12) 8084). 99.7 % of slopes are
+      smaller than 2 deg if the standard deviation is 0.59 deg.
+    - altitude_sd, attitude_sd_rad: Standard deviations of the relative altitude and of the attitude per axis,
+      independent for each image: 0.24 % and 0.017 deg in simulated descents (`imu_threshold.json`). Half of the
+      alignment error of the camera (0.02 deg) is added, because it rotates with the body between the images.
     """
 
     binned_size: tuple[int, int] = (256, 256)
@@ -70,15 +79,20 @@ class DimesOptions:
     grid_step_px: int = 8
     templates_per_pair: int = 2
     exclusion_px: float = 31.0
-    full_camera: bool = False
     subpixel: bool = True
-    align: bool = False
     min_contrast: float = 0.003
     min_peak: float = 0.45
     max_peak_width_px: float = 16.0
     max_second_peak_ratio: float = 0.8
     second_peak_exclusion_px: float = 3.0
     imu_threshold_m_s: float = 3.5
+    correct_tilt: bool = False
+    grid_template_px: int = 21
+    track_sd_px: float = 0.1
+    tilt_sd_rad: float = float(np.deg2rad(0.9))
+    slope_sd_rad: float = float(np.deg2rad(0.59))
+    altitude_sd: float = 0.0024
+    attitude_sd_rad: float = float(np.deg2rad(0.02))
 
     def __post_init__(self) -> None:
         if self.template_px < 5 or self.template_px % 2 == 0:
@@ -92,4 +106,4 @@ class DimesOptions:
 
 
 #: Options of `dimes-plus` that differ from the published algorithm.
-IMPROVEMENTS: Mapping[str, Any] = MappingProxyType({"full_camera": True, "align": True})
+IMPROVEMENTS: Mapping[str, Any] = MappingProxyType({"correct_tilt": True})
