@@ -33,6 +33,8 @@ MARGIN_PX = 4
 MIN_TRACKS = 8
 #: Residuals of more than this number of standard deviations are outliers.
 OUTLIER_SIGMAS = 3.5
+#: Number of fits: outliers displace the first one, and enlarge the standard deviation of the second one.
+FITS = 3
 #: Probability of the chi-square tests: one correct answer in a thousand is not corrected, or refused.
 ACCEPTED_PROBABILITY = 0.999
 
@@ -156,7 +158,7 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
     """Fit ground and motion to the tracks of both pairs, from initial velocities (east, north).
 
     The standard deviation of the tracks is `DimesOptions.track_sd_px`, or that of the residuals (from their median) if
-    it is larger. Outliers are excluded from a second fit. Each pair must have at least one track.
+    it is larger. The fit is repeated without outliers. Each pair must have at least one track.
     """
     inclination_sd = np.full(2, np.hypot(options.tilt_sd_rad, options.slope_sd_rad))
     instrument_sd = np.repeat([options.altitude_sd, options.attitude_sd_rad], [3, 9])
@@ -174,12 +176,13 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
 
     start = np.zeros(18)
     start[2:6] = np.ravel([velocity * pair.interval_s for velocity, pair in zip(velocities_m_s, pairs, strict=True)])
-    state = fit(start, [np.ones(len(pair.first), dtype=bool) for pair in pairs], options.track_sd_px)
-    residuals = track_residuals(state)
-    # median of absolute values of a normal distribution: 0.674 standard deviations
-    sd_px = max(float(np.median(np.abs(np.concatenate(residuals)))) / 0.674, options.track_sd_px)
-    inliers = [np.hypot(*r.T) < OUTLIER_SIGMAS * sd_px for r in residuals]
-    state = fit(state, inliers, sd_px)
+    state, inliers, sd_px = start, [np.ones(len(pair.first), dtype=bool) for pair in pairs], options.track_sd_px
+    for _ in range(FITS):
+        state = fit(state, inliers, sd_px)
+        residuals = track_residuals(state)
+        # median of absolute values of a normal distribution: 0.674 standard deviations
+        sd_px = max(float(np.median(np.abs(np.concatenate(residuals)))) / 0.674, options.track_sd_px)
+        inliers = [np.hypot(*r.T) < OUTLIER_SIGMAS * sd_px for r in residuals]
     displacements = np.stack([predict_matches(state, k, pair)[1] for k, pair in enumerate(pairs)])
     counts = (int(inliers[0].sum()), int(inliers[1].sum()))
     return GroundFit(state[:2], displacements, state[6:] / instrument_sd, counts)

@@ -42,7 +42,7 @@ def biquadratic_offset(surface: Raster, peak: Peak) -> Vector2:
     """Fit a quadratic by least squares to the 3 x 3 values around the peak; return its maximum's offset (row, column).
 
     In pixels, clipped to [-1, 1]. Zero if the peak is on the border or the quadratic has no maximum. The bias towards
-    whole pixels is up to 0.09 px; `refine_shift` has no such bias.
+    whole pixels is up to 0.09 px; `registration.register_template` has no such bias.
     """
     if peak.on_border:
         return np.zeros(2)

@@ -15,7 +15,6 @@ from typing import Final, Literal
 import numpy as np
 from jaxtyping import Float
 from scipy import ndimage
-from scipy.interpolate import BSpline
 
 from marsyard.algorithms.arrays import Patch, Raster, Vector2
 from marsyard.algorithms.image.kernels import quintic
@@ -23,72 +22,13 @@ from marsyard.algorithms.image.kernels import registration as kernels
 
 #: Degree of the splines.
 ORDER: Final = 5
-#: Step length below which the shift refinement ends; the next step is smaller by a factor of at least ten.
-ALIGNMENT_TOLERANCE_PX = 1e-3
 #: Margin around a patch for its spline; pixels outside it change the result by less than 1e-4 px.
 MARGIN_PX = 12
-#: Positions of the six spline coefficients relative to a point's pixel.
-_TAPS = np.arange(ORDER + 1) - ORDER // 2
-#: Quintic B-spline and its derivative.
-_BASIS = BSpline.basis_element(np.arange(ORDER + 2) - (ORDER + 1) / 2.0, extrapolate=False)
-_SLOPE = _BASIS.derivative()
 
 
 def spline_coefficients(image: Raster) -> Raster:
     """Compute the coefficients of the quintic spline through the image, mirrored at its outermost pixels."""
     return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
-
-
-def shifted_patch(coefficients: Raster, corner: Vector2, shape: tuple[int, int]) -> Float[np.ndarray, "3 n m"]:
-    """Sample a patch with its upper left pixel at `corner` (row, column), and its gradient (row, column).
-
-    All pixels have the same fractional shift, so that the spline is a separable filter with six taps. The patch must
-    have a distance of at least three pixels from the border of `coefficients`.
-    """
-    integer_part = np.floor(corner)
-    tap_positions = (corner - integer_part)[:, np.newaxis] - _TAPS
-    taps = np.stack([_BASIS(tap_positions), _SLOPE(tap_positions)])
-    samples = np.empty((3, *shape))
-    quintic.sample_with_derivatives(
-        coefficients, int(integer_part[0]), int(integer_part[1]), taps[:, 0], taps[:, 1], samples
-    )
-    return samples
-
-
-def refine_shift(
-    template: Float[np.ndarray, "n m"], window: Raster, corner: Vector2, iterations: int = 6, max_shift_px: float = 1.5
-) -> Vector2 | None:
-    """Refine the position `corner` (row, column) of a template's upper left pixel in the window.
-
-    Minimises ``sum (A - gain B)^2`` over shift and gain by Gauss-Newton. A is the template and B the window's patch,
-    each minus its mean. None if the position moves by more than `max_shift_px` or closer than three pixels to the
-    window's border, or if the normal equations are singular.
-    """
-    low = np.maximum(np.floor(corner).astype(int) - MARGIN_PX, 0)
-    high = np.floor(corner).astype(int) + np.array(template.shape) + MARGIN_PX
-    region = window[low[0] : high[0], low[1] : high[1]]
-    coefficients = spline_coefficients(region)
-    last_position = np.array(region.shape) - np.array(template.shape) - 4.0
-    a = template - template.mean()
-    start = corner - low
-    position = start
-    for _ in range(iterations):
-        if np.hypot(*(position - start)) > max_shift_px or np.any(position < 3.0) or np.any(position > last_position):
-            return None
-        samples = shifted_patch(coefficients, position, (template.shape[0], template.shape[1]))
-        b = samples[0] - samples[0].mean()
-        energy = float(np.sum(b * b))
-        gain = float(np.sum(a * b)) / energy if energy > 0.0 else 0.0
-        slopes = samples[1:].reshape(2, -1)
-        jacobian = gain * (slopes - slopes.mean(axis=1, keepdims=True))
-        normal = jacobian @ jacobian.T
-        if gain <= 0.0 or np.linalg.det(normal) <= 1e-10 * np.trace(normal) ** 2:
-            return None
-        step = np.linalg.solve(normal, jacobian @ (a - gain * b).ravel())
-        position = position + step
-        if np.hypot(*step) < ALIGNMENT_TOLERANCE_PX:
-            break
-    return position + low if np.hypot(*(position - start)) <= max_shift_px else None
 
 
 #: Model of the registration: shift; shift and linear map; shift, linear and quadratic map of the offsets.

@@ -74,7 +74,11 @@ def test_labels_are_unique_column_names() -> None:
 
 @pytest.mark.parametrize(
     ("task", "name", "key", "improved_value"),
-    [(VELOCITY, "dimes", "align", True), (TRACKING, "vtt", "warp", "bend"), (LANDING, "hda", "check_footprints", True)],
+    [
+        (VELOCITY, "dimes", "correct_tilt", True),
+        (TRACKING, "vtt", "warp", "bend"),
+        (LANDING, "hda", "check_footprints", True),
+    ],
 )
 def test_only_the_custom_configuration_accepts_an_improvement(
     task: Task[Any, Any], name: str, key: str, improved_value: Any
@@ -90,9 +94,11 @@ def test_only_the_custom_configuration_accepts_an_improvement(
 
 
 def test_improvement_of_a_published_algorithm_is_rejected_before_the_campaign() -> None:
-    with pytest.raises(ValueError, match="'dimes' and 'dimes-plus' define the option align; 'dimes-custom' accepts it"):
-        DescentScenarioParameters.model_validate({"dimes": {"align": True}})
-    DescentScenarioParameters.model_validate({"dimes": {"align": True}, "algorithm": "dimes-custom"})
+    with pytest.raises(
+        ValueError, match="'dimes' and 'dimes-plus' define the option correct_tilt; 'dimes-custom' accepts it"
+    ):
+        DescentScenarioParameters.model_validate({"dimes": {"correct_tilt": True}})
+    DescentScenarioParameters.model_validate({"dimes": {"correct_tilt": True}, "algorithm": "dimes-custom"})
 
 
 def test_duplicate_algorithm_is_rejected() -> None:

@@ -124,31 +124,3 @@ def sample_shifted(coefficients: Array, side: int, row: float, column: float, va
                 total += row_weights[a] * interpolated_rows[i + a, j]
             values[i * side + j] = total
     return True
-
-
-@njit(cache=True)
-def sample_with_derivatives(
-    coefficients: Array, row: int, column: int, row_taps: Array, column_taps: Array, output: Array
-) -> None:
-    """Evaluate a patch of the spline and its two derivatives; the upper left pixel is (row, column) plus a fraction.
-
-    `row_taps` and `column_taps` are the six filter taps for values and for slopes, shape (2, 6), at -2 .. 3 pixels from
-    the pixel. Values and derivatives with respect to row and column are stored in `output`, (3, rows, columns).
-    """
-    _, height, width = output.shape
-    values, slopes = np.empty(width + 5), np.empty(width + 5)
-    for i in range(height):
-        for j in range(width + 5):
-            value, slope = 0.0, 0.0
-            for k in range(6):
-                coefficient = coefficients[row + i + k - 2, column + j - 2]
-                value += row_taps[0, k] * coefficient
-                slope += row_taps[1, k] * coefficient
-            values[j], slopes[j] = value, slope
-        for j in range(width):
-            value, row_slope, column_slope = 0.0, 0.0, 0.0
-            for k in range(6):
-                value += column_taps[0, k] * values[j + k]
-                row_slope += column_taps[0, k] * slopes[j + k]
-                column_slope += column_taps[1, k] * values[j + k]
-            output[0, i, j], output[1, i, j], output[2, i, j] = value, row_slope, column_slope
