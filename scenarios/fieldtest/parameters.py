@@ -77,6 +77,8 @@ class TargetParameters(Parameters):
     placed: Annotated[int, Field(ge=3, le=1000, description="number of targets on the ground")] = 11
     used: Annotated[int, Field(ge=3, le=1000, description="number of these targets used for the attitude")] = 9
     within_m: Annotated[Positive, Field(description="half the side length of the targets' square, m (assumed)")] = 90.0
+    central: Annotated[int, Field(ge=0, le=1000, description="number of the used targets in the centre")] = 3
+    central_m: Annotated[Positive, Field(description="radius of the circle of the central targets, m (assumed)")] = 10.0
     images: Annotated[int, Field(ge=1, le=1000, description="number of images of a pass over the targets")] = 20
     side_m: Annotated[Positive, Field(description="side length of a target, m")] = 1.0
     albedo: Annotated[Positive, Field(le=1.0, description="albedo of the white targets (assumed)")] = 0.8
@@ -96,6 +98,8 @@ class TargetParameters(Parameters):
     def _check_used(self) -> TargetParameters:
         if self.used > self.placed:
             raise ValueError(f"{self.used} targets are used, but only {self.placed} are placed")
+        if self.central > self.used:
+            raise ValueError(f"{self.central} targets are in the centre, but only {self.used} are used")
         return self
 
 

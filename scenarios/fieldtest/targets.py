@@ -55,8 +55,14 @@ class Targets:
     def draw(
         cls, p: TargetParameters, surface: Surface, centre_m: Float64[np.ndarray, "2"], rng: np.random.Generator
     ) -> Targets:
-        """Draw `placed` panels on the ground around a position; return the first `used` of them."""
-        points = centre_m + rng.uniform(-p.within_m, p.within_m, (p.placed, 2))[: p.used]
+        """Draw `placed` panels on the ground around a position; return the first `used` of them.
+
+        The first `central` panels are evenly spaced on a circle, the others are at random positions in a square.
+        """
+        points = rng.uniform(-p.within_m, p.within_m, (p.placed, 2))
+        azimuths = rng.uniform(0.0, 2.0 * np.pi) + 2.0 * np.pi * np.arange(p.central) / max(p.central, 1)
+        points[: p.central] = p.central_m * np.column_stack([np.cos(azimuths), np.sin(azimuths)])
+        points = centre_m + points[: p.used]
         error = p.survey_m * rng.standard_normal((p.used, 3))
         # corners of squares of any azimuth, counterclockwise
         angles = rng.uniform(0.0, 0.5 * np.pi, p.used)[:, None] + np.radians([0.0, 90.0, 180.0, 270.0])

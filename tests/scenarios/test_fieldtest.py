@@ -215,6 +215,21 @@ def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatc
     assert np.all(np.sqrt(np.mean(errors[is_detected] ** 2, axis=0)) < [0.37, 0.25])
 
 
+def test_three_targets_are_in_the_centre() -> None:
+    """Paper, III.D.2: nine of eleven targets are used, three are in the centre (here on a circle of 10 m radius)."""
+    flat_ground = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
+    centre = np.array([300.0, -120.0])
+    targets = Targets.draw(TargetParameters(survey_m=0.0), flat_ground, centre, np.random.default_rng(3))
+    distances = np.hypot(*(targets.surveyed_m[:, :2] - centre).T)
+    assert len(distances) == 9
+    np.testing.assert_allclose(distances[:3], 10.0, atol=1e-6)
+    assert np.all(distances[3:] > 10.0)
+    sides = targets.surveyed_m[:3] - np.roll(targets.surveyed_m[:3], 1, axis=0)
+    np.testing.assert_allclose(np.linalg.norm(sides, axis=1), 10.0 * np.sqrt(3.0), atol=1e-6)
+    with pytest.raises(ValueError, match="10 targets are in the centre, but only 9 are used"):
+        TargetParameters(central=10)
+
+
 def test_targets_are_detected_only_if_the_image_contains_them() -> None:
     """Spots of noise and a bright rock on bare ground do not match the pattern of the targets."""
     rng = np.random.default_rng(3)
