@@ -59,7 +59,10 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
             raise bad_answer(f"span_s is {span}; allowed: {allowed}")
     elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise bad_answer("one image has no last interval; allowed: a velocity with a span_s, or a failure outcome")
-    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, answer.after_images)
+    attitude_error = check_numbers("attitude_error_rad", answer.attitude_error_rad, (3,))
+    return VelocityEstimate(
+        answer.outcome, velocity, answer.details, covariance, span, answer.after_images, attitude_error
+    )
 
 
 def check_site(answer: Any) -> interface.SiteEstimate:

@@ -43,6 +43,8 @@ class VelocityEstimate:
       evaluation also tests whether the errors agree with this covariance.
     - span_s: Start and end of the averaging interval, within the time tags of the images. Equal values mean the
       velocity at that instant. None: the last interval, from the second to the third of three images.
+    - attitude_error_rad: Estimated rotation vector from the true to the measured attitudes, common to all images, world
+      axes; None if the algorithm does not estimate it. The propagation of the velocity by the inertial unit uses it.
     - after_images: Answers of a stream (`VelocityStream`) after each image, None for no answer; set by the caller.
       Empty for other estimators.
     """
@@ -53,6 +55,7 @@ class VelocityEstimate:
     covariance_m2_s2: Float[np.ndarray, "2 2"] | None = None
     span_s: tuple[float, float] | None = None
     after_images: tuple[VelocityEstimate | None, ...] = ()
+    attitude_error_rad: Float[np.ndarray, "3"] | None = None
 
     @property
     def after_pictures(self) -> tuple[VelocityEstimate | None, ...]:

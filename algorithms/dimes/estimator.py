@@ -157,8 +157,9 @@ def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: Dime
         return answer
     details = replace(details, ground=fit)
     if tilt.is_plausible(fit.inclination, options):
-        velocity = tilt.levelled_velocity(fit, grids[1].interval_s, options)
-        return replace(answer, velocity_m_s=velocity, details=details)
+        error = tilt.expected_attitude_error(fit.inclination, options)
+        velocity = tilt.levelled_velocity(fit, grids[1].interval_s, error)
+        return replace(answer, velocity_m_s=velocity, details=details, attitude_error_rad=error)
     apparent_m_s = np.hypot(*fit.inclination) * abs(fit.displacements_m[1, 2]) / grids[1].interval_s
     if apparent_m_s < options.imu_threshold_m_s:
         return replace(answer, details=details)

@@ -198,12 +198,18 @@ def _is_accepted(normalised: Vector) -> bool:
     return float(normalised @ normalised) <= float(stats.chi2.ppf(ACCEPTED_PROBABILITY, len(normalised)))
 
 
-def levelled_velocity(fit: GroundFit, interval_s: float, options: DimesOptions) -> Vector2:
-    """Horizontal velocity (east, north) of the second pair, corrected for the expected tilt, m/s.
+def expected_attitude_error(inclination: Vector2, options: DimesOptions) -> Vector3:
+    """Expected rotation vector (world axes) from true to measured attitudes, for an inclination of the ground.
 
-    The tilt is the fraction of the inclination that its prior variance has in the variance of the inclination.
+    It is the fraction of the inclination that the prior variance of the tilt has in the variance of the inclination.
+    The error about the vertical is unknown and expected to be 0.
     """
     tilt_variance, slope_variance = options.tilt_sd_rad**2, options.slope_sd_rad**2
-    tilt = tilt_variance / (tilt_variance + slope_variance) * fit.inclination
-    east, north, up = fit.displacements_m[1]
-    return np.asarray((np.array([east, north]) - up * tilt) / interval_s)
+    east, north = tilt_variance / (tilt_variance + slope_variance) * inclination
+    return np.array([-north, east, 0.0])
+
+
+def levelled_velocity(fit: GroundFit, interval_s: float, attitude_error_rad: Vector3) -> Vector2:
+    """Horizontal velocity (east, north) of the second pair, corrected for an attitude error to first order, m/s."""
+    displacement = fit.displacements_m[1]
+    return np.asarray((displacement - np.cross(attitude_error_rad, displacement))[:2] / interval_s)

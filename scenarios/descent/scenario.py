@@ -23,7 +23,13 @@ from marsyard.scenarios.conditions import (
     optics_columns,
 )
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
-from marsyard.scenarios.descent.flight import DescentFlight, create_flight, states_at_images, true_velocity
+from marsyard.scenarios.descent.flight import (
+    DescentFlight,
+    create_flight,
+    gravity_m_s2,
+    states_at_images,
+    true_velocity,
+)
 from marsyard.scenarios.descent.measurement import Instruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
@@ -188,7 +194,7 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
     estimate = algorithm_run.answer
     velocity = None if estimate is None else estimate.velocity_m_s
     truth = descent.truth((estimate and estimate.span_s) or measurements.last_interval_s)
-    propagated = propagate_to_firing(estimate, descent.instruments, state_at_firing.time_s)
+    propagated = propagate_to_firing(estimate, descent.instruments, state_at_firing.time_s, gravity_m_s2(p))
     available_s, firing_truth = state_at_firing.time_s - descent.states[-1].time_s, state_at_firing.velocity_m_s[:2]
     landing = compute_touchdown(p.landing, firing_truth, propagated, available_s, descent.streams.generator("landing"))
     row = {

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import UInt16
+from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import propagate_velocity
 from marsyard.algorithms.dimes.binning import altitudes_at_images
@@ -68,15 +69,23 @@ def compute_touchdown(
 
 
 def propagate_to_firing(
-    estimate: VelocityEstimate | None, instruments: Instruments, firing_s: float
+    estimate: VelocityEstimate | None, instruments: Instruments, firing_s: float, gravity_m_s2: float
 ) -> Horizontal | None:
-    """Propagate the estimate to the thrusters' firing with the inertial unit; None without an estimate."""
+    """Propagate the estimate to the thrusters' firing with the inertial unit; None without an estimate.
+
+    The attitude error that the estimate reports corrects the inertial velocity change: navigation rotates the specific
+    force with its attitude, and adds gravity along the true vertical.
+    """
     if estimate is None or estimate.velocity_m_s is None or estimate.span_s is None:
         return None
     navigation, span = instruments.navigation, np.array(estimate.span_s)
     is_instant = estimate.span_s[0] == estimate.span_s[1]
     start = (navigation.velocity(span) if is_instant else navigation.mean_velocities(span))[0]
     end = navigation.velocity(np.array([firing_s]))[0]
+    if estimate.attitude_error_rad is not None:
+        by_gravity = np.array([0.0, 0.0, -gravity_m_s2 * (firing_s - span.mean())])
+        by_force = end - start - by_gravity
+        end = start + by_gravity + Rotation.from_rotvec(-estimate.attitude_error_rad).apply(by_force)
     return propagate_velocity(estimate.velocity_m_s, start[:2], end[:2])
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions
-from marsyard.algorithms.dimes.tilt import GroundTracks, fit_ground, levelled_velocity
+from marsyard.algorithms.dimes.tilt import GroundTracks, expected_attitude_error, fit_ground, levelled_velocity
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 from tests.algorithms.synthetic_descent import (
@@ -61,7 +61,9 @@ def test_exact_tracks_give_the_exact_tilt_and_velocity(tilt_deg: tuple[float, fl
     np.testing.assert_allclose(fit.corrections, 0.0, atol=0.02)
     assert fit.tracks == (80, 80)
     # a tilt of 2 deg is corrected to first order: 75 m/s times 0.035^2 / 2, and 14 m/s times 0.035^2
-    np.testing.assert_allclose(levelled_velocity(fit, INTERVAL_S, LEVEL), velocities[1, :2], atol=0.07)
+    error = expected_attitude_error(fit.inclination, LEVEL)
+    np.testing.assert_allclose(error, np.deg2rad([*tilt_deg, 0.0]), atol=1e-4)
+    np.testing.assert_allclose(levelled_velocity(fit, INTERVAL_S, error), velocities[1, :2], atol=0.07)
 
 
 def test_outliers_do_not_change_the_fit() -> None:

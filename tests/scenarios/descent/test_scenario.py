@@ -105,6 +105,23 @@ def test_ideal_instruments_over_flat_ground_give_exact_velocity(wind: tuple[floa
         assert row[f"firing_velocity_error_{axis}_m_s"] == pytest.approx(row[f"velocity_error_{axis}_m_s"], abs=0.01)
 
 
+def test_reported_attitude_error_corrects_the_propagation_to_the_firing() -> None:
+    """An error of the initial attitude tilts the attitudes of the images and of the inertial navigation.
+
+    Over level ground the algorithm knows the tilt. Its velocity error is then small at the images, and also at the
+    firing. Without the correction the error grows by gravity times tilt times the time to the firing, 20 s.
+    """
+    approach = {"attitude_sd_deg": 1.5, "velocity_sd_m_s": 0.0, "spin_scale_ppm": 0.0}
+    options = {"correct_tilt": True, "slope_sd_rad": 1e-6, "tilt_sd_rad": 0.03}
+    instruments = {**IDEAL_INSTRUMENTS, "approach": approach}
+    row: Any = run_descent(**instruments, terrain=FLAT_TERRAIN, algorithm="dimes-custom", dimes=options).row
+    tilt_deg = float(row["attitude_error_common_deg"])
+    assert tilt_deg > 1.0
+    assert row["velocity_error_m_s"] < 0.4
+    assert row["firing_velocity_error_m_s"] < 0.6
+    assert 3.7 * 15.0 * np.deg2rad(tilt_deg) > 0.9  # error of the propagation without the correction, m/s
+
+
 def test_ideal_instruments_are_reported_without_errors(nominal_case: CaseResult) -> None:
     """Over flat ground the only error is the altitude change between the last altimeter reading and the image."""
     row = run_descent(**IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN).row
