@@ -3,7 +3,8 @@
 from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track, dimes_products
 from marsyard.algorithms.dimes.estimator import DimesEstimator
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.tilt import GroundFit
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck, propagate_velocity
 
-__all__ = ["Combination", "DimesDetails", "DimesEstimator", "DimesOptions", "PairDetails", "Track", "TrackMetrics"]
-__all__ += ["ValidityCheck", "dimes_products", "propagate_velocity"]
+__all__ = ["Combination", "DimesDetails", "DimesEstimator", "DimesOptions", "GroundFit", "PairDetails", "Track"]
+__all__ += ["TrackMetrics", "ValidityCheck", "dimes_products", "propagate_velocity"]
