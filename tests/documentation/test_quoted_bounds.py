@@ -36,7 +36,7 @@ def test_quoted_bounds_on_wrong_velocities_are_correct() -> None:
     assert len(tables) == 2
     for index in tables:
         counts, bounds = (re.split(r"\s*\|\s*", line.strip("| "))[1:] for line in lines[index : index + 2])
-        assert len(counts) == len(bounds) == 4
+        assert len(counts) == len(bounds) == 3
         for cell, bound in zip(counts, bounds, strict=True):
             answers, wrong = map(int, re.findall(r"\d+", cell)[:2])
             assert parse_percent(bound) == round(100.0 * proportion_upper(wrong, answers, 0.9), 2)
