@@ -67,7 +67,7 @@ class DriftParameters(Parameters):
     ] = 1.0
     change_k: Annotated[
         float, Field(ge=-100.0, le=100.0, description="temperature change after a long time, K; 0: no drift")
-    ] = -19.0
+    ] = -22.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the cooling, s (assumed)")] = 300.0
 
 

@@ -31,8 +31,6 @@ Angle = Annotated[float, Field(ge=0.0, le=45.0)]
 
 #: Number of points within a pass at which the speed is drawn.
 _SPEED_POINTS = 4
-#: Minimum duration of the last pass, which ends at the maximum height.
-_MIN_PASS_S = 10.0
 #: Time between the points at which distance from the line, pointing and swing are drawn.
 _POINT_SPACING_S = 15.0
 
@@ -40,22 +38,19 @@ _POINT_SPACING_S = 15.0
 class HelicopterParameters(Parameters):
     """Parameters of a flight. Values are from the field test paper (III.C, III.D) unless marked as assumed.
 
-    The rate of climb of each pass is uniformly distributed. The last pass ends at the maximum height. With the defaults
-    six to eight passes climb from 1000 m to 2000 m in 26 min on average. The paper reports a climb of 1 to 2 m/s,
-    about 30 min of images, and about 40 min between the passes over the targets.
+    With a climb of 1 m/s, passes of 100 s and turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min. The
+    paper reports a climb of 1 to 2 m/s, about 30 min of images, and about 40 min between the passes over the targets.
     """
 
-    passes: Annotated[int, bounded_field(1, 100, "maximum number of passes along the line")] = 8
+    passes: Annotated[int, bounded_field(1, 100, "passes along the line")] = 10
     pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass (assumed)")] = 100.0
-    turn_s: Annotated[Positive, Field(le=1000.0, description="duration of a turn (assumed)")] = 150.0
+    turn_s: Annotated[Positive, Field(le=1000.0, description="duration of a turn (assumed)")] = 60.0
     speed_m_s: Annotated[Positive, Field(le=100.0, description="mean speed along a pass")] = 30.0
     speed_change_m_s: Annotated[float, bounded_field(0.0, 10.0, "RMS change of speed within a pass (assumed)")] = 1.0
     lowest_m: Annotated[Positive, Field(description="initial height of the first pass above the line's ground")] = (
         1000.0
     )
-    highest_m: Annotated[Positive, Field(description="final height of the last pass above the line's ground")] = 2000.0
-    climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "mean rate of climb on a pass")] = 1.5
-    climb_change_m_s: Annotated[float, bounded_field(0.0, 10.0, "maximum deviation from the mean rate of climb")] = 0.5
+    climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "rate of climb on a pass")] = 1.0
     wander_m: Annotated[float, bounded_field(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
     pointing_deg: Annotated[
         Angle, Field(description="RMS tilt along and across the line (assumed: flights reach the maximum)")
@@ -78,16 +73,6 @@ class HelicopterParameters(Parameters):
     )
 
     @model_validator(mode="after")
-    def _check_climb(self) -> HelicopterParameters:
-        if self.climb_change_m_s > self.climb_m_s:
-            raise ValueError(
-                f"climb_change_m_s is {self.climb_change_m_s}; allowed: at most climb_m_s, {self.climb_m_s}"
-            )
-        if self.highest_m <= self.lowest_m:
-            raise ValueError(f"highest_m is {self.highest_m}; allowed: more than lowest_m, {self.lowest_m}")
-        return self
-
-    @model_validator(mode="after")
     def _check_times(self) -> HelicopterParameters:
         collection_s = self.passes * self.pass_s + (self.passes - 1) * self.turn_s
         if self.between_s - self.fly_over_s - self.approach_s - collection_s <= 0.0:
@@ -105,24 +90,12 @@ class HelicopterParameters(Parameters):
 
 @dataclass(frozen=True)
 class FlightPass:
-    """A pass along the line.
-
-    - number, direction: number from 0, and direction of flight, +1 or -1 along the line
-    - start_s, end_s: start and end
-    - start_m, climb_m_s: initial height above the line's ground, and rate of climb
-    """
+    """A pass along the line: its number, start and end, and its direction, +1 or -1 along the line."""
 
     number: int
-    direction: int
     start_s: float
     end_s: float
-    start_m: float
-    climb_m_s: float
-
-    @property
-    def end_m(self) -> float:
-        """Final height above the line's ground."""
-        return self.start_m + self.climb_m_s * (self.end_s - self.start_s)
+    direction: int
 
 
 @dataclass(frozen=True)
@@ -203,7 +176,8 @@ def draw_helicopter_flight(
     """Draw a flight along a line whose middle is above `origin_m`, a point of the ground."""
     half_s = 0.5 * p.fly_over_s
     first_pass_s = half_s + p.approach_s
-    passes = _draw_passes(p, first_pass_s, rng)
+    starts = [first_pass_s + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
+    passes = tuple(FlightPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
     fly_overs = ((-half_s, half_s), (p.between_s - half_s, p.between_s + half_s))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + _POINT_SPACING_S, _POINT_SPACING_S)
     # points of the curves: (time, value, rate) or (time, value). Height and platform angle are constant over the
@@ -212,18 +186,17 @@ def draw_helicopter_flight(
     positions = [point for start, end in fly_overs for point in ((start, -half_m, speed), (end, half_m, speed))]
     heights = [(time, p.fly_over_m, 0.0) for times_s in fly_overs for time in times_s]
     angles = [(time, 0.0) for times_s in fly_overs for time in times_s]
+    climb_m = p.climb_m_s * p.pass_s
     fraction = np.linspace(0.0, 1.0, _SPEED_POINTS + 2)
     for flight_pass in passes:
         changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
         changes[[0, -1]] = 0.0
-        durations = fraction * (flight_pass.end_s - flight_pass.start_s)
-        distances = flight_pass.direction * (p.speed_m_s * durations - 0.5 * p.length_m)
+        distances = flight_pass.direction * p.length_m * (fraction - 0.5)
         speeds = flight_pass.direction * (p.speed_m_s + changes)
-        pass_times = flight_pass.start_s + durations
+        pass_times = flight_pass.start_s + fraction * (flight_pass.end_s - flight_pass.start_s)
         positions += list(zip(pass_times.tolist(), distances.tolist(), speeds.tolist(), strict=True))
-        climb_m_s = flight_pass.climb_m_s
-        heights += [(flight_pass.start_s, flight_pass.start_m, climb_m_s)]
-        heights += [(flight_pass.end_s, flight_pass.end_m, climb_m_s)]
+        height = p.lowest_m + flight_pass.number * climb_m
+        heights += [(flight_pass.start_s, height, p.climb_m_s), (flight_pass.end_s, height + climb_m, p.climb_m_s)]
         angle = np.pi if flight_pass.direction < 0 and p.turns_with_flight else 0.0
         angles += [(flight_pass.start_s, angle), (flight_pass.end_s, angle)]
     tilt_along, tilt_across = _draw_tilts(p, passes, times, rng)
@@ -241,21 +214,6 @@ def draw_helicopter_flight(
         gravity_m_s2=gravity_m_s2,
         vibration=Vibration.draw(p.vibration, rng),
     )
-
-
-def _draw_passes(p: HelicopterParameters, start_s: float, rng: np.random.Generator) -> tuple[FlightPass, ...]:
-    """Draw the passes, in alternating directions, from a start time until the helicopter reaches the maximum height."""
-    passes: list[FlightPass] = []
-    height_m = p.lowest_m
-    for number, change in enumerate(p.climb_change_m_s * rng.uniform(-1.0, 1.0, p.passes)):
-        start, climb_m_s = start_s + number * (p.pass_s + p.turn_s), p.climb_m_s + float(change)
-        # a pass without climb lasts its full duration
-        duration_s = min(p.pass_s, (p.highest_m - height_m) / max(climb_m_s, 1e-9))
-        if duration_s < min(p.pass_s, _MIN_PASS_S):
-            break
-        passes.append(FlightPass(number, 1 - 2 * (number % 2), start, start + duration_s, height_m, climb_m_s))
-        height_m = passes[-1].end_m
-    return tuple(passes)
 
 
 def _draw_tilts(
