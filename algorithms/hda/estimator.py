@@ -223,7 +223,7 @@ def map_ground(
     elevation = hazards.fill_small_holes(elevation, options.narrowest_hazard * options.max_roughness_m)
     maps = hazards.hazard_maps(elevation, options)
     if options.check_footprints:
-        maps = replace(maps, safety=hazards.check_footprints(maps.safety, elevation, resolution, options))
+        maps = replace(maps, safety=hazards.classify_footprints(elevation, resolution, options))
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])

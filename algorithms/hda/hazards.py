@@ -258,7 +258,7 @@ def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) 
     return int(best_cells[nearest, 0]), int(best_cells[nearest, 1])
 
 
-#: Number of points for the plane fit, and of tested positions, per footprint diameter.
+#: Number of points for the plane fit per footprint diameter.
 POINTS_PER_DIAMETER = 16
 #: Ratio of standard deviation to median absolute value of a normal distribution.
 SIGMA_PER_MEDIAN = 1.4826
@@ -299,42 +299,37 @@ def roughness_limit_m(resolution: Resolution, cell_m: float, options: HdaOptions
     return height_fraction * options.max_roughness_m - options.margin_deviations * resolution.noise_m
 
 
-def check_footprints(
-    safety: UInt8[np.ndarray, "rows columns"], ground: ElevationMap, resolution: Resolution, options: HdaOptions
+def classify_footprints(
+    ground: ElevationMap, resolution: Resolution, options: HdaOptions
 ) -> UInt8[np.ndarray, "rows columns"]:
-    """Mark unsafe footprints as hazards in a safe landing map; return the new map.
+    """Classify the footprint centred at each cell by a robust plane of its own: values of `Safety`.
 
-    The maps of section III use planes of fixed squares only. This test fits a robust plane to the footprint at each
-    tested position; it checks the plane's slope and the largest distance of a cell from the plane. The positions form a
-    lattice of `POINTS_PER_DIAMETER` positions per diameter; each cell gets the result of the nearest position.
+    A footprint is safe if the slope of its plane and the largest distance of a cell from the plane are within the
+    limits. The plane is fitted to a disc of the lander's diameter. The distances are also checked one cell farther out,
+    because the true position of a footprint differs from the centre of its cell. A footprint with an empty cell, or
+    beyond the border of the map, is unknown. The maps of section III have planes of fixed squares only, and hazards are
+    enlarged by the lander's diameter.
     """
-    diameter_cells = options.lander_diameter_m / ground.cell_m
-    step = max(int(diameter_cells / POINTS_PER_DIAMETER), 1)
-    lattice = np.zeros(safety.shape, dtype=bool)
-    lattice[::step, ::step] = True
-    # test the lattice cell nearest to each safe cell, even if that lattice cell is not safe
-    is_tested = np.zeros_like(lattice)
-    safe_cells = np.argwhere(safety == Safety.SAFE)
-    nearest = tuple(np.minimum((safe_cells + step // 2) // step * step, (np.array(safety.shape) - 1) // step * step).T)
-    is_tested[nearest] = True
-    rows, columns = np.nonzero(is_tested & lattice)
-    offsets = disc_cells(0.5 * diameter_cells)
-    fit_offsets = offsets[np.all(offsets % step == 0, axis=1)].copy()
+    shape = ground.elevation_m.shape
+    max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
+    if max_roughness_m <= 0.0:
+        return np.full(shape, Safety.HAZARD, dtype=np.uint8)
+    radius_cells = 0.5 * options.lander_diameter_m / ground.cell_m
+    step = max(int(2.0 * radius_cells / POINTS_PER_DIAMETER), 1)
+    fit_offsets = disc_cells(radius_cells)
+    fit_offsets = fit_offsets[np.all(fit_offsets % step == 0, axis=1)].copy()
+    empty = np.pad(np.isnan(ground.elevation_m), 1, constant_values=True)
+    known = ~_dilate(empty, radius_cells)[1:-1, 1:-1]
+    rows, columns = np.nonzero(known)
     triples = np.random.default_rng(options.seed).uniform(size=(options.plane_trials, 3))
-    min_cells = max(len(fit_offsets) // 2, 4)
     slopes, roughness = kernels.evaluate_footprints(
-        ground.elevation_m, rows, columns, offsets, fit_offsets, min_cells, triples, options.refine_planes
+        ground.elevation_m, rows, columns, disc_cells(radius_cells + 1.0), fit_offsets, triples, options.refine_planes
     )
     max_slope_rad = options.max_slope_rad - options.margin_deviations * options.level_error_rad
-    max_roughness_m = roughness_limit_m(resolution, ground.cell_m, options)
-    with np.errstate(invalid="ignore"):
-        is_safe = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
-    is_safe &= max_roughness_m > 0.0
-    is_unsafe = np.zeros_like(lattice)
-    is_unsafe[rows[~is_safe], columns[~is_safe]] = True
-    result = safety.copy()
-    result[tuple(safe_cells[is_unsafe[nearest]].T)] = Safety.HAZARD
-    return result
+    safe = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
+    safety = np.full(shape, Safety.UNKNOWN, dtype=np.uint8)
+    safety[rows, columns] = np.where(safe, Safety.SAFE, Safety.HAZARD)
+    return safety
 
 
 def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:

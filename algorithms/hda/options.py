@@ -75,6 +75,10 @@ class HdaOptions:
     - refine_grid: Whether the spacing is reduced until the grid resolves the narrowest hazard
       (`marsyard.algorithms.hda.structure.grid_spacing_px`). Section II.C: "it could be set automatically based on the
       size of the helicopter (or lander) and the pixel resolution".
+    - resample_second: Whether the second image is resampled to the orientation and the scale of the first before the
+      structure matches: a window then shows the same ground in both
+    - filter_images: Whether both images are smoothed and their local mean is subtracted before the structure matches
+      (`marsyard.algorithms.hda.preparation`)
     - search_half_px: Half width of the windows compared along epipolar segments, pixels
     - min_match_correlation: Minimum correlation (Eq. 3) of a structure match
     - max_forward_backward_px: Maximum forward-backward error, pixels: each structure match is matched back from the
@@ -88,13 +92,13 @@ class HdaOptions:
       are not on the plane, 30 trials find it in 98 % of footprints; if 30 % are not, in all but 3 in a million.
     - refine_planes: Whether each plane is refined by least squares over its inliers (Rousseeuw & Leroy 1987)
     - max_slope_rad, max_roughness_m: Limits of the lander, set by the user (section III)
-    - hazard_growth, unknown_growth: Dilation of hazards, and of borders and holes of the map, in lander diameters. The
-      paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller distance, part of the lander would
-      be on unmapped ground.
-    - check_footprints: Whether each position that is safe in the paper's maps is also checked with a plane fitted to
-      its footprint, with a margin for the map's resolution (`marsyard.algorithms.hda.hazards.check_footprints`). The
-      paper interpolates planes and slopes between fixed squares. Over curved ground the distance from this interpolated
-      surface is half of the distance from a plane.
+    - hazard_growth, unknown_growth: Without `check_footprints`, dilation of hazards, and of borders and holes of the map,
+      in lander diameters. The paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller distance,
+      part of the lander would be on unmapped ground.
+    - check_footprints: Whether the safe landing map is that of a plane fitted to the footprint at each cell, with a margin
+      for the map's resolution (`marsyard.algorithms.hda.hazards.classify_footprints`). The paper interpolates planes
+      and slopes between fixed squares, and enlarges hazards by the lander's diameter. Over curved ground the distance
+      from this interpolated surface is half of the distance from a plane.
     - narrowest_hazard: Ratio of base width to height of the narrowest hazard. Rocks have heights of up to 0.65 widths
       (Golombek & Rapp 1997: 0.5, with a variation of one third).
     - margin_deviations: Safety margin of `check_footprints`, in standard deviations of the map's noise and the vertical
@@ -123,6 +127,8 @@ class HdaOptions:
     depth_margin: float = 0.3
     grid_px: int = 8
     refine_grid: bool = False
+    resample_second: bool = False
+    filter_images: bool = False
     search_half_px: int = 5
     min_match_correlation: float = 0.7
     max_forward_backward_px: float | None = None
@@ -184,6 +190,8 @@ IMPROVEMENTS: Mapping[str, Any] = MappingProxyType(
         "align": True,
         "max_forward_backward_px": 1.5,
         "refine_grid": True,
+        "resample_second": True,
+        "filter_images": True,
         "refine_planes": True,
         "check_footprints": True,
     }

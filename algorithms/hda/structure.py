@@ -16,6 +16,7 @@ from marsyard.algorithms.arrays import Flags, Points2
 from marsyard.algorithms.hda.kernels import matching
 from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, project_points, undistort
 from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.preparation import prepare_views
 
 
 class MatchStatus(IntEnum):
@@ -131,31 +132,38 @@ def match_pixels(
     is partly outside the second image are omitted. Accepted matches pass the limits on correlation and depth and, with
     `max_forward_backward_px`, the check of forward-backward consistency.
     """
-    first, second = views
     border = options.search_half_px + 1  # one pixel more for the neighbours of the peak
-    coordinates = undistort(first.camera, pixels)
-    starts, ends, valid = epipolar_segments(second, second_from_first, coordinates, bounds_m, border)
+    coordinates = undistort(views[0].camera, pixels)
+    starts, ends, valid = epipolar_segments(views[1], second_from_first, coordinates, bounds_m, border)
+    pair, pair_motion = prepare_views(views, second_from_first, 0.5 * sum(bounds_m), options)
+    pair_starts, pair_ends, pair_valid = epipolar_segments(pair[1], pair_motion, coordinates, bounds_m, border)
+    valid &= pair_valid
     pixels, coordinates, starts, ends = pixels[valid], coordinates[valid], starts[valid], ends[valid]
     rounded = pixels.astype(np.int64)
+    images = pair[0].counts, pair[1].counts
     matches = matching.match_along_epipolar_segments(
-        first.counts, second.counts, rounded, starts, ends, options.search_half_px
+        *images, rounded, pair_starts[valid], pair_ends[valid], options.search_half_px
     )
     matched_pixels, correlations = matching.refine_positions(
-        first.counts, second.counts, rounded[:, ::-1], (matches - rounded)[:, ::-1], options.search_half_px
+        *images, rounded[:, ::-1], (matches - rounded)[:, ::-1], options.search_half_px
     )
-    depths = triangulate(coordinates, undistort(second.camera, matched_pixels), second_from_first)
+    second_coordinates = undistort(pair[1].camera, matched_pixels)
+    depths = triangulate(coordinates, second_coordinates, pair_motion)
     statuses = np.full(len(pixels), MatchStatus.ACCEPTED, dtype=np.uint8)
     statuses[~((depths > bounds_m[0]) & (depths < bounds_m[1]))] = MatchStatus.OUT_OF_BOUNDS
     statuses[~(correlations >= options.min_match_correlation)] = MatchStatus.DISSIMILAR
     if options.max_forward_backward_px is not None:
         indices = np.flatnonzero(statuses == MatchStatus.ACCEPTED)
         accepted_matches = (rounded[indices], matches[indices], coordinates[indices])
-        errors_px = forward_backward_error(
-            views, second_from_first, *accepted_matches, bounds_m, options.search_half_px
-        )
+        errors_px = forward_backward_error(pair, pair_motion, *accepted_matches, bounds_m, options.search_half_px)
         statuses[indices[errors_px > options.max_forward_backward_px]] = MatchStatus.INCONSISTENT
     is_accepted = statuses == MatchStatus.ACCEPTED
     points = points_at_depth(coordinates[is_accepted], depths[is_accepted])
+    if pair[1].camera is not views[1].camera:
+        # back from the resampled image to the second image
+        rotation = second_from_first.rotation * pair_motion.rotation.inv()
+        rays = rotation.apply(np.column_stack([second_coordinates, np.ones(len(second_coordinates))]))
+        matched_pixels = views[1].camera.project(rays)[0]
     return Matches(pixels, starts, ends, matched_pixels, correlations, depths, statuses, points)
 
 

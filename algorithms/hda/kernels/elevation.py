@@ -162,34 +162,30 @@ def footprint_planes(
 @njit(cache=True)
 def evaluate_footprints(
     elevation: Array, rows: NDArray[np.int64], columns: NDArray[np.int64], offsets: NDArray[np.int64],
-    fit_offsets: NDArray[np.int64], min_cells: int, triples: Array, refine: bool,
+    fit_offsets: NDArray[np.int64], triples: Array, refine: bool,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Fit a robust plane to each footprint; return its slope per cell and the maximum distance of a cell from it.
 
-    `rows` and `columns` are the footprints' centres, `offsets` a footprint's cells relative to its centre (row,
-    column), `fit_offsets` the cells for the plane fit. NaN if fewer than `min_cells` of the fit's cells are valid.
+    `rows` and `columns` are the footprints' centres. `fit_offsets` are the cells for the plane fit, relative to the
+    centre (row, column); all must have an elevation. `offsets` are the cells whose distance is checked; empty ones are
+    skipped. Slopes and distances are NaN if no plane is found.
     """
     count = rows.size
     slopes, roughness = np.full(count, np.nan), np.full(count, np.nan)
     n = fit_offsets.shape[0]
     x, y, z = np.empty(n), np.empty(n), np.empty(n)
+    for m in range(n):
+        x[m], y[m] = fit_offsets[m, 1], fit_offsets[m, 0]
     for k in range(count):
-        valid_count = 0
         for m in range(n):
-            i, j = rows[k] + fit_offsets[m, 0], columns[k] + fit_offsets[m, 1]
-            if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
-                x[valid_count], y[valid_count], z[valid_count] = fit_offsets[m, 1], fit_offsets[m, 0], elevation[i, j]
-                valid_count += 1
-        if valid_count < min_cells:
-            continue
-        value, slope_x, slope_y = robust_plane(x[:valid_count], y[:valid_count], z[:valid_count], triples, refine)
+            z[m] = elevation[rows[k] + fit_offsets[m, 0], columns[k] + fit_offsets[m, 1]]
+        value, slope_x, slope_y = robust_plane(x, y, z, triples, refine)
         max_distance = 0.0
         for m in range(offsets.shape[0]):
             i, j = rows[k] + offsets[m, 0], columns[k] + offsets[m, 1]
             if 0 <= i < elevation.shape[0] and 0 <= j < elevation.shape[1] and not math.isnan(elevation[i, j]):
-                max_distance = max(
-                    max_distance, abs(elevation[i, j] - value - slope_x * offsets[m, 1] - slope_y * offsets[m, 0])
-                )
+                distance = abs(elevation[i, j] - value - slope_x * offsets[m, 1] - slope_y * offsets[m, 0])
+                max_distance = max(max_distance, distance)
         slopes[k] = math.hypot(slope_x, slope_y)
-        roughness[k] = max_distance
+        roughness[k] = max_distance if not math.isnan(value) else math.nan
     return slopes, roughness

@@ -13,7 +13,7 @@ from marsyard.algorithms.hda import HdaOptions, Safety, hazard_maps, safe_site
 from marsyard.algorithms.hda.hazards import (
     ElevationMap,
     Resolution,
-    check_footprints,
+    classify_footprints,
     elevation_map,
     fill_small_holes,
     grassfire,
@@ -319,11 +319,10 @@ def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
     """A ridge with a slope of 0.3 on both sides: no plane under a footprint on its crest fits within 0.1 m."""
     x = 0.05 * (np.arange(121) - 60)
     ground = ElevationMap(np.tile(-0.3 * np.abs(x), (121, 1)), np.zeros(2), 0.05)
-    all_safe = np.full((121, 121), Safety.SAFE, dtype=np.uint8)
     options = HdaOptions(
         refine_planes=True, max_roughness_m=0.1, narrowest_hazard=100.0, max_slope_rad=float(np.radians(20.0))
     )
-    result = check_footprints(all_safe, ground, SHARP, options)
+    result = classify_footprints(ground, SHARP, options)
     assert np.all(result[40:80, 58:63] == Safety.HAZARD)
     # A footprint that lies on one flank is plane.
     assert np.all(result[40:80, 85:95] == Safety.SAFE)
@@ -331,13 +330,38 @@ def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
 
 def test_coarse_map_has_no_safe_cells() -> None:
     ground = ElevationMap(np.zeros((60, 60)), np.zeros(2), 0.1)
-    all_safe = np.full((60, 60), Safety.SAFE, dtype=np.uint8)
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     coarse = Resolution(window_m=1.0, noise_m=0.0)
-    # At the corners most of a footprint is outside the map.
+    # Footprints at the border are not within the map.
     inner = (slice(10, 50), slice(10, 50))
-    assert np.all(check_footprints(all_safe, ground, SHARP, options)[inner] == Safety.SAFE)
-    assert np.all(check_footprints(all_safe, ground, coarse, options) == Safety.HAZARD)
+    assert np.all(classify_footprints(ground, SHARP, options)[inner] == Safety.SAFE)
+    assert np.all(classify_footprints(ground, coarse, options) == Safety.HAZARD)
+
+
+@pytest.mark.parametrize(("row", "column"), [(40, 50), (41, 53), (37, 60)])
+def test_each_position_is_checked_with_its_own_footprint(row: int, column: int) -> None:
+    """A boulder of one cell is a hazard for footprints within a lander radius and one cell, 5 + 1 cells, and no other.
+
+    Footprints within 5 cells of the border, or of an empty cell, are unknown.
+    """
+    ground = add_bump(make_ground(slope_x=0.1, slope_y=-0.05), row, column, 0.5, 0.3)
+    ground.elevation_m[20, 20] = np.nan
+    options = replace(OPTIONS, narrowest_hazard=100.0, level_error_rad=0.0)
+    safety = classify_footprints(ground, SHARP, options)
+    rows, columns = np.indices(safety.shape)
+    hazard = np.hypot(rows - row, columns - column) <= 6.0
+    unknown = np.hypot(rows - 20, columns - 20) <= 5.0
+    unknown |= np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns]) <= 5
+    expected = np.where(hazard, Safety.HAZARD, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
+    np.testing.assert_array_equal(safety, expected)
+
+
+def test_steep_footprints_are_hazards() -> None:
+    """The limit of slope, 15 deg, is reduced by two standard deviations of the vertical, here to 13 deg."""
+    options = replace(OPTIONS, narrowest_hazard=100.0, level_error_rad=float(np.radians(1.0)))
+    for slope_deg, expected in ((12.9, Safety.SAFE), (13.1, Safety.HAZARD)):
+        ground = make_ground(slope_y=float(np.tan(np.radians(slope_deg))))
+        assert np.all(classify_footprints(ground, SHARP, options)[10:70, 10:90] == expected)
 
 
 def test_elevation_map_is_centred_on_its_points() -> None:

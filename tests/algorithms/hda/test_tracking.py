@@ -87,10 +87,9 @@ def test_pyramid_levels_of_the_papers_window() -> None:
     assert level_sizes(5, 40, (640, 480)) == (LevelSize(5, 2), LevelSize(3, 2), LevelSize(2, 2), LevelSize(2, 5))
     # A window that fits on one level is searched at full resolution.
     assert level_sizes(5, 6, (640, 480)) == (LevelSize(5, 6),)
-    # Eq. 4 gives 7 levels for a window of 640 px; at level 7 the image has 3 rows, fewer than the template.
+    # Eq. 4 gives 7 levels for a window of 640 px; from level 5, with 15 rows, a template of 5 px exceeds a quarter.
     sizes = level_sizes(5, 640, (640, 480))
-    assert len(sizes) == 7
-    assert sizes[-1] == LevelSize(2, 10)
+    assert sizes == (LevelSize(5, 2), LevelSize(3, 2), *[LevelSize(2, 2)] * 2, LevelSize(2, 40))
 
 
 def make_view(columns: int = 320) -> View:
@@ -131,6 +130,21 @@ def test_displacement_by_the_baseline_of_the_campaigns_is_tracked(window_half: i
     assert np.mean(is_correct[is_inside]) >= fraction
     narrow = track_features(first, second, features, features, 40, replace(OPTIONS, align=False))
     assert np.sum(narrow.accepted & (np.hypot(*(narrow.second - true_pixels).T) < 1.0)) < 0.2 * is_inside.sum()
+
+
+@pytest.mark.parametrize("pitch_deg", [15.0, -15.0])
+def test_displacement_along_the_shorter_side_is_tracked(pitch_deg: float) -> None:
+    """A pitch of 15 deg moves the image by 100 to 120 of its 240 rows; the search window is the whole image."""
+    scene = make_pass((0.0, -0.6, 10.0, 20.0, pitch_deg))
+    first, second = (render_image(scene, i).counts for i in (0, 1))
+    features = select_features(first, OPTIONS)
+    true_pixels = scene.camera(1).project(scene.ground(0, features))[0]
+    is_inside = np.all((true_pixels > 12) & (true_pixels < np.array([307, 227])), axis=1)
+    tracks = track_features(first, second, features, features, 320, replace(OPTIONS, align=False))
+    is_correct = tracks.accepted & (np.hypot(*(tracks.second - true_pixels).T) < 1.0)
+    assert is_inside.sum() >= 30
+    # from a level at which the template covers most of the image, 0 and 0.6 of the features are tracked
+    assert np.mean(is_correct[is_inside]) >= 0.8
 
 
 def test_pyramid_levels_are_block_means(noise: np.ndarray) -> None:
