@@ -266,10 +266,14 @@ SIGMA_PER_MEDIAN = 1.4826
 
 @dataclass(frozen=True)
 class Resolution:
-    """Map resolution: side of the matching windows on the ground, and standard deviation of a point's elevation."""
+    """Map resolution: side of the matching windows on the ground, and standard deviations of elevation and position.
+
+    The position is that of the map in the surface frame: an error of the vertical displaces it horizontally.
+    """
 
     window_m: float
     noise_m: float
+    position_m: float
 
 
 def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Resolution:
@@ -281,7 +285,8 @@ def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Reso
     depth = float(np.median(motion.depths[motion.inliers]))
     error_px = SIGMA_PER_MEDIAN * float(np.median(motion.residuals_px[motion.inliers]))
     error_px = float(np.hypot(error_px, options.match_error_px))
-    return Resolution(depth * (2 * options.search_half_px + 1) / focal_px, depth * error_px / motion.parallax_px)
+    window_m = depth * (2 * options.search_half_px + 1) / focal_px
+    return Resolution(window_m, depth * error_px / motion.parallax_px, depth * options.level_error_rad)
 
 
 def roughness_limit_m(resolution: Resolution, cell_m: float, options: HdaOptions) -> float:
@@ -305,9 +310,10 @@ def classify_footprints(
     """Classify the footprint centred at each cell by a robust plane of its own: values of `Safety`.
 
     A footprint is safe if the slope of its plane and the largest distance of a cell from the plane are within the
-    limits. The plane is fitted to a disc of the lander's diameter. The distances are also checked one cell farther out,
-    because the true position of a footprint differs from the centre of its cell. A footprint with an empty cell, or
-    beyond the border of the map, is unknown. The maps of section III have planes of fixed squares only, and hazards are
+    limits. The plane is fitted to a disc of the lander's diameter; the distances are also checked one cell farther out,
+    because positions between cell centres belong to the nearest cell. A footprint with an empty cell, or beyond the
+    border of the map, is unknown. Hazards and unknown positions are dilated by the error of the map's position, with
+    the margin `margin_deviations`. The maps of section III have planes of fixed squares only, and their hazards are
     enlarged by the lander's diameter.
     """
     shape = ground.elevation_m.shape
@@ -327,9 +333,13 @@ def classify_footprints(
     )
     max_slope_rad = options.max_slope_rad - options.margin_deviations * options.level_error_rad
     safe = (np.arctan(slopes / ground.cell_m) <= max_slope_rad) & (roughness <= max_roughness_m)
-    safety = np.full(shape, Safety.UNKNOWN, dtype=np.uint8)
-    safety[rows, columns] = np.where(safe, Safety.SAFE, Safety.HAZARD)
-    return safety
+    hazard = np.zeros(shape, dtype=bool)
+    hazard[rows[~safe], columns[~safe]] = True
+    margin_cells = options.margin_deviations * resolution.position_m / ground.cell_m
+    unknown = _dilate(np.pad(~known, 1, constant_values=True), margin_cells)[1:-1, 1:-1]
+    hazard = _dilate(hazard, margin_cells)
+    safety = np.where(hazard, Safety.HAZARD, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
+    return np.asarray(safety.astype(np.uint8))
 
 
 def disc_cells(radius_cells: float) -> Int[np.ndarray, "n 2"]:

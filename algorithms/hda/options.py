@@ -92,18 +92,20 @@ class HdaOptions:
       are not on the plane, 30 trials find it in 98 % of footprints; if 30 % are not, in all but 3 in a million.
     - refine_planes: Whether each plane is refined by least squares over its inliers (Rousseeuw & Leroy 1987)
     - max_slope_rad, max_roughness_m: Limits of the lander, set by the user (section III)
-    - hazard_growth, unknown_growth: Without `check_footprints`, dilation of hazards, and of borders and holes of the map,
-      in lander diameters. The paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller distance,
-      part of the lander would be on unmapped ground.
-    - check_footprints: Whether the safe landing map is that of a plane fitted to the footprint at each cell, with a margin
-      for the map's resolution (`marsyard.algorithms.hda.hazards.classify_footprints`). The paper interpolates planes
-      and slopes between fixed squares, and enlarges hazards by the lander's diameter. Over curved ground the distance
-      from this interpolated surface is half of the distance from a plane.
+    - hazard_growth, unknown_growth: Without `check_footprints`, dilation of hazards, and of borders and holes of the
+      map, in lander diameters. The paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller
+      distance, part of the lander would be on unmapped ground.
+    - check_footprints: Whether the safe landing map is that of a plane fitted to the footprint at each cell, with a
+      margin for the map's resolution (`marsyard.algorithms.hda.hazards.classify_footprints`). The paper interpolates
+      planes and slopes between fixed squares, and enlarges hazards by the lander's diameter. Over curved ground the
+      distance from this interpolated surface is half of the distance from a plane.
     - narrowest_hazard: Ratio of base width to height of the narrowest hazard. Rocks have heights of up to 0.65 widths
       (Golombek & Rapp 1997: 0.5, with a variation of one third).
-    - margin_deviations: Safety margin of `check_footprints`, in standard deviations of the map's noise and the vertical
+    - margin_deviations: Safety margin of `check_footprints`, in standard deviations of the map's noise, the vertical
+      and the map's position
     - match_error_px: Minimum error of a structure match: the biquadratic's bias towards whole pixels is up to 0.09 px
-    - level_error_rad: Standard deviation of the vertical, including the map's tilt due to the motion's error
+    - level_error_rad: Standard deviation of the vertical, including the map's tilt due to the motion's error. It also
+      displaces the map by this angle times the depth, 0.1 m at 11 m.
     - seed: Seed of the random triples, the same for every map: the result depends only on the measurements
     """
 

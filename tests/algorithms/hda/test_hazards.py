@@ -298,8 +298,8 @@ def test_out_of_range_options_are_reported() -> None:
 # ----- footprints -----
 
 
-#: Resolution of an exact map: matching windows without extent, and no noise.
-SHARP = Resolution(window_m=0.0, noise_m=0.0)
+#: Resolution of an exact map: matching windows without extent, no noise, and an exact position.
+SHARP = Resolution(window_m=0.0, noise_m=0.0, position_m=0.0)
 
 
 def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
@@ -310,8 +310,8 @@ def test_curvature_limit_follows_window_mean_of_paraboloid() -> None:
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
     x = np.linspace(-0.05, 0.05, 401)
     mean = float(np.mean(1.0 - 4.0 * (x[:, None] ** 2 + x**2) / 0.4**2))
-    assert roughness_limit_m(Resolution(0.1, 0.0), 1e-9, options) == pytest.approx(0.2 * mean, rel=1e-2)
-    noisy = roughness_limit_m(Resolution(0.0, 0.01), 1e-9, options)
+    assert roughness_limit_m(Resolution(0.1, 0.0, 0.0), 1e-9, options) == pytest.approx(0.2 * mean, rel=1e-2)
+    noisy = roughness_limit_m(Resolution(0.0, 0.01, 0.0), 1e-9, options)
     assert noisy == pytest.approx(0.2 - options.margin_deviations * 0.01)
 
 
@@ -331,7 +331,7 @@ def test_curved_ground_is_a_hazard_despite_smooth_planes() -> None:
 def test_coarse_map_has_no_safe_cells() -> None:
     ground = ElevationMap(np.zeros((60, 60)), np.zeros(2), 0.1)
     options = HdaOptions(refine_planes=True, max_roughness_m=0.2, narrowest_hazard=2.0)
-    coarse = Resolution(window_m=1.0, noise_m=0.0)
+    coarse = Resolution(window_m=1.0, noise_m=0.0, position_m=0.0)
     # Footprints at the border are not within the map.
     inner = (slice(10, 50), slice(10, 50))
     assert np.all(classify_footprints(ground, SHARP, options)[inner] == Safety.SAFE)
@@ -354,6 +354,17 @@ def test_each_position_is_checked_with_its_own_footprint(row: int, column: int) 
     unknown |= np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns]) <= 5
     expected = np.where(hazard, Safety.HAZARD, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
     np.testing.assert_array_equal(safety, expected)
+
+
+def test_unsafe_positions_grow_by_the_error_of_the_position() -> None:
+    """Two standard deviations of 0.16 m are 3.2 cells: the hazard grows from 6 to 9 cells, the border from 5 to 8."""
+    ground = add_bump(make_ground(), 40, 50, 0.5, 0.3)
+    options = replace(OPTIONS, narrowest_hazard=100.0, margin_deviations=2.0, level_error_rad=0.0)
+    safety = classify_footprints(ground, replace(SHARP, position_m=0.16), options)
+    distances = np.hypot(*(np.indices(safety.shape) - np.array([40, 50])[:, None, None]))
+    assert np.all(safety[distances <= 8.5] == Safety.HAZARD)
+    assert np.all(safety[8:-8, 8:-8][distances[8:-8, 8:-8] > 9.7] == Safety.SAFE)
+    assert np.all(safety[:8] == Safety.UNKNOWN)
 
 
 def test_steep_footprints_are_hazards() -> None:
