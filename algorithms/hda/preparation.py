@@ -44,9 +44,9 @@ def prepare_views(
 def resample_second(views: Views, second_from_first: RigidTransform, depth_m: float) -> tuple[Views, RigidTransform]:
     """Resample the second image to the orientation of the first camera, and to its scale at the depth `depth_m`.
 
-    A window then shows the same ground in both images, whatever the rotation and the change of height between them. The
-    resampled image covers the field of view of the second image, but has at most `MAX_SIDE_RATIO` times the sides of
-    the first; outside the second image it repeats the border. The views are returned unchanged if the second camera is
+    A window then shows the same ground in both images, also after a rotation or a change of height. The resampled
+    image covers the field of view of the second image, but has at most `MAX_SIDE_RATIO` times the sides of the first;
+    outside the second image it repeats the border. The views are returned unchanged if the second camera is
     not above the ground at this depth, or does not look in the direction of the first.
     """
     first, second = views
@@ -54,7 +54,7 @@ def resample_second(views: Views, second_from_first: RigidTransform, depth_m: fl
     origin = first_from_second.apply(np.array(second_from_first.translation))
     rays = first_from_second.apply(second.camera.rays(second.camera.border(16))[1])
     second_depth_m = depth_m + float(origin[2])
-    if second_depth_m <= 0.0 or np.any(rays[:, 2] <= 0.0):
+    if not (second_depth_m > 0.0 and np.all(rays[:, 2] > 0.0)):
         return views, second_from_first
     focal = first.focal_px * second_depth_m / depth_m
     border_px = focal * rays[:, :2] / rays[:, 2:]

@@ -21,6 +21,7 @@ from marsyard.algorithms.hda import (
     hda_products,
 )
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
+from marsyard.algorithms.hda.options import IMPROVEMENTS
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements, PoseMeasurement
@@ -40,6 +41,7 @@ OPTIONS = HdaOptions(
 BOULDERS = ((-1.2, 1.5, 0.35, 0.12), (1.6, 1.6, 0.35, 0.12), (0.3, 0.6, 0.35, 0.12), (-2.0, 0.3, 0.35, 0.12))
 ESTIMATORS: dict[str, Callable[[HdaOptions], SiteEstimator]] = {
     "hda": HdaEstimator,
+    "hda-plus": lambda options: HdaEstimator(replace(options, **IMPROVEMENTS)),
     "essential": EssentialMatrixEstimator,
     "semi-global": SemiGlobalEstimator,
 }
