@@ -22,7 +22,6 @@ from marsyard.sim.measurements import (
     ImuIncrements,
     MastCalibration,
 )
-from marsyard.sim.parameters import warn_deprecated
 
 #: Largest asymmetry of a covariance due to rounding, as a fraction of its largest entry.
 _MAX_ASYMMETRY = 1e-9
@@ -149,39 +148,6 @@ OPTIONAL_STREAM_METHODS: Mapping[type, str] = {
     ImuIncrements: "process_increments",
     AltitudeMeasurement: "process_altitude",
 }
-#: Former name of the method `process_image`; accepted until 0.2.
-_FORMER_IMAGE_METHOD = "picture"
-
-
-def has_stream_method(stream: object, method: str) -> bool:
-    """Return whether a class or object has a method of a stream, under its current or former name."""
-    return hasattr(stream, method) or (method == "process_image" and hasattr(stream, _FORMER_IMAGE_METHOD))
-
-
-class _FormerStream:
-    """Adapter: calls a stream whose image method has its former name as a `VelocityStream`."""
-
-    def __init__(self, stream: Any) -> None:
-        self._stream = stream
-
-    def start(self) -> None:
-        self._stream.start()
-
-    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
-        answer: VelocityEstimate | None = getattr(self._stream, _FORMER_IMAGE_METHOD)(frame)
-        return answer
-
-    def finish(self) -> VelocityEstimate:
-        answer: VelocityEstimate = self._stream.finish()
-        return answer
-
-
-def create_streamed(stream: Any) -> StreamedEstimator:
-    """Wrap a stream as a velocity estimator; the former name of its image method is accepted with a warning."""
-    if hasattr(stream, "process_image"):
-        return StreamedEstimator(stream)
-    warn_deprecated(_FORMER_IMAGE_METHOD, "process_image")
-    return StreamedEstimator(_FormerStream(stream))
 
 
 @dataclass(frozen=True)

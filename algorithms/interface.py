@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
@@ -19,7 +18,6 @@ from marsyard.sim.measurements import (
     RoverMeasurements,
     TargetDesignation,
 )
-from marsyard.sim.parameters import DeprecatedNameWarning, warn_deprecated
 
 
 class VelocityOutcome(Enum):
@@ -56,12 +54,6 @@ class VelocityEstimate:
     span_s: tuple[float, float] | None = None
     after_images: tuple[VelocityEstimate | None, ...] = ()
     attitude_error_rad: Float[np.ndarray, "3"] | None = None
-
-    @property
-    def after_pictures(self) -> tuple[VelocityEstimate | None, ...]:
-        """Former name of `after_images`, until 0.2."""
-        warn_deprecated("after_pictures", "after_images")
-        return self.after_images
 
 
 class VelocityEstimator(Protocol):
@@ -159,16 +151,6 @@ class TargetUpdate:
     def tracked(self) -> bool:
         """Whether this update matched the target."""
         return self.state is TrackingState.NORMAL
-
-    @property
-    def found(self) -> bool:
-        """Former name of `tracked`, accepted until 0.2."""
-        warnings.warn(
-            "TargetUpdate.found is now TargetUpdate.tracked; the former name is accepted until 0.2",
-            DeprecatedNameWarning,
-            2,
-        )
-        return self.tracked
 
 
 class TargetTracker(Protocol):

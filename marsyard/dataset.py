@@ -117,9 +117,6 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
             "case": case,
             "image_index": number,
             "dispersed_parameters": draws,
-            # former names of the two fields, until 0.2
-            "picture": number,
-            "drawn": draws,
         }
         image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel, 2**sample.bits - 1)
         # scale the counts to the full range of 16 bits

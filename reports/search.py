@@ -12,9 +12,6 @@ from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.stored import table
 from marsyard.reports.wording import NOTHING, count, number
 
-#: Current keys of stored results by former key; accepted until version 0.2.
-_FORMER_KEYS = {"searched": "search_cases", "found_case": "original_case"}
-
 
 def read_search(record: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the settings of a search with its `result`; empty for a run that is no search, or is not finished."""
@@ -22,13 +19,7 @@ def read_search(record: Mapping[str, Any]) -> Mapping[str, Any]:
     result = table(study.get("result"))
     if study.get("kind") != "search" or not result:
         return {}
-    failures = [_rename_keys(failure, _FORMER_KEYS) for failure in result["failures"]]
-    return {**study, "result": {**_rename_keys(result, _FORMER_KEYS), "failures": failures}}
-
-
-def _rename_keys(values: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    """Replace former keys by the current ones."""
-    return {names.get(key, key): value for key, value in values.items()}
+    return study
 
 
 def search_sentences(study: Mapping[str, Any]) -> list[str]:

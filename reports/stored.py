@@ -10,11 +10,6 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.configuration import (
-    find_renamed_columns,
-    update_stored_configuration,
-    update_stored_rows,
-)
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
@@ -110,7 +105,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     except (OSError, ValueError):
         record = {}
     configuration = table(record.get("configuration"))
-    record["configuration"] = configuration = update_stored_configuration(configuration) if configuration else {}
+    record["configuration"] = configuration
     record["requirements"] = configuration.get("requirements", record.get("requirements"))
     if requirements is not None:
         record["requirements"] = list(requirements)
@@ -133,12 +128,11 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
 
     file = pq.ParquetFile(path)
     stored_names = file.schema_arrow.names
-    new_names = find_renamed_columns(stored_names, str(table(record.get("configuration")).get("scenario")))
     if file.metadata.num_rows <= MAX_FULL_CASES:
-        frame = _sort_rows(update_stored_rows(pd.read_parquet(path), new_names))
+        frame = _sort_rows(pd.read_parquet(path))
         return frame, frame
-    first_rows = update_stored_rows(next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas(), new_names)
-    requirement_list, names = record.get("requirements"), [new_names.get(name, name) for name in stored_names]
+    first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
+    requirement_list = record.get("requirements")
     requirements = (
         [requirement for requirement in requirement_list if isinstance(requirement, Mapping)]
         if isinstance(requirement_list, list)
@@ -152,9 +146,11 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         )
     metric = primary_metric(first_rows, requirements)
     if metric is not None:
-        columns.update([metric, *axis_columns(metric, names), *driver_columns(first_rows, metric, max_columns=3)])
-    all_cases = pd.read_parquet(path, columns=[name for name in stored_names if new_names.get(name, name) in columns])
-    return _sort_rows(first_rows), _sort_rows(update_stored_rows(all_cases, new_names))
+        columns.update(
+            [metric, *axis_columns(metric, stored_names), *driver_columns(first_rows, metric, max_columns=3)]
+        )
+    all_cases = pd.read_parquet(path, columns=[name for name in stored_names if name in columns])
+    return _sort_rows(first_rows), _sort_rows(all_cases)
 
 
 def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:

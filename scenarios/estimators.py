@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from marsyard.algorithms import exchange
-from marsyard.algorithms.answers import STREAM_METHODS, StreamedEstimator, create_streamed, has_stream_method
+from marsyard.algorithms.answers import STREAM_METHODS, StreamedEstimator
 from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes import options as dimes_options
@@ -121,7 +121,7 @@ class Task(Generic[Algorithm, Options]):
             return
         factory = self._import(spec)
         methods = STREAM_METHODS if self._is_stream(factory) else self.methods
-        missing = [method for method in methods if not has_stream_method(factory, method)]
+        missing = [method for method in methods if not hasattr(factory, method)]
         if not callable(factory):
             raise ValueError(f"'{spec}' is not a valid {self.what}: {type(factory).__name__}, not a class or function")
         if missing and isinstance(factory, type):
@@ -158,8 +158,8 @@ class Task(Generic[Algorithm, Options]):
 
     def _is_stream(self, algorithm: object) -> bool:
         """Return whether a class or object receives images one by one; methods may be missing."""
-        is_complete = all(has_stream_method(algorithm, method) for method in STREAM_METHODS)
-        is_partial = has_stream_method(algorithm, "process_image") and not any(
+        is_complete = all(hasattr(algorithm, method) for method in STREAM_METHODS)
+        is_partial = hasattr(algorithm, "process_image") and not any(
             hasattr(algorithm, method) for method in self.methods
         )
         return self.streamed is not None and (is_complete or is_partial)
@@ -207,7 +207,7 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     ),
     options=DimesOptions,
     offline=VELOCITY_FORMAT,
-    streamed=create_streamed,
+    streamed=StreamedEstimator,
 )
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(

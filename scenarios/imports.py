@@ -11,23 +11,6 @@ from typing import Any
 
 from marsyard.scenarios.objects import SUFFIX, load_object
 
-#: Former top-level names of the subpackages of `marsyard`.
-_FORMER_PACKAGES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
-
-
-def current_module(module: str) -> str:
-    """Return the current name of a module whose former name a stored campaign or an older file contains.
-
-    ``algorithms.dimes`` becomes ``marsyard.algorithms.dimes``; names of other packages are returned unchanged.
-    """
-    if module.partition(".")[0] not in _FORMER_PACKAGES:
-        return module
-    try:
-        exists = importlib.util.find_spec(f"marsyard.{module}") is not None
-    except ImportError:
-        exists = False
-    return f"marsyard.{module}" if exists else module
-
 
 def import_object(path: str) -> Any:
     """Import the object at ``module:name``, or a stored object. Raises ImportError with the reason.
@@ -41,7 +24,7 @@ def import_object(path: str) -> Any:
     if module.endswith(SUFFIX):
         return load_object(module)
     try:
-        return getattr(importlib.import_module(current_module(module)), name)
+        return getattr(importlib.import_module(module), name)
     except ImportError:
         raise
     except Exception as error:  # a module may raise anything
@@ -55,7 +38,7 @@ def source_files(path: str) -> Iterator[tuple[str, Path]]:
         source = Path(module).with_suffix(".py")
         yield source.name, source if source.is_file() else Path(module)
         return
-    parts = current_module(module).split(".")
+    parts = module.split(".")
     package = ".".join(parts[:2] if parts[0] == "marsyard" else parts[:1])
     spec = importlib.util.find_spec(package)
     if spec is None or spec.origin is None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import InitVar, dataclass, field
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from marsyard.scenarios.imports import import_object
-from marsyard.sim.parameters import warn_deprecated
 
 if TYPE_CHECKING:  # its imports take longer than `marsyard list`
     from marsyard.scenarios.interface import Scenario
@@ -65,7 +64,6 @@ class System:
     - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder
       for the new cases, and folder to which the new cases are moved. Returns `Ingested`.
     - report: a `marsyard.reports.presentation.Presentation`: report sections, and the figures of a case
-    - compiled_by: deprecated name of `compilation_campaigns`
     """
 
     name: str
@@ -81,12 +79,6 @@ class System:
     templates: Mapping[str, str] = field(default_factory=dict)
     ingest: str = ""
     report: str = ""
-    compiled_by: InitVar[Mapping[str, tuple[str, ...]] | None] = None
-
-    def __post_init__(self, compiled_by: Mapping[str, tuple[str, ...]] | None) -> None:
-        if compiled_by is not None:
-            warn_deprecated("compiled_by", "compilation_campaigns")
-            object.__setattr__(self, "compilation_campaigns", compiled_by)
 
     @property
     def campaigns(self) -> Mapping[str, Path]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import InitVar, asdict, dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.systems import SCENARIOS_FOLDER
 from marsyard.sim.camera import read_camera
-from marsyard.sim.parameters import warn_deprecated
 from marsyard.sim.terrain import MAX_TERRAINS
 
 #: Minimum number of terrains of a new campaign's bank, enough for cases appended later and for studies.
@@ -54,7 +53,6 @@ class CampaignTemplate:
     - max_bound: upper limit of the bound, exclusive
     - unsupported_options: why an option (``camera``, ``detector``, ``flight``) is not accepted, by option
     - values: function that returns further values for the file. Raises ValueError if a user's file is invalid.
-    - refused: deprecated name of `unsupported_options`
     """
 
     file: Path
@@ -65,12 +63,6 @@ class CampaignTemplate:
     max_bound: float = math.inf
     unsupported_options: Mapping[str, str] = field(default_factory=dict)
     values: Callable[[Choices], Mapping[str, Any]] = lambda _: {}
-    refused: InitVar[Mapping[str, str] | None] = None
-
-    def __post_init__(self, refused: Mapping[str, str] | None) -> None:
-        if refused is not None:
-            warn_deprecated("refused", "unsupported_options")
-            object.__setattr__(self, "unsupported_options", refused)
 
     def text(self, choices: Choices) -> str:
         """Return the text of the campaign file. Raises ValueError if an option is not accepted."""

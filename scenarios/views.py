@@ -17,7 +17,6 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.horizon import hill_objects
 from marsyard.sim.frames import rigid
-from marsyard.sim.parameters import warn_deprecated
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
 from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.sensor import CameraDesign
@@ -119,12 +118,6 @@ class Viewpoint:
     azimuth_rad: float = 0.0
     half_width_rad: float = np.pi
     max_distance_m: float = np.inf
-
-    @classmethod
-    def of(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Viewpoint:
-        """Call `from_pose`; deprecated name."""
-        warn_deprecated("Viewpoint.of", "Viewpoint.from_pose")
-        return cls.from_pose(rays, world_from_body, surface)
 
     @classmethod
     def from_pose(cls, rays: PixelRays, world_from_body: RigidTransform, surface: Surface) -> Viewpoint:

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from marsyard.sim.parameters import Choice
 
-
-class SurfaceFrame(Choice):
+class SurfaceFrame(Enum):
     """Source of the vertical direction (paper: section II.D). The azimuth always comes from the on-board pose.
 
     Inclinometers, attitude of the on-board filter, or the normal of a robust plane through the points. The map of the
@@ -24,7 +23,7 @@ class SurfaceFrame(Choice):
     PLANE = "plane"
 
 
-class TrackSeed(Choice):
+class TrackSeed(Enum):
     """Start of the search for a feature in the second image, and of the motion estimation.
 
     Unchanged: the position in the first image, and zero motion ("no knowledge of the motion between frames is assumed",

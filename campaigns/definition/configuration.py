@@ -1,14 +1,12 @@
-"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits); use of former names."""
+"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits)."""
 
 from __future__ import annotations
 
 import math
-import re
 import tomllib
 import types
-import warnings
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial, reduce
+from collections.abc import Iterable, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -17,20 +15,11 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from marsyard.campaigns.errors import ConfigurationError, Problem, suggest_similar
 from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
-from marsyard.scenarios.interface import Scenario
-from marsyard.scenarios.systems import UnknownScenarioError, row_columns, scenario
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import (
-    DeprecatedNameWarning,
-    Parameters,
-    current_column,
-    current_fault,
-    current_key,
-    field_names,
-)
+from marsyard.sim.parameters import Parameters
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 Model = TypeVar("Model", bound=BaseModel)
 #: Location of a key in nested tables and lists: names and indices.
@@ -319,18 +308,6 @@ def description_at(model: type[BaseModel], path: str) -> str:
     return next((option.model_fields[name].description or "" for option in models if name in option.model_fields), "")
 
 
-def current_path(model: type[BaseModel], path: str) -> str:
-    """Replace former names in the dotted path of a model's field by current names; unknown names are unchanged."""
-    annotation: Any = model
-    keys = []
-    for key in path.split("."):
-        fields = {name for option in _list_models(annotation) for name in option.model_fields}
-        fields = fields.union(*map(field_names, _list_alternatives(annotation)))
-        keys.append(current_key(key, fields))
-        annotation = _find_inner_type(annotation, int(key) if key.isdigit() else keys[-1])
-    return ".".join(keys)
-
-
 def _find_inner_type(annotation: Any, key: str | int) -> Any:
     """Find the type of the field, entry or element `key` of a type; None if there is none."""
     inner_types: list[Any] = []
@@ -360,88 +337,3 @@ def _list_alternatives(annotation: Any) -> list[Any]:
     if origin in (Union, types.UnionType):
         return [inner for choice in get_args(annotation) for inner in _list_alternatives(choice)]
     return [annotation]
-
-
-_NAME = re.compile(r"[A-Za-z_]\w*(?:\.\w+)*")
-#: Keys of a dispersion whose texts are not formulas.
-_TEXT_KEYS = ("distribution", "source", "description", "unit")
-
-
-def use_current_names(tables: Mapping[str, Any], selected_scenario: Scenario) -> dict[str, Any]:
-    """Replace former names of dispersed parameters and columns in the tables of a campaign file, with warnings.
-
-    The parameter models replace the former keys of the parameters themselves.
-    """
-    rename_path = partial(current_path, selected_scenario.parameters_type)
-    rename_column = _column_renamer(str(tables.get("scenario")))
-    current = dict(tables)
-    dispersions, correlations = tables.get("dispersions"), tables.get("correlations")
-    if isinstance(dispersions, Mapping):
-        current["dispersions"] = {
-            rename_path(name): {
-                key: _rename_in_value(value, rename_path) if key not in _TEXT_KEYS else value
-                for key, value in table.items()
-            }
-            if isinstance(table, Mapping)
-            else table
-            for name, table in dispersions.items()
-        }
-    if isinstance(correlations, list):
-        current["correlations"] = [_rename_entries(group, ("parameters",), rename_path) for group in correlations]
-    if isinstance(tables.get("requirements"), list):
-        keys = ("metric", "population")
-        current["requirements"] = [_rename_entries(entry, keys, rename_column) for entry in tables["requirements"]]
-    return current
-
-
-def update_stored_configuration(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace former names in the configuration of a stored campaign, without warnings."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecatedNameWarning)
-        stored = {current_key(key, CampaignConfiguration.model_fields): value for key, value in stored.items()}
-        try:
-            selected_scenario = scenario(str(stored.get("scenario")))
-            current = use_current_names(stored, selected_scenario)
-            parameters = selected_scenario.parameters_type.model_validate(stored.get("parameters", {}))
-        except (UnknownScenarioError, ValidationError, ImportError):
-            return dict(stored)
-        return {**current, "parameters": parameters.model_dump(mode="json", round_trip=True, exclude_unset=True)}
-
-
-def find_renamed_columns(names: Iterable[str], scenario_name: str) -> dict[str, str]:
-    """Map stored columns that have a former name to their current names, without warnings."""
-    rename_column = _column_renamer(scenario_name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecatedNameWarning)
-        return {name: current for name in names if (current := rename_column(name)) != name}
-
-
-def update_stored_rows(frame: pd.DataFrame, new_names: Mapping[str, str]) -> pd.DataFrame:
-    """Rename the columns of stored rows, and replace former names of faults."""
-    frame = frame.rename(columns=dict(new_names))
-    return frame.assign(fault=frame["fault"].map(current_fault, na_action="ignore")) if "fault" in frame else frame
-
-
-def _column_renamer(scenario_name: str) -> Callable[[str], str]:
-    """Create the function that returns the current name of a column of a scenario."""
-    try:
-        columns = row_columns(scenario_name)
-    except ValueError:
-        columns = None
-    if columns is None:
-        return lambda name: name
-    return lambda name: current_column(name, lambda key: columns.has_flag(key) or columns.has_number(key))
-
-
-def _rename_in_value(value: Any, rename: Callable[[str], str]) -> Any:
-    """Rename all names in a formula, or in a list of names or formulas."""
-    if isinstance(value, str):
-        return _NAME.sub(lambda match: rename(match[0]), value)
-    return [_rename_in_value(item, rename) for item in value] if isinstance(value, list) else value
-
-
-def _rename_entries(entry: Any, keys: Iterable[str], rename: Callable[[str], str]) -> Any:
-    """Rename all names in the entries `keys` of a table; another value is returned unchanged."""
-    if not isinstance(entry, Mapping):
-        return entry
-    return {key: _rename_in_value(value, rename) if key in keys else value for key, value in entry.items()}

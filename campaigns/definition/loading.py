@@ -16,17 +16,15 @@ from marsyard.campaigns.definition.checks import find_campaign_problems
 from marsyard.campaigns.definition.configuration import (
     CampaignConfiguration,
     Key,
-    current_path,
     key_text,
     read_tables,
-    use_current_names,
     validation_problems,
 )
 from marsyard.campaigns.definition.identity import find_scenario
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
 from marsyard.campaigns.sampling.design import MATRICES
-from marsyard.scenarios.interface import HasAlgorithms, Scenario
+from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.systems import UnknownScenarioError, catalogue, scenario
 
 #: Keys of the file that `--set` accepts; any other key is a parameter.
@@ -72,14 +70,11 @@ def load_campaign(
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
-    selected_scenario = find_scenario(tables.get("scenario"))
-    if selected_scenario is not None:
-        tables = use_current_names(tables, selected_scenario)
     options_by_key: dict[tuple[str, ...], str] = {}
     command = ["marsyard", "run", name_or_path]
     for override in overrides:
         option = f"--set {override}"
-        tables = _apply_option(tables, _parse_override(override, option, selected_scenario), option, options_by_key)
+        tables = _apply_option(tables, _parse_override(override, option), option, options_by_key)
     if algorithms:
         tables = _select_algorithms(tables, algorithms, str(path), options_by_key)
     for key, option, value in (("cases", "-n", cases), ("seed", "--seed", seed)):
@@ -98,18 +93,14 @@ def create_campaign(tables: Mapping[str, Any], source: str = "the campaign") -> 
     source: name of the tables in messages
     Raises ConfigurationError with all problems: key and allowed values.
     """
-    selected_scenario = find_scenario(tables.get("scenario"))
-    complete = dict(tables) if selected_scenario is None else use_current_names(dict(tables), selected_scenario)
-    return _validate(source, complete, {})
+    return _validate(source, dict(tables), {})
 
 
-def _parse_override(override: str, option: str, selected_scenario: Scenario | None) -> dict[str, Any]:
+def _parse_override(override: str, option: str) -> dict[str, Any]:
     """Parse ``KEY=VALUE`` into nested tables of a campaign file; a value that is not TOML is a text."""
     key, separator, value = override.partition("=")
     if not separator or not key.strip() or "\n" in override:
         raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
-    if selected_scenario is not None and key.split(".")[0].strip() not in _FILE_KEYS:
-        key = current_path(selected_scenario.parameters_type, key.strip())
     try:
         try:
             values = tomllib.loads(f"{key} = {value.strip()}")

@@ -21,7 +21,6 @@ import numpy as np
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import StoreError, report_write_errors
-from marsyard.sim.parameters import rename_products
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
 _ARRAY_KEY = "__array__"
@@ -133,13 +132,13 @@ def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def load_products(directory: Path) -> dict[str, Any]:
-    """Load the products in a folder; tuples become lists, and deprecated names current names.
+    """Load the products in a folder; tuples become lists.
 
     Raises StoreError if there are none.
     """
     try:
         files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
-        return rename_products(unpack_products(PackedProducts(*files)))
+        return unpack_products(PackedProducts(*files))
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise StoreError(f"{directory} contains no products of a case: {error}") from error
 

@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, update_stored_configuration
+from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
@@ -177,7 +177,7 @@ def read(directory: Path) -> dict[str, Any]:
 def stored_configuration(directory: Path) -> CampaignConfiguration:
     """Read the configuration of a stored campaign. Raises StoreError if the record is missing or damaged."""
     try:
-        return CampaignConfiguration.model_validate(update_stored_configuration(read(directory)["configuration"]))
+        return CampaignConfiguration.model_validate(read(directory)["configuration"])
     except (ValueError, KeyError) as error:
         raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
 

@@ -163,28 +163,10 @@ for panel, commands in PANELS.items():
         app.add_typer(terrain, name="terrain", cls=_Group, rich_help_panel=panel)
 
 
-_format_default = warnings.formatwarning
-
-
-def _format_warning(
-    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
-) -> str:
-    from marsyard.sim.parameters import DeprecatedNameWarning
-
-    if issubclass(category, DeprecatedNameWarning):
-        return f"warning: {message}\n"
-    return _format_default(message, category, filename, lineno, line)
-
-
 def main() -> None:
     """Run the command line; an unexpected error prints a traceback and exits with status 2 (1 is for verdicts)."""
     # if `pgrep` is not installed, loky prints a needless warning at the end of each worker
     warnings.filterwarnings("ignore", message="Failed to kill subprocesses")
-    warnings.formatwarning = _format_warning
-    if not {"--help", "--version"}.issuperset(sys.argv[1:]):  # both options work without NumPy
-        from marsyard.sim.parameters import current_options
-
-        sys.argv[1:] = current_options(sys.argv[1:])
     try:
         app()
     except Exception:

@@ -56,9 +56,7 @@ def clean(
         except OSError:  # not empty, in use, or already removed
             continue
     if as_json:
-        # `kept` is the former key of `caches`, until version 0.2
-        data = {"caches": caches, "kept": caches, "removed_bytes": removed_bytes}
-        typer.echo(json.dumps(data, indent=2, default=str))
+        typer.echo(json.dumps({"caches": caches, "removed_bytes": removed_bytes}, indent=2, default=str))
         return
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("kind", "files", "size", "limit", "folder", "contents"):

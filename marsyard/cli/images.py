@@ -278,7 +278,6 @@ def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any
         "marsyard": version("marsyard"),
         "shot": asdict(request),
         "image": image.suffix.lstrip("-") or "single",
-        "picture": image.suffix.lstrip("-") or "single",  # former name of `image`, until 0.2
         "size": {"columns": columns, "rows": rows},
         "png": png,
         "npz": {

@@ -163,8 +163,7 @@ def conformance(
             console().print(line, markup=False, highlight=False, soft_wrap=True)
     failures = sum(not finding.passed for finding in findings)
     if as_json:
-        # `asked` is the former key of `requirement`, until version 0.2
-        checks = [{**asdict(finding), "asked": finding.requirement, "passed": finding.passed} for finding in findings]
+        checks = [{**asdict(finding), "passed": finding.passed} for finding in findings]
         data = {"algorithm": candidate.spec, "task": candidate.task, "passed": not failures, "checks": checks}
         typer.echo(json.dumps(data, indent=2))
     else:

@@ -27,7 +27,6 @@ from rich.console import Console
 from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import find_renamed_columns, update_stored_rows
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import ProgressObserver, append_cases, run_campaign
@@ -128,9 +127,7 @@ def read_frame(directory: Path) -> pd.DataFrame:
     if not path.is_file():
         raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign is not finished")
     try:
-        frame = pd.read_parquet(path)
-        new_names = find_renamed_columns(frame.columns, stored_configuration(directory).scenario)
-        return update_stored_rows(frame, new_names)
+        return pd.read_parquet(path)
     except (OSError, ValueError) as error:
         raise StoreError(f"{path} is not a valid table of cases: {error}") from error
 

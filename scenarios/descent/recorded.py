@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import Annotated
 
 import numpy as np
@@ -12,13 +13,13 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.user_files import RecordedAxes, UserFile
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
-from marsyard.sim.parameters import Choice, bounded_field
+from marsyard.sim.parameters import bounded_field
 
 #: Required duration of the flight after the last image, s.
 END_MARGIN_S = 0.5
 
 
-class FlightOrigin(Choice):
+class FlightOrigin(Enum):
     """Origin of the positions of a recorded flight: the case's location on the ground, or the terrain's origin."""
 
     LOCATION = "location"

@@ -237,7 +237,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         changes = settings.get("terrain", {})
         site_preset = sites().get(name) if isinstance(name, str) else None
         if (
-            not {"terrain_site", "terrain_of"}.isdisjoint(settings)  # `terrain_of`: deprecated name
+            "terrain_site" in settings
             or getattr(site_preset, str(scale), None) is None
             or not isinstance(changes, Mapping)
         ):

@@ -18,12 +18,12 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
+    TABLE_FILE,
     VELOCITY,
     ImageRow,
     IngestError,
     IngestFile,
     SunTable,
-    find_table,
     read_counts,
     read_flat_field,
     read_header,
@@ -91,7 +91,7 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
     Raises IngestError if the folder is invalid: the message contains the file, and the line or key. Raises OSError if
     the cases cannot be written.
     """
-    file, table = read_ingest_file(source), find_table(source)
+    file, table = read_ingest_file(source), source / TABLE_FILE
     reader = _FolderReader(source, file, target)
     cases: list[store.StoredCase] = []
     problems: list[str] = []

@@ -23,12 +23,10 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular, open_regular, read_npy_header
 from marsyard.sim.frames import direction
-from marsyard.sim.parameters import Parameters, bounded_field, warn_deprecated
+from marsyard.sim.parameters import Parameters, bounded_field
 
 #: Names of the settings file and of the table of images in every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "images.csv"
-#: Former name of the table of images, accepted until 0.2.
-_FORMER_TABLE_FILE = "pictures.csv"
 
 VELOCITY, LANDING, MATCHING = "velocity", "landing", "matching"
 TaskName = Literal["velocity", "landing", "matching"]
@@ -208,15 +206,6 @@ class ImageRow:
         """Return the rotation of the columns `qx` to `qw`; None if they are empty."""
         quaternion = self.vector(*(f"{prefix}q{axis}" for axis in "xyzw"))
         return None if quaternion is None else Rotation.from_quat(quaternion)
-
-
-def find_table(folder: Path) -> Path:
-    """Return the path of the folder's table of images; a table with the former name is found with a warning."""
-    path, former_path = folder / TABLE_FILE, folder / _FORMER_TABLE_FILE
-    if path.exists() or not former_path.exists():
-        return path
-    warn_deprecated(_FORMER_TABLE_FILE, TABLE_FILE)
-    return former_path
 
 
 def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:

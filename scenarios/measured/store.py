@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -32,7 +31,7 @@ from marsyard.sim.measurements import (
     LandingMeasurements,
     PoseMeasurement,
 )
-from marsyard.sim.parameters import DeprecatedNameWarning, Parameters
+from marsyard.sim.parameters import Parameters
 
 #: Version of `cases.json`, and its name.
 SCHEMA = 1
@@ -149,10 +148,7 @@ def _read(file: str, _modified_ns: int, _size: int) -> tuple[StoredCases, str]:
     """Read and check `cases.json`; modification time and size are cache keys, so that a changed file is read again."""
     try:
         contents = Path(file).read_bytes()
-        with warnings.catch_warnings():
-            # the user cannot rename a former key, because the hash of the file is part of a campaign's identity
-            warnings.simplefilter("ignore", DeprecatedNameWarning)
-            stored = StoredCases.model_validate_json(contents)
+        stored = StoredCases.model_validate_json(contents)
     except OSError as error:
         raise ValueError(f"{file}: {error.strerror or error}") from error
     except ValidationError as error:

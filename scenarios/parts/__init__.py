@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
 from marsyard.scenarios.parts.motions import MotionInputs, Poses
 from marsyard.scenarios.parts.scores import (
@@ -17,17 +15,8 @@ from marsyard.scenarios.parts.scores import (
     ScoredSite,
     ScoredVelocity,
 )
-from marsyard.sim.parameters import warn_deprecated
 
 __all__ = [
     "InstrumentReadings", "InstrumentTruth", "MotionInputs", "Poses", "ScoredDescent", "ScoredFlight",
     "ScoredLanding", "ScoredRun", "ScoredSite", "ScoredVelocity",
 ]  # fmt: skip
-
-
-def __getattr__(name: str) -> Any:
-    """Return the class with a deprecated name."""
-    if name != "DescentPlace":
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    warn_deprecated(name, "MotionInputs")
-    return MotionInputs

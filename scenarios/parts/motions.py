@@ -25,7 +25,7 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, CustomPart
 from marsyard.scenarios.user_files import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.parameters import bounded_field, warn_deprecated
+from marsyard.sim.parameters import bounded_field
 
 #: Maximum deviation of a quaternion's length from 1.
 UNIT_TOLERANCE = 1e-6
@@ -52,12 +52,6 @@ class MotionInputs:
     from_s: float
     until_s: float
     firing_height_m: float
-
-    @property
-    def pictures_s(self) -> tuple[float, ...]:
-        """Former name of `image_times_s`, until 0.2."""
-        warn_deprecated("pictures_s", "image_times_s")
-        return self.image_times_s
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rotation_matrix
-from marsyard.sim.parameters import warn_deprecated
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.structs import Rays
 from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
@@ -85,12 +84,6 @@ class PixelRays:
         """The cone that contains all rays of a camera in this pose."""
         axis = rotation_matrix(world_from_body) @ self.axis
         return world_from_body.apply(self.centre.copy()), axis, self.half_angle_rad
-
-    @classmethod
-    def of(cls, camera: CameraModel) -> PixelRays:
-        """Call `from_camera`; deprecated name."""
-        warn_deprecated("PixelRays.of", "PixelRays.from_camera")
-        return cls.from_camera(camera)
 
     @classmethod
     def from_camera(cls, camera: CameraModel) -> PixelRays:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span, check_velocity
-from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
+from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.exchange import (
     ExecutableLimits,
     ExecutableVelocityStream,
@@ -27,9 +27,7 @@ from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import VELOCITY
 from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, DescentMeasurements, ImuIncrements
-from marsyard.sim.parameters import DeprecatedNameWarning
 from marsyard.sim.sensor import InertialSolution
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
@@ -219,29 +217,6 @@ def test_answer_of_a_stream_with_after_images_is_rejected() -> None:
 
     with pytest.raises(AlgorithmError, match="after_images is given"):
         StreamedEstimator(StreamWithAfterImages()).estimate(inputs.descent())
-
-
-class FormerStream:
-    """A stream whose method `process_image` has its former name."""
-
-    def start(self) -> None:
-        pass
-
-    def picture(self, frame: DescentFrame) -> VelocityEstimate | None:
-        return make_estimate(frame.image.time_s, frame.image.time_s)
-
-    def finish(self) -> VelocityEstimate:
-        return NO_VELOCITY
-
-
-def test_former_names_of_streams_are_accepted() -> None:
-    VELOCITY.check(f"{__name__}:FormerStream")
-    with pytest.warns(DeprecatedNameWarning, match="'picture' is now 'process_image'"):
-        estimator = VELOCITY.make(f"{__name__}:FormerStream", DimesOptions(), ExecutableLimits())
-    answer = estimator.estimate(inputs.descent(3))
-    assert len(answer.after_images) == 3
-    with pytest.warns(DeprecatedNameWarning, match="'after_pictures' is now 'after_images'"):
-        assert answer.after_pictures == answer.after_images
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])

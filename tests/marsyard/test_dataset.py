@@ -113,8 +113,6 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
 
     assert 0.0 <= sample["dispersed_parameters"]["location.east_m"] <= 20.0
     assert sample["image_index"] == 0
-    # former names of these fields are written until 0.2
-    assert (sample["drawn"], sample["picture"]) == (sample["dispersed_parameters"], 0)
     # an interrupted data set is completed with identical files
     contents_before = [path.read_bytes() for path in shards]
     shards[0].unlink()

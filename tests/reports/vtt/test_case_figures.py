@@ -22,7 +22,6 @@ from marsyard.reports.vtt.case_figures import (
     read_stops,
 )
 from marsyard.reports.vtt.presentation import view
-from marsyard.sim.parameters import rename_products
 from tests.reports.vtt.tracking_rows import make_products
 
 
@@ -54,13 +53,6 @@ def test_template_around_the_match_is_enlarged() -> None:
     # 21 pixels are enlarged to 126: one bright pixel becomes 6 x 6 pixels
     assert bright.min(axis=0).tolist() == [60, 60]
     assert bright.max(axis=0).tolist() == [65, 65]
-
-
-def test_matches_with_the_deprecated_name_are_read() -> None:
-    case_products = make_products()
-    matches = case_products.pop("stop_1_matches")
-    stop = read_stops(rename_products(case_products | {"stop_1_found": matches}))[0]
-    np.testing.assert_array_equal(stop.matches, matches)
 
 
 def test_titles_contain_range_roll_and_match_score() -> None:

@@ -16,7 +16,6 @@ from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.scenarios import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, load_images
-from marsyard.sim.parameters import DeprecatedNameWarning
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
 
@@ -65,17 +64,6 @@ def test_invalid_tables_are_rejected(tmp_path: Path, change: Callable[[Rows], Ro
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_text_rows(folder, change(read_rows(folder)))
     assert message in ingest_and_expect_error(folder, tmp_path)
-
-
-def test_former_names_of_table_and_images_are_accepted(tmp_path: Path) -> None:
-    folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
-    (folder / "images.csv").rename(folder / "pictures.csv")
-    (tmp_path / "out").mkdir()
-    with pytest.warns(DeprecatedNameWarning, match=r"'pictures\.csv' is now 'images\.csv'"):
-        path, stored_cases = ingest(folder, tmp_path / "out")
-    # cases.json of version 0.1 has the key `pictures`
-    path.write_text(path.read_text().replace('"images": [', '"pictures": ['))
-    assert CasesFile(file=str(path)).stored.cases == stored_cases.cases
 
 
 def replace_by_pipe(path: Path) -> None:
