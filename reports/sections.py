@@ -48,7 +48,7 @@ from marsyard.reports.wording import (
     requirement_text,
     split_unit,
 )
-from marsyard.scenarios.systems import scenario
+from marsyard.scenarios.systems import scenario, scenario_names
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10
@@ -208,11 +208,12 @@ def _distribution_text(dispersion: Mapping[str, Any]) -> str:
 
 
 def _parameters_type(run: StoredRun) -> type[BaseModel] | None:
-    """Return the parameters of the run's scenario; None if the scenario is not installed."""
-    try:
-        return scenario(str(run.recorded("scenario"))).parameters_type
-    except LookupError:
-        return None
+    """Return the parameters of the run's scenario; None for a scenario that is not installed.
+
+    A custom scenario is not imported: a report runs no code that a folder names.
+    """
+    name = str(run.recorded("scenario"))
+    return scenario(name).parameters_type if name in scenario_names() else None
 
 
 #: Machine properties whose names in the record are not words.
