@@ -12,15 +12,20 @@ from typing import Any
 from marsyard.scenarios.objects import SUFFIX, load_object
 
 
+def search_current_folder() -> None:
+    """Let Python find modules in the current folder, after those of installed packages."""
+    current_folder = str(Path.cwd())
+    if current_folder not in sys.path:
+        sys.path.append(current_folder)
+
+
 def import_object(path: str) -> Any:
     """Import the object at ``module:name``, or a stored object. Raises ImportError with the reason.
 
     The current folder is searched last: a file in it never shadows an installed package.
     """
     module, _, name = path.rpartition(":")
-    current_folder = str(Path.cwd())
-    if current_folder not in sys.path:
-        sys.path.append(current_folder)
+    search_current_folder()
     if module.endswith(SUFFIX):
         return load_object(module)
     try:

@@ -234,7 +234,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     for spec in list_algorithms(campaign.configuration):
         # shipped algorithms are installed with Marsyard; their sources are all of `marsyard.algorithms`
         is_shipped = spec in selected_scenario.task.shipped
-        sources = list(source_files("algorithms:") if is_shipped else custom_sources(spec))
+        sources = list(source_files("marsyard.algorithms:") if is_shipped else custom_sources(spec))
         if is_shipped:
             configured_options = (value for _, value in parameters if isinstance(value, selected_scenario.task.options))
             algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))

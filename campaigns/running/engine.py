@@ -27,6 +27,7 @@ from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, rea
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
+from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.products import ProductStore, create_product_selection
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
@@ -97,6 +98,7 @@ def run_campaign(
             command=command,
             algorithms=algorithms,
             evidence=evidence.to_table(),
+            origin=describe_origin(configuration),
         )
         if shard is not None:
             record.update(directory, {SHARD_KEY: str(shard)})

@@ -17,12 +17,12 @@ from marsyard.campaigns.definition.identity import configuration_hash
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver, resume_campaign, run_campaign
+from marsyard.campaigns.running.replay import load_stored_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
 from marsyard.scenarios.estimators import Task
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.offline import ANSWERS, CASES, read_answers
-from marsyard.scenarios.systems import scenario
 
 #: Files that describe an exported folder, for programs and for the team under test.
 MANIFEST_FILE, README_FILE = "export.json", "README.md"
@@ -109,7 +109,7 @@ def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Camp
         raise CampaignError(f"{truth} is not finished: export again to continue")
     if export_identity != (stored.name, stored.total_cases):
         raise CampaignError(f"{directory} and {truth} belong to different exports")
-    export = Campaign(stored, scenario(stored.scenario))
+    export = load_stored_campaign(truth, stored)
     _check_answers(_find_task(export), stored, answers)
     table = export.scenario.algorithm_table if isinstance(export.scenario, HasAlgorithms) else ()
     parameters = replace_value(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")

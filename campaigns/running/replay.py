@@ -26,6 +26,7 @@ from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.origin import check_origin
 from marsyard.campaigns.store.products import ALL_PRODUCTS, REPLAYED_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
@@ -117,8 +118,10 @@ def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
 def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
     """Create the campaign of a stored configuration; imports its scenario and algorithms.
 
-    Raises ConfigurationError if the scenario or an algorithm cannot be imported, or a parameter is invalid.
+    Raises CampaignError if the folder was created elsewhere and names code, and ConfigurationError if the scenario or
+    an algorithm cannot be imported, or a parameter is invalid.
     """
+    check_origin(directory, configuration)
     try:
         campaign = Campaign(configuration, scenario(configuration.scenario))
         campaign.base_parameters()

@@ -65,6 +65,7 @@ def write_first_record(
     command: Sequence[str] = (),
     algorithms: Sequence[Mapping[str, Any]] = (),
     evidence: Mapping[str, Any] | None = None,
+    origin: Mapping[str, Any] | None = None,
 ) -> None:
     """Write the record of a new campaign.
 
@@ -72,6 +73,7 @@ def write_first_record(
     - command: words of the command that repeats the campaign in the current folder
     - algorithms: see `marsyard.campaigns.definition.identity.describe_algorithms`
     - evidence: see `marsyard.campaigns.definition.evidence.Evidence`
+    - origin: see `marsyard.campaigns.store.origin`
     """
     contents = configuration.model_dump(mode="json")
     write(
@@ -93,6 +95,7 @@ def write_first_record(
             "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
             "algorithms": list(algorithms),
             "evidence": None if evidence is None else dict(evidence),
+            "origin": None if origin is None else dict(origin),
             "sessions": [describe_session("run", executor, 0)],
             "changes": [],
             "showcase": None,

@@ -30,6 +30,7 @@ from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
+from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
@@ -208,6 +209,7 @@ def create_study(campaign: Campaign, directory: Path, executor: str, settings: d
         executor,
         algorithms=describe_algorithms(campaign),
         evidence=evidence.to_table(),
+        origin=describe_origin(campaign.configuration),
     )
     record.update(directory, {STUDY_KEY: settings})
 

@@ -113,12 +113,16 @@ def merge(
     directories: Annotated[list[Path], Argument(metavar="DIR...", help="Folders of all shards of a campaign.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the merged campaign.")],
     jobs: options.JobsOption = None,
+    trust: options.TrustOption = False,
 ) -> None:
     """Combine all shards of a campaign (`run --shard`) into one campaign, evaluate it, and write its report."""
     from marsyard.campaigns.running.engine import finish_campaign
     from marsyard.campaigns.running.shards import merge_shards
+    from marsyard.campaigns.store.origin import adopt
 
     merge_shards(directories, out)
+    if trust:
+        adopt(out)
     executor = make_executor(jobs, None)
     run_and_evaluate(out, lambda observer: finish_campaign(out, executor, observer))
 
@@ -139,13 +143,17 @@ def resume(
     cluster: options.ClusterOption = None,
     case_time: options.CaseTimeOption = None,
     allow_changed: options.ChangedOption = False,
+    trust: options.TrustOption = False,
 ) -> None:
     """Run the remaining cases of an interrupted or killed campaign, and evaluate it."""
     from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
+    from marsyard.campaigns.store.origin import adopt
     from marsyard.cli.outcome import continue_until_decided
     from marsyard.cli.studies import contains_study, continue_study
 
+    if trust:
+        adopt(directory)
     if contains_study(directory):
         continue_study(directory, jobs, cluster)
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
@@ -176,14 +184,18 @@ def append(
     random: Annotated[
         bool, Option("--random", help="For a study of `marsyard rare`: N are random cases instead of replicates.")
     ] = False,
+    trust: options.TrustOption = False,
 ) -> None:
     """Add cases to a finished campaign (or replicates or cases to a study of rare violations), and evaluate all."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
+    from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.record import stored_configuration
     from marsyard.cli import outcome
     from marsyard.cli.studies import contains_study, continue_study
 
+    if trust:
+        adopt(directory)
     if contains_study(directory):
         continue_study(directory, jobs, cluster, cases, is_random=random)
     if random:

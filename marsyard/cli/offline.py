@@ -74,13 +74,17 @@ def score(
     out: options.OutOption = None,
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
+    trust: options.TrustOption = False,
 ) -> None:
     """Score the answers of an external algorithm; write verdicts and report."""
     from marsyard.campaigns.running.engine import ProgressObserver, run_campaign
     from marsyard.campaigns.running.offline import create_scoring_campaign, find_cases_with_changed_images, truth_folder
+    from marsyard.campaigns.store.origin import adopt
     from marsyard.reports.wording import count
 
     truth = truth_folder(directory) if truth is None else truth
+    if trust:
+        adopt(truth)
     command = ("marsyard", "score", str(directory), str(answers), "--truth", str(truth))
     campaign = replace(create_scoring_campaign(directory, truth, answers), command=command)
     target = out if out is not None else default_directory(campaign.configuration.name)

@@ -95,6 +95,13 @@ CaseTimeOption = Annotated[
 ChangedOption = Annotated[
     bool, Option("--allow-changed", help="Continue with changed code or versions; the change is recorded.")
 ]
+TrustOption = Annotated[
+    bool,
+    Option(
+        "--trust",
+        help="Execute code that a folder names which was created elsewhere; it must be the code that it recorded.",
+    ),
+]
 
 OutOption = Annotated[Path | None, Option(metavar="DIR", help="Output folder; by default runs/<campaign>-<UTC time>.")]
 OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]

@@ -41,9 +41,11 @@ def replay(
         Path | None,
         Option(metavar="DIR", help="Also write images, poses and inertial data as a ROS 2 bag into a new folder."),
     ] = None,
+    trust: options.TrustOption = False,
 ) -> None:
     """Run one case again, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as rerun_case
+    from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.products import (
         case_directory,
         pack_products,
@@ -55,6 +57,8 @@ def replay(
     from marsyard.reports.presentation import write_case_figures
 
     exports = _requested_exports(rerun, glb, rosbag)
+    if trust:
+        adopt(directory)
     result = rerun_case(directory, case)
     target = out if out is not None else case_directory(directory, case)
     if (result.failed or result.products is None) and (target / "products.json").exists():

@@ -17,6 +17,7 @@ from marsyard.cli.options import (
     Exit,
     JobsOption,
     JsonOption,
+    TrustOption,
     console,
     handle_user_errors,
 )
@@ -38,6 +39,7 @@ def report(
             "--gallery", help="First run some cases again to store their images: largest errors, no answer, and random."
         ),
     ] = False,
+    trust: TrustOption = False,
 ) -> None:
     """Evaluate the stored results of a campaign, and write its report; an interrupted campaign is also accepted.
 
@@ -46,8 +48,11 @@ def report(
     from marsyard.campaigns.definition.requirements import read_requirements, select_applicable
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store import record
+    from marsyard.campaigns.store.origin import adopt
     from marsyard.cli import outcome
 
+    if trust:
+        adopt(directory)
     if gallery:
         outcome.rerun_notable_cases(directory)
     applicable_requirements = None

@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
+]
+Command = Callable[..., tuple[int, str]]
 #: A module that leaves a file when it is imported, or an object of it is constructed.
 TRAP = """
 from pathlib import Path
@@ -30,14 +35,7 @@ NAMES: Mapping[str, dict[str, Any]] = {
     "rover": {"algorithm": "trap:Estimator", "compared": []},
     "localisation": {"algorithm": "trap:Estimator", "compared": []},
 }
-PARTS = {"motion": {"custom": "trap:Estimator"}, "scores": ["trap:Estimator"]}
-COMMANDS = (
-    ("report", "run"),
-    ("report", "run", "--csv"),
-    ("compare", "run", "other"),
-    ("dashboard", ".", "--out", "site"),
-    ("merge", "run", "other", "--out", "merged"),
-)
+PARTS = {"flight": {"motion": "trap:Estimator"}, "scores": ["trap:Estimator"]}
 
 
 class Trap:
@@ -47,23 +45,83 @@ class Trap:
         return exec, ("open('executed', 'w').write('unpickled')",)
 
 
-@pytest.mark.parametrize("scenario", list(NAMES))
-def test_reading_commands_execute_nothing(tmp_path: Path, scenario: str) -> None:
-    folder = run(write_campaign(tmp_path, "products = 'good'"), tmp_path / "run", RecordingWatch(), jobs=1)
-    record = json.loads((folder / "campaign.json").read_text())
-    record["configuration"] |= {"scenario": scenario, "parameters": NAMES[scenario] | PARTS}
-    for entry in record["algorithms"]:
-        entry |= {"spec": "trap:Estimator", "path": "trap:Estimator"}
-    (folder / "campaign.json").write_text(json.dumps(record))
-    shutil.copytree(folder, tmp_path / "other")
+@pytest.fixture
+def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
+    """Return a function that runs the command line in a folder of its own: exit code and output."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+    def run_command(*words: str) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["marsyard", *words])
+        with pytest.raises(SystemExit) as error_info:
+            cli.main()
+        captured = capfd.readouterr()
+        return int(error_info.value.code or 0), captured.out + captured.err
+
+    return run_command
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> dict[str, Path]:
+    """Folders of campaigns that name code which leaves a file when it is executed, by scenario."""
+    original = run(write_campaign(tmp_path, "products = 'good'"), tmp_path / "original", RecordingWatch(), jobs=1)
     (tmp_path / "trap.py").write_text(TRAP)
     (tmp_path / "trap.pkl").write_bytes(pickle.dumps(Trap()))
     (tmp_path / "trap.sh").write_text("#!/bin/sh\ntouch executed\n")
     (tmp_path / "trap.sh").chmod(0o755)
-    for command in COMMANDS:
-        process = subprocess.run(
-            [sys.executable, "-m", "marsyard", *command], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
-        assert "Traceback" not in process.stderr, process.stderr
+    folders = {}
+    for number, (scenario, names) in enumerate(NAMES.items()):
+        folders[scenario] = shutil.copytree(original, tmp_path / f"run-{number}")
+        record = json.loads((original / "campaign.json").read_text())
+        record["configuration"] |= {"scenario": scenario, "parameters": names | PARTS}
+        for entry in record["algorithms"]:
+            entry |= {"spec": "trap:Estimator", "path": "trap:Estimator"}
+        (folders[scenario] / "campaign.json").write_text(json.dumps(record))
+    shutil.rmtree(original)
+    return folders
+
+
+def test_reading_commands_execute_nothing(marsyard: Command, folders: Mapping[str, Path], tmp_path: Path) -> None:
+    names = [folder.name for folder in folders.values()]
+    for words in (
+        *(("report", name, "--csv") for name in names),
+        ("compare", *names[:2]),
+        ("dashboard", ".", "--out", "site"),
+        ("merge", *names, "--out", "merged"),
+    ):
+        _, output = marsyard(*words)
+        assert "Traceback" not in output, output
+        assert not (tmp_path / "executed").exists(), words
+    assert all((folder / "report.html").exists() for folder in folders.values())
+    assert (tmp_path / "site" / "index.html").exists()
+
+
+@pytest.mark.parametrize("scenario", ["trap:Scenario", "descent", "rover"])
+def test_running_commands_refuse_code_from_elsewhere(
+    marsyard: Command, folders: Mapping[str, Path], tmp_path: Path, scenario: str
+) -> None:
+    folder = folders[scenario]
+    stored = (folder / "campaign.json").read_bytes()
+    for command in (("replay", "0"), ("resume",), ("append", "2"), ("report", "--gallery")):
+        status, output = marsyard(command[0], folder.name, *command[1:])
+        assert (status, "was created elsewhere" in output) == (2, True), output
+        assert (folder / "campaign.json").read_bytes() == stored
         assert not (tmp_path / "executed").exists(), command
-    assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_folder_from_elsewhere_runs_with_trusted_code_only(
+    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another user's folder is refused; with --trust it runs if its code is the recorded one."""
+    estimator = "class Estimator:\n    def estimate(self, measurements): raise AssertionError\n"
+    (tmp_path / "mine.py").write_text(estimator)
+    options = ("-n", "1", "--out", "run", "--set", "terrain.samples=512")
+    assert marsyard("run", "dimes-smoke", "--algorithm", "mine:Estimator", *options)[0] == 1
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
+    assert "was created elsewhere" in marsyard("replay", "run", "0")[1]
+    (tmp_path / "mine.py").write_text(f"{estimator}# changed\n")
+    status, output = marsyard("replay", "run", "0", "--trust")
+    assert (status, "mine:Estimator" in output) == (2, True)
+    (tmp_path / "mine.py").write_text(estimator)
+    assert "the row equals the stored one" in marsyard("replay", "run", "0", "--trust")[1]

@@ -76,6 +76,7 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
     from marsyard.campaigns.definition.identity import create_identity
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.store import record
+    from marsyard.campaigns.store.origin import describe_origin
     from marsyard.campaigns.store.rows import ROWS_FILE, create_store
 
     folder = tmp_path / "run"
@@ -84,7 +85,8 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
     parameters = {**configuration.parameters, "algorithm": "my_absent_module:Estimator"}
     create_store(folder / ROWS_FILE, {"identity": "x"})
     identity = create_identity(configuration)
-    record.write_first_record(folder, configuration.model_copy(update={"parameters": parameters}), identity, "nobody")
+    configuration = configuration.model_copy(update={"parameters": parameters})
+    record.write_first_record(folder, configuration, identity, "nobody", origin=describe_origin(configuration))
     files_before = _read_files(folder)
     status, output = run_command("replay", folder, 0)
     assert status == 2
