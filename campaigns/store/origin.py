@@ -41,7 +41,7 @@ def check_origin(directory: Path, configuration: CampaignConfiguration) -> None:
     signature = str(_read_origin(directory).get("signature"))
     if names and not hmac.compare_digest(signature.encode(), _sign(configuration).encode()):
         raise CampaignError(
-            f"{directory} was created elsewhere, and this command would execute code that it names: "
+            f"{directory} was created or changed elsewhere, and this command would execute code that it names: "
             f"{', '.join(names)}. Nothing was executed. If you trust this code: --trust"
         )
 

@@ -8,6 +8,8 @@ from typing import Any
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.store import record
+from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.table import read_rows
 
 TOP_LEVEL_KEYS = """
@@ -76,6 +78,11 @@ def run(path: Path, directory: Path, watch: RecordingWatch, *overrides: str, job
     """Run a campaign file with overrides of its keys; return the campaign folder."""
     run_campaign(load_campaign(str(path), overrides), directory, ExecutorConfig(jobs), watch)
     return directory
+
+
+def sign_folder(directory: Path) -> None:
+    """Make a folder, whose record a test has changed, one that was created here."""
+    record.update(directory, {"origin": describe_origin(record.stored_configuration(directory))})
 
 
 def read_case_rows(directory: Path) -> list[dict[str, Any]]:

@@ -105,7 +105,7 @@ def test_running_commands_refuse_code_from_elsewhere(
     stored = (folder / "campaign.json").read_bytes()
     for command in (("replay", "0"), ("resume",), ("append", "2"), ("report", "--gallery")):
         status, output = marsyard(command[0], folder.name, *command[1:])
-        assert (status, "was created elsewhere" in output) == (2, True), output
+        assert (status, "was created or changed elsewhere" in output) == (2, True), output
         assert (folder / "campaign.json").read_bytes() == stored
         assert not (tmp_path / "executed").exists(), command
 
@@ -119,7 +119,7 @@ def test_folder_from_elsewhere_runs_with_trusted_code_only(
     options = ("-n", "1", "--out", "run", "--set", "terrain.samples=512")
     assert marsyard("run", "dimes-smoke", "--algorithm", "mine:Estimator", *options)[0] == 1
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
-    assert "was created elsewhere" in marsyard("replay", "run", "0")[1]
+    assert "was created or changed elsewhere" in marsyard("replay", "run", "0")[1]
     (tmp_path / "mine.py").write_text(f"{estimator}# changed\n")
     status, output = marsyard("replay", "run", "0", "--trust")
     assert (status, "mine:Estimator" in output) == (2, True)

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.cli.app import app
-from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
+from tests.campaigns.fake_campaign import RecordingWatch, run, sign_folder, write_campaign
 
 SCENARIO = """
 from tests.campaigns.fake_scenario import FakeScenario
@@ -104,6 +104,7 @@ def test_products_are_kept_if_the_replayed_case_fails(
     changed_record = json.loads(text)
     changed_record["configuration"]["parameters"]["raising_cases"] = [0]
     (copy / "campaign.json").write_text(json.dumps(changed_record))
+    sign_folder(copy)
     status, output = run_command("replay", copy, 0)
     assert status == 1
     assert "case 0: CRASHED" in output

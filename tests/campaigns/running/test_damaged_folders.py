@@ -22,7 +22,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import write_table
 from marsyard.cli.options import handle_user_errors
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, sign_folder
 
 CampaignFile = Callable[..., Path]
 
@@ -87,6 +87,7 @@ def test_stored_parameters_with_wrong_types_are_rejected(
     stored_record = json.loads((failing_campaign / "campaign.json").read_text())
     stored_record["configuration"]["parameters"] = {"altitude_m": [1], "wind": 3}
     (tmp_path / "campaign.json").write_text(json.dumps(stored_record))
+    sign_folder(tmp_path)
     shutil.copy(failing_campaign / ROWS_FILE, tmp_path)
     with pytest.raises(ConfigurationError, match=r"parameters\.altitude_m"):
         command(tmp_path)

@@ -16,7 +16,7 @@ from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.record import folder_lock
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, sign_folder, write_campaign
 
 CampaignFile = Callable[..., Path]
 
@@ -106,6 +106,7 @@ def test_changed_versions_are_rejected_without_allow_changed(
 def test_changed_configuration_is_rejected(finished_campaign: Path, watch: RecordingWatch) -> None:
     text = (finished_campaign / "campaign.json").read_text()
     (finished_campaign / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
+    sign_folder(finished_campaign)
     with pytest.raises(CampaignError, match="configuration \\("):
         resume_campaign(finished_campaign, ExecutorConfig(1), watch)
 
