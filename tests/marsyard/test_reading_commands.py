@@ -115,13 +115,13 @@ def test_folder_from_elsewhere_runs_with_trusted_code_only(
 ) -> None:
     """Another user's folder is refused; with --trust it runs if its code is the recorded one."""
     estimator = "class Estimator:\n    def estimate(self, measurements): raise AssertionError\n"
-    (tmp_path / "mine.py").write_text(estimator)
+    (tmp_path / "trusted_estimator.py").write_text(estimator)
     options = ("-n", "1", "--out", "run", "--set", "terrain.samples=512")
-    assert marsyard("run", "dimes-smoke", "--algorithm", "mine:Estimator", *options)[0] == 1
+    assert marsyard("run", "dimes-smoke", "--algorithm", "trusted_estimator:Estimator", *options)[0] == 1
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
     assert "was created or changed elsewhere" in marsyard("replay", "run", "0")[1]
-    (tmp_path / "mine.py").write_text(f"{estimator}# changed\n")
+    (tmp_path / "trusted_estimator.py").write_text(f"{estimator}# changed\n")
     status, output = marsyard("replay", "run", "0", "--trust")
-    assert (status, "mine:Estimator" in output) == (2, True)
-    (tmp_path / "mine.py").write_text(estimator)
+    assert (status, "trusted_estimator:Estimator" in output) == (2, True)
+    (tmp_path / "trusted_estimator.py").write_text(estimator)
     assert "the row equals the stored one" in marsyard("replay", "run", "0", "--trust")[1]

@@ -156,7 +156,8 @@ def test_defects_are_reported(
 def test_slow_estimator_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     body = "    def image(self, image): import time; time.sleep(0.02); return super().image(image)"
     finding = run_suite(write_defective_module(tmp_path, monkeypatch, body), "time", limit_s=0.01)["time"]
-    assert "it took 0.02" in finding.problem
+    assert float(finding.problem.split()[2]) >= 0.02  # a loaded machine takes longer
+    assert not finding.passed
     assert finding.requirement == "answers each image within 0.01 s"
 
 
