@@ -16,7 +16,8 @@ from tests.campaigns.fake_campaign import write_campaign
 
 #: Bounds in the units of the metrics (m/s, m, s); None: the metric is true or false.
 BOUNDS = {
-    "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None, "VTT-DRIFT": 2.5,
+    "DIMES-VEL": 5.0, "DIMES-HARM": 5.0, "DIMES-AVAIL": None, "VTT-POS": 0.03, "VTT-TRACK": None, "VTT-HARM": None,
+    "VTT-DRIFT": 2.5,
     "HDA-SAFE": None, "HDA-TOUCHDOWN": None, "HDA-FIND": None, "HDA-FAR": None, "HDA-MAP": 0.9, "HDA-POS": 1.21,
     "LOC-POS": 40.0, "LOC-FINAL": 40.0, "LOC-HARM": 40.0, "LOC-COARSE": 200.0, "LOC-AVAIL": None,
 }  # fmt: skip
