@@ -1,7 +1,7 @@
 """User-defined meshes on the ground (rocks, landers, landmarks), in the formats of trimesh.
 
 A mesh appears once per period of the terrain: in images with its shadow, and in the truth (range, bodies, landing site
-truth).
+truth). Triangles are oriented when the file is read, because the winding of files is often inverted or mixed.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.mesh_orientation import orient_triangles
 from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
 from marsyard.sim.render import Objects, Scene
@@ -98,7 +99,7 @@ class MeshParameters(UserFile):
 class Mesh:
     """A mesh in the axes and unit of its file.
 
-    - triangles: corners, counter-clockwise seen from outside
+    - triangles: corners, counter-clockwise seen from outside; those of open surfaces occur on both sides
     - normals: smooth outward normals at the corners
     """
 
@@ -152,7 +153,6 @@ def _read(path: str, _modified_ns: int) -> Mesh:
     except Exception as error:  # each reader raises different exceptions
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise MeshFileError(f"{path}: cannot be read as a mesh ({reason})") from error
-    # the arrays of trimesh are read-only, which rotations do not accept
     triangles = np.array(getattr(mesh, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
     if len(triangles) == 0:
         raise MeshFileError(f"{path}: contains no triangle")
@@ -162,10 +162,15 @@ def _read(path: str, _modified_ns: int) -> Mesh:
         raise MeshFileError(f"{path}: contains a corner that is not finite")
     if not np.ptp(triangles.reshape(-1, 3), axis=0).all():
         raise MeshFileError(f"{path}: is flat; allowed: bodies that extend along all axes")
-    # equal corners become one vertex, so that normals are smooth even over unconnected triangles
-    vertices, vertex_indices = np.unique(triangles.reshape(-1, 3), axis=0, return_inverse=True)
-    merged_mesh = trimesh.Trimesh(vertices, vertex_indices.reshape(-1, 3), process=False)
-    return Mesh(digest, triangles, np.array(merged_mesh.vertex_normals, dtype=np.float64)[np.array(merged_mesh.faces)])
+    oriented, normals = orient_triangles(triangles)
+    if len(oriented) == 0:
+        raise MeshFileError(f"{path}: contains only triangles without area")
+    if len(oriented) > MAX_FACES:
+        raise MeshFileError(
+            f"{path}: its open surfaces are two-sided, which gives {len(oriented)} triangles; "
+            f"allowed: up to {MAX_FACES}; close the surfaces"
+        )
+    return Mesh(digest, oriented, normals)
 
 
 def _accessor_bytes(contents: bytes, kind: str) -> int:

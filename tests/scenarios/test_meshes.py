@@ -111,3 +111,108 @@ def test_invalid_mesh_files_are_rejected(tmp_path: Path) -> None:
     with (tmp_path / "huge.stl").open("wb") as file:
         file.truncate(1 << 30)
     expect_error(tmp_path / "huge.stl", "larger than 256 MiB")
+
+
+def export(folder: Path, mesh: trimesh.Trimesh, name: str) -> str:
+    """Write the triangles as they are: trimesh does not repair them."""
+    trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(folder / name)
+    return str(folder / name)
+
+
+def reverse(mesh: trimesh.Trimesh, selected: slice) -> trimesh.Trimesh:
+    faces = np.array(mesh.faces)
+    faces[selected] = faces[selected, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def volume(file: str) -> float:
+    a, b, c = np.moveaxis(read_mesh(file).triangles, 1, 0)
+    return float(np.sum(a * np.cross(b, c)) / 6.0)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb", "off"])
+@pytest.mark.parametrize("selected", [slice(None), slice(0, None, 2), slice(3, 5)], ids=["all", "half", "two"])
+def test_closed_bodies_are_oriented_outwards(tmp_path: Path, surface: Surface, suffix: str, selected: slice) -> None:
+    """Inverted or mixed winding: two boxes and a ball have their volumes, and a box its height of 1 m in the truth."""
+    box = trimesh.creation.box((2.0, 1.0, 1.0))
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.2)
+    bodies = [reverse(box, selected), reverse(box.copy().apply_translation([5.0, 0.0, 0.0]), slice(None)), ball]
+    bodies[2].apply_translation([0.0, 4.0, 0.0])
+    file = export(tmp_path, trimesh.util.concatenate(bodies), f"bodies.{suffix}")
+    # Formats with single precision give 7 digits.
+    assert volume(file) == pytest.approx(4.0 + ball.volume, rel=1e-5)
+    assert len(read_mesh(file).triangles) == 24 + len(ball.faces)
+    ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
+    mesh = MeshParameters(file=export(tmp_path, bodies[0], f"box.{suffix}"), east_m=20.02, north_m=30.02)
+    low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
+    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (mesh,)))
+    assert (with_mesh.heights_m - without_mesh.heights_m).max() == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("inverted", [(), (0,), (1,), (0, 1, 2)])
+def test_walls_of_cavities_are_oriented_into_the_cavity(tmp_path: Path, inverted: tuple[int, ...]) -> None:
+    """A hollow box with a stone in its cavity: the volume is 27 - 8 + 1 = 20."""
+    boxes = [trimesh.creation.box((side,) * 3) for side in (3.0, 2.0, 1.0)]
+    boxes = [reverse(box, slice(None)) if n in inverted else box for n, box in enumerate(boxes)]
+    assert volume(export(tmp_path, trimesh.util.concatenate(boxes), "hollow.stl")) == pytest.approx(20.0)
+
+
+def test_intersecting_and_touching_bodies_are_oriented_outwards(tmp_path: Path) -> None:
+    """A leg that protrudes from a body is not a cavity, and neither is a body inside the box of a concave body."""
+    leg = trimesh.creation.box((0.2, 0.2, 3.0))
+    lander = [reverse(trimesh.creation.box((2.0, 2.0, 1.0)), slice(0, 5)), reverse(leg, slice(None))]
+    assert volume(export(tmp_path, trimesh.util.concatenate(lander), "lander.stl")) == pytest.approx(4.12)
+    bracket = trimesh.creation.extrude_triangulation(  # L-shaped, area 5
+        [[0, 0], [3, 0], [3, 1], [1, 1], [1, 3], [0, 3]], [[0, 1, 3], [1, 2, 3], [0, 3, 5], [3, 4, 5]], 1.0
+    )
+    inside = trimesh.creation.box((0.5, 0.5, 0.5)).apply_translation([2.0, 2.0, 0.5])
+    both = trimesh.util.concatenate([reverse(bracket, slice(None)), reverse(inside, slice(None))])
+    assert volume(export(tmp_path, both, "bracket.obj")) == pytest.approx(5.125)
+    touching = trimesh.creation.box((2.0, 2.0, 1.0)).apply_translation([2.0, 2.0, 0.0])  # one common edge
+    edge = trimesh.util.concatenate([lander[0], touching])
+    assert volume(export(tmp_path, edge, "edge.ply")) == pytest.approx(8.0)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
+def test_open_surfaces_are_two_sided(tmp_path: Path, surface: Surface, suffix: str) -> None:
+    """A box without its bottom, with mixed winding: the top is seen from above, and the inside from below."""
+    box = reverse(trimesh.creation.box((2.0, 1.0, 1.0)), slice(0, None, 3))
+    is_bottom = box.triangles_center[:, 2] < -0.49
+    shell = trimesh.Trimesh(box.vertices, box.faces[~is_bottom], process=False)
+    file = export(tmp_path, shell, f"shell.{suffix}")
+    mesh = read_mesh(file)
+    assert len(mesh.triangles) == 20
+    normals = np.cross(mesh.triangles[:, 1] - mesh.triangles[:, 0], mesh.triangles[:, 2] - mesh.triangles[:, 0])
+    np.testing.assert_allclose(normals.sum(axis=0), 0.0, atol=1e-9)
+    # The smooth normals are on the side of their triangle.
+    assert np.sum(normals[:, None] * mesh.normals, axis=2).min() > 0.1
+    ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
+    placed = MeshParameters(file=file, east_m=20.02, north_m=30.02)
+    low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
+    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (placed,)))
+    assert (with_mesh.heights_m - without_mesh.heights_m).max() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_repeated_and_degenerate_triangles_are_removed(tmp_path: Path) -> None:
+    """A box whose triangles occur on both sides, as exporters write two-sided materials, is a closed body again."""
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    faces = np.concatenate([box.faces[:, ::-1], box.faces, [[0, 0, 1]]])
+    file = export(tmp_path, trimesh.Trimesh(box.vertices, faces, process=False), "double.ply")
+    assert len(read_mesh(file).triangles) == 12
+    assert volume(file) == pytest.approx(1.0)
+
+
+def test_surface_without_orientation_is_two_sided(tmp_path: Path) -> None:
+    """A Moebius strip of 40 triangles has no outside: each triangle occurs on both sides."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 20, endpoint=False)
+    rims = [(1.0 + s * np.cos(angle / 2.0)) * np.array([np.cos(angle), np.sin(angle), 0 * angle]) for s in (-0.3, 0.3)]
+    heights = [s * np.sin(angle / 2.0) for s in (-0.3, 0.3)]
+    vertices = np.concatenate([np.stack([rim[0], rim[1], z], axis=1) for rim, z in zip(rims, heights, strict=True)])
+    faces = []
+    for k in range(20):
+        a, b, c, d = k, 20 + k, k + 1, 21 + k
+        if k == 19:  # the rims change places
+            c, d = 20, 0
+        faces += [[a, b, d], [a, d, c]]
+    file = export(tmp_path, trimesh.Trimesh(vertices, faces, process=False), "strip.ply")
+    assert len(read_mesh(file).triangles) == 80

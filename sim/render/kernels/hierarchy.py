@@ -237,6 +237,16 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: float) -> TriangleHit:
             return best
 
 
+@njit(cache=True)
+def nearest_hits(tree: Hierarchy, origins: Array, direction: Array) -> Longs:
+    """Find the nearest triangle that the ray from each origin hits; number -1 if there is none."""
+    numbers = np.empty(len(origins), dtype=np.int64)
+    for k in range(len(origins)):
+        ray = Ray(origins[k, 0], origins[k, 1], origins[k, 2], direction[0], direction[1], direction[2])
+        numbers[k] = nearest_hit(tree, ray, math.inf).triangle
+    return numbers
+
+
 @njit(cache=True, inline="always")
 def _is_outside_beam(triangles: Array, n: int, sides: tuple[Plane, ...]) -> bool:
     """Return whether a triangle is entirely outside one of a frustum's first four sides; the fifth is the far side."""
