@@ -1,6 +1,6 @@
 """Orient the triangles of user-defined meshes: closed bodies outwards, open surfaces on both sides.
 
-Images, range and landing site truth use only triangles that face the observer; inverted triangles are invisible to them.
+Images, range and landing site truth use only triangles that face the observer: inverted triangles would be invisible.
 """
 
 from __future__ import annotations

@@ -20,7 +20,9 @@ from pydantic import AfterValidator
 
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, read_npz_headers
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, check_holes, choose_grid, read_rasters
+from marsyard.sim.terrain.geotiff import brightness_problems, read_heights
+from marsyard.sim.terrain.imported import choose_grid
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, check_holes, read_rasters
 
 #: Maximum number of DTM posts along a side (size of the largest terrain), and of orthoimage pixels (memory).
 _MAX_POSTS, _MAX_PIXELS = 5461, 8192
@@ -73,7 +75,7 @@ def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
         dtm_crs = None
     else:
         dtm_crs = _check_geotiff(dtm, _MAX_POSTS, dtm_source=source)
-    if source.ortho is None:
+    if source.ortho is None or not source.use_ortho:
         return
     ortho_crs = _check_geotiff(source.ortho, _MAX_PIXELS)
     if dtm_crs is not None and ortho_crs != dtm_crs:
@@ -81,6 +83,7 @@ def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
             f"{source.ortho}: its projection differs from that of {source.dtm}; reproject it with "
             f"rio warp {source.ortho.name} OUT --like {source.dtm.name} --res METRES"
         )
+    read_rasters(source)  # checks that the orthoimage covers the DTM
 
 
 def _require_file(path: Path) -> os.stat_result:
@@ -152,7 +155,10 @@ def _geotiff_problems(file: Any, max_side: int, is_dtm: bool) -> Iterator[str]:
             f"direction; allowed: within {_MAX_STRETCH:g} of 1: project it about its centre with rio warp --dst-crs"
         )
     if not is_dtm:
+        yield from brightness_problems(file)
         return
+    if file.colorinterp[0].name in ("palette", "red", "green", "blue"):
+        yield "contains colours, as in an image; allowed: heights in metres"
     if file.dtypes[0] == "uint8":
         yield "contains 8-bit values, as in an image; allowed: heights in metres"
     if (file.units[0] or "").strip().lower() not in _METRE_UNITS:
@@ -174,12 +180,11 @@ def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None 
         _raise_first_problem(path, _geotiff_problems(file, max_side, dtm_source is not None))
         if dtm_source is None:
             return file.crs
-        values = file.read(1, masked=True)
-        if values.dtype.kind not in "iuf":
-            raise TerrainFileError(f"{path}: contains values of type {values.dtype}; allowed: heights in metres")
+        if np.dtype(file.dtypes[0]).kind not in "iuf":
+            raise TerrainFileError(f"{path}: contains values of type {file.dtypes[0]}; allowed: heights in metres")
         nodata = "has no nodata value" if file.nodata is None else f"has the nodata value {file.nodata:g}"
         advice = f"it {nodata}; set the value for missing data with rio edit-info --nodata"
-        _check_values(path, values.astype(np.float64).filled(np.nan), dtm_source, advice)
+        _check_values(path, read_heights(file), dtm_source, advice)
         return file.crs
 
 

@@ -18,7 +18,7 @@ from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun, Textu
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.sensor.presets import preset
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from marsyard.sim.terrain.imported import RealTerrain
+from marsyard.sim.terrain.rasters import RealTerrain
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
 from marsyard.sim.terrain.sites import Site, SiteTexture, site
 

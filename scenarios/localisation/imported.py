@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 from marsyard.sim.terrain import TerrainParameters
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, read_rasters
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 
 #: Minimum period of a terrain with a DTM, m: the size of a map of Mars 2020, 2048 pixels of 6 m, rounded.
 MIN_PERIOD_M = 12_000.0

@@ -3,135 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
-from pydantic import Field
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, spline_filter
 
-from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.landforms.ground import Ground, refine
+from marsyard.sim.terrain.rasters import (
+    Coordinates,
+    Grid,
+    Mask,
+    Raster,
+    RealTerrain,
+    TerrainFileError,
+    brightness_at_posts,
+    ortho_origin,
+    read_rasters,
+)
 
-Grid = Float64[np.ndarray, "rows columns"]
-Coordinates = Float64[np.ndarray, "n"]
 GridPatch = Float32[np.ndarray, "rows columns"]
-Mask = Bool[np.ndarray, "rows columns"]
-
-
-class TerrainFileError(ValueError):
-    """A terrain file cannot be used; the message contains the file, the reason and the allowed values."""
-
-
-class RealTerrain(Parameters):
-    """A digital terrain model (DTM) from a file; it replaces the synthetic ground inside its borders.
-
-    The file is a GeoTIFF (rows from north to south, projected, metres; needs the extra `geo`) or an ``.npz`` with
-    ``dem`` (heights, m, row 0 in the north) and ``dem_gsd`` (m), and optionally ``ortho``, ``ortho_gsd`` and
-    ``ortho_valid``. Its centre is the centre of the periodic terrain. Azimuths, including the sun's, are relative to
-    grid north (y axis), which differs from true north away from the projection's central meridian.
-
-    Missing heights are interpolated, up to a fraction `max_hole_fraction`. Filled samples are excluded from statistics.
-    """
-
-    dtm: Annotated[Path, Field(description="GeoTIFF or .npz with the heights")]
-    ortho: Annotated[Path | None, Field(description="GeoTIFF with the orthoimage; an .npz can contain it")] = None
-    use_ortho: Annotated[bool, Field(description="whether the orthoimage determines the albedo")] = True
-    ortho_east_m: Annotated[float, Field(description="eastward offset of the orthoimage from the DTM, m")] = 0.0
-    ortho_north_m: Annotated[float, Field(description="northward offset of the orthoimage from the DTM, m")] = 0.0
-    border_m: Annotated[float, Field(gt=0.0, description="width of the blending zone inside the DTM, m")] = 20.0
-    max_hole_fraction: Annotated[float, Field(ge=0.0, lt=1.0, description="maximum fraction without height")] = 0.05
-    roughen: Annotated[bool, Field(description="add fractal detail finer than twice the DTM's posting")] = True
-
-    def input_files(self) -> tuple[str, ...]:
-        """Return the paths of the DTM's files."""
-        return tuple(str(path) for path in (self.dtm, self.ortho) if path is not None)
-
-
-@dataclass(frozen=True)
-class Raster:
-    """A grid of values, row 0 in the south, NaN where missing.
-
-    - posting_m: distance between the grid points (posts)
-    - west_m, south_m: position of post (0, 0)
-    """
-
-    values: Grid
-    posting_m: float
-    west_m: float
-    south_m: float
-
-
-def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
-    """Read heights, and brightness if an orthoimage is used. Raises TerrainFileError."""
-    if not source.dtm.exists():
-        raise TerrainFileError(f"terrain file {source.dtm} does not exist")
-    heights, ortho = _read_npz(source.dtm) if source.dtm.suffix == ".npz" else (_read_geotiff(source.dtm), None)
-    if source.ortho is not None:
-        if not source.ortho.exists():
-            raise TerrainFileError(f"ortho image {source.ortho} does not exist")
-        ortho = _read_geotiff(source.ortho)
-    check_holes(source, heights.values)
-    return heights, ortho if source.use_ortho else None
-
-
-def check_holes(source: RealTerrain, heights: Grid) -> None:
-    """Raise TerrainFileError if more heights are missing (not finite) than the source allows."""
-    fraction = float(np.mean(~np.isfinite(heights)))
-    if fraction == 1.0:
-        raise TerrainFileError(f"{source.dtm}: has no valid height at all")
-    if fraction > source.max_hole_fraction:
-        raise TerrainFileError(
-            f"{source.dtm}: {fraction:.1%} of its posts have no height; allowed: up to {source.max_hole_fraction:.1%}. "
-            "Clip the file to a part without holes (rio clip --bounds), or increase max_hole_fraction "
-            "(marsyard terrain stats and render: --max-holes) to fill the holes by interpolation"
-        )
-
-
-def _read_npz(path: Path) -> tuple[Raster, Raster | None]:
-    with np.load(path, allow_pickle=False) as file:
-        missing = [key for key in ("dem", "dem_gsd") if key not in file]
-        if missing:
-            allowed = "dem, dem_gsd, ortho, ortho_gsd, ortho_valid"
-            raise TerrainFileError(f"{path} does not contain {', '.join(missing)}; allowed: {allowed}")
-        heights = _create_raster(file["dem"], float(file["dem_gsd"]), path)
-        if "ortho" not in file:
-            return heights, None
-        brightness = np.asarray(file["ortho"], dtype=np.float64)
-        if "ortho_valid" in file:
-            brightness = np.where(file["ortho_valid"], brightness, np.nan)
-        return heights, _create_raster(brightness, float(file["ortho_gsd"]), path)
-
-
-def _create_raster(values: Any, posting_m: float, path: Path) -> Raster:
-    """Create a raster from rows in north-to-south order, with the outer corner of the north-western cell at (0, 0)."""
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 2 or min(array.shape) < 4:
-        raise TerrainFileError(f"{path} has a grid of shape {array.shape}; at least 4 x 4 values are needed")
-    array = np.where(np.isfinite(array), array, np.nan)
-    return Raster(array[::-1].copy(), posting_m, 0.5 * posting_m, (0.5 - array.shape[0]) * posting_m)
-
-
-def _read_geotiff(path: Path) -> Raster:
-    try:
-        import rasterio
-    except ImportError as error:
-        raise TerrainFileError(
-            f"{path}: reading GeoTIFF needs rasterio, which is not installed: pip install rasterio (extra 'geo')"
-        ) from error
-    with rasterio.open(path) as file:
-        values = file.read(1, masked=True).astype(np.float64).filled(np.nan)
-        transform, crs = file.transform, file.crs
-    if crs is not None and crs.is_geographic:
-        raise TerrainFileError(f"{path} is in degrees ({crs}); project it to metres with rio warp --dst-crs")
-    if transform.b or transform.d or abs(transform.a + transform.e) > 1e-6 * abs(transform.a):
-        raise TerrainFileError(f"{path} has rotated or oblong cells; square cells, north up, are needed")
-    factor = 1.0 if crs is None else float(crs.linear_units_factor[1])
-    posting = float(transform.a) * factor
-    raster = _create_raster(values, posting, path)
-    return Raster(raster.values, posting, transform.c * factor + raster.west_m, transform.f * factor + raster.south_m)
 
 
 def fill_holes(values: Grid) -> tuple[Grid, int]:
@@ -165,7 +56,7 @@ class RealExtent:
     """Borders of the DTM in terrain coordinates, and the number of missing values in its files.
 
     - holes, hole_fraction: number of posts without a height, and their fraction of all posts
-    - ortho_holes: number of pixels without a brightness
+    - ortho_holes: number of pixels without a brightness, and of pixels that are missing beyond the image's edges
     """
 
     west_m: float
@@ -186,6 +77,7 @@ class EmbeddedDtm:
     - height: control values of the B-spline through the DTM's interpolated heights
     - log_brightness: natural logarithm of brightness divided by its mean
     - weight: blending weight, 1 inside, decreasing to 0 at the border
+    - brightness_weight: blending weight of the brightness, also 0 outside the orthoimage
     - has_data: whether the DTM has a height at the post nearest to each sample
     """
 
@@ -194,6 +86,7 @@ class EmbeddedDtm:
     height: GridPatch
     log_brightness: GridPatch | None
     weight: GridPatch
+    brightness_weight: GridPatch
     has_data: Mask
     extent: RealExtent
 
@@ -237,12 +130,11 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
     # cubic interpolation between the DTM's posts, then control values of the B-spline through these heights
     resampled = RectBivariateSpline(posts_y, posts_x, heights - heights.mean(), kx=3, ky=3)(y, x)
     control = spline_filter(resampled, order=3, mode="mirror", output=np.float64).astype(np.float32)
-    margin_y, margin_x = np.minimum(y - south, south + length - y), np.minimum(x - west, west + width - x)
-    fraction = np.clip(np.minimum(margin_y[:, None], margin_x[None, :]) / source.border_m, 0.0, 1.0)
-    weight = (fraction * fraction * (3.0 - 2.0 * fraction)).astype(np.float32)
-    log_brightness, ortho_holes = (
-        (None, 0) if ortho is None else _resample_log_brightness(source, raster, ortho, x - west, y - south)
-    )
+    weight = brightness_weight = _blending_weight(source.border_m, (x - west, width), (y - south, length))
+    log_brightness, ortho_holes = None, 0
+    if ortho is not None:
+        log_brightness, ortho_holes = _resample_log_brightness(source, raster, ortho, x - west, y - south)
+        brightness_weight = np.minimum(weight, _ortho_weight(source, raster, ortho, x - west, y - south))
     borders = (west, south, west + width, south + length)
     extent = RealExtent(*borders, raster.posting_m, holes, ortho_holes, holes / heights.size)
     nearest = (
@@ -251,8 +143,33 @@ def embed(source: RealTerrain, side: int, spacing_m: float) -> EmbeddedDtm:
     )
     has_data = np.isfinite(raster.values)[np.ix_(*nearest)]
     return EmbeddedDtm(
-        slice(i[0], i[-1] + 1), slice(j[0], j[-1] + 1), control, log_brightness, weight, has_data, extent
+        slice(i[0], i[-1] + 1),
+        slice(j[0], j[-1] + 1),
+        control,
+        log_brightness,
+        weight,
+        brightness_weight,
+        has_data,
+        extent,
     )
+
+
+def _blending_weight(border_m: float, x: tuple[Coordinates, float], y: tuple[Coordinates, float]) -> GridPatch:
+    """Return the blending weight of a rectangle: 1 inside, smoothly decreasing to 0 along its border.
+
+    x, y: positions relative to the rectangle's south-western corner, and the length of its side, m.
+    """
+    margin_x, margin_y = (np.minimum(position, side - position) for position, side in (x, y))
+    fraction = np.clip(np.minimum(margin_y[:, None], margin_x[None, :]) / border_m, 0.0, 1.0)
+    return np.asarray(fraction * fraction * (3.0 - 2.0 * fraction), dtype=np.float32)
+
+
+def _ortho_weight(source: RealTerrain, raster: Raster, ortho: Raster, x: Coordinates, y: Coordinates) -> GridPatch:
+    """Return the blending weight of the orthoimage, whose pixels are squares."""
+    east_m, north_m = (start - 0.5 * ortho.posting_m for start in ortho_origin(source, raster, ortho))
+    rows, columns = ortho.values.shape
+    width, length = columns * ortho.posting_m, rows * ortho.posting_m
+    return _blending_weight(source.border_m, (x - east_m, width), (y - north_m, length))
 
 
 def _resample_log_brightness(
@@ -270,10 +187,12 @@ def _resample_log_brightness(
     brightness, _ = fill_holes(np.where(missing, np.nan, ortho.values))
     logarithm = np.log(np.maximum(brightness / float(brightness.mean()), MIN_RELATIVE_BRIGHTNESS))
     rows, columns = logarithm.shape
-    posts_x = ortho.west_m - raster.west_m - source.ortho_east_m + ortho.posting_m * np.arange(columns)
-    posts_y = ortho.south_m - raster.south_m - source.ortho_north_m + ortho.posting_m * np.arange(rows)
+    east_m, north_m = ortho_origin(source, raster, ortho)
+    posts_x, posts_y = east_m + ortho.posting_m * np.arange(columns), north_m + ortho.posting_m * np.arange(rows)
     spline = RectBivariateSpline(posts_y, posts_x, logarithm, kx=1, ky=1)
     log_brightness = spline(np.clip(y, posts_y[0], posts_y[-1]), np.clip(x, posts_x[0], posts_x[-1]))
+    is_covered, _ = brightness_at_posts(source, raster, ortho)
+    holes += round(float(np.count_nonzero(~is_covered)) * (raster.posting_m / ortho.posting_m) ** 2)
     return log_brightness.astype(np.float32), holes
 
 
@@ -328,7 +247,7 @@ def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -
     if dtm.log_brightness is not None:
         log_brightness = dtm.log_brightness if detail is None else dtm.log_brightness + detail[1]
         region = ground.log_albedo[dtm.rows, dtm.columns]
-        region += dtm.weight * (log_brightness - region)
+        region += dtm.brightness_weight * (log_brightness - region)
 
 
 def _extrapolate_smoothly(

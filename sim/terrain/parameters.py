@@ -8,9 +8,9 @@ from typing import Annotated, Any, get_args
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field, merge_settings
-from marsyard.sim.terrain.imported import RealTerrain
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
+from marsyard.sim.terrain.rasters import RealTerrain
 from marsyard.sim.terrain.rocks.field import RockParameters
 
 

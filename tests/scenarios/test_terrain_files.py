@@ -25,7 +25,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios import terrain_files
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError
 
 #: Mars, equidistant cylindrical about the equator, in metres (IAU 2000 sphere).
 MARS = "+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs"

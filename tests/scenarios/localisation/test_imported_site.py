@@ -113,10 +113,7 @@ def test_lander_is_located_on_the_imported_ground(tmp_path: Path) -> None:
 
 def test_terrain_and_files_of_a_wrong_size_are_rejected(tmp_path: Path) -> None:
     source = _write_site(tmp_path)
-    small, large = (
-        {**source, "dtm": _write_site(folder, posting_m=posting)["dtm"]}
-        for folder, posting in ((tmp_path / "small", 2.0), (tmp_path / "large", 100.0))
-    )
+    small, large = _write_site(tmp_path / "small", posting_m=2.0), _write_site(tmp_path / "large", posting_m=100.0)
     cases: list[tuple[dict[str, Any], str]] = [
         (_settings(source, terrain={**TERRAIN, "samples": 512, "source": source}), r"repeats after 6144 m; .* 12000 m"),
         # the camera's field of 90 deg shows 2100 m from 1050 m

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Surface, TerrainBank, TerrainParameters, synthesise
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, choose_grid, embed, fill_holes, read_rasters
+from marsyard.sim.terrain.imported import choose_grid, embed, fill_holes
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 from marsyard.sim.terrain.surface import terrain_statistics
 
 #: Size of the synthetic elevation model of the tests, in posts (1 m apart in `tile.npz`).
