@@ -18,6 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator
 
+from marsyard.scenarios.missing_heights import find_missing_value
 from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, read_npz_headers
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.geotiff import brightness_problems, read_heights
@@ -71,7 +72,8 @@ def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
     dtm = source.dtm
     if dtm.suffix == ".npz":
         _raise_first_problem(dtm, _npz_problems(source))
-        _check_values(dtm, read_rasters(source)[0].values, source, "mark posts without height with NaN")
+        heights, _ = read_rasters(source)
+        _check_values(dtm, heights.values, heights.posting_m, source, "mark posts without height with NaN")
         dtm_crs = None
     else:
         dtm_crs = _check_geotiff(dtm, _MAX_POSTS, dtm_source=source)
@@ -184,7 +186,8 @@ def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None 
             raise TerrainFileError(f"{path}: contains values of type {file.dtypes[0]}; allowed: heights in metres")
         nodata = "has no nodata value" if file.nodata is None else f"has the nodata value {file.nodata:g}"
         advice = f"it {nodata}; set the value for missing data with rio edit-info --nodata"
-        _check_values(path, read_heights(file), dtm_source, advice)
+        posting_m = float(file.transform.a) * float(file.crs.linear_units_factor[1])
+        _check_values(path, read_heights(file), posting_m, dtm_source, advice)
         return file.crs
 
 
@@ -215,15 +218,23 @@ def grid_north_deg(path: Path) -> float | None:
     return None if scale is None else scale.grid_north_deg
 
 
-def _check_values(path: Path, values: np.ndarray, source: RealTerrain, advice: str) -> None:
-    """Check the number of missing heights (NaN) and the range of the valid heights."""
+def _check_values(path: Path, values: np.ndarray, posting_m: float, source: RealTerrain, advice: str) -> None:
+    """Check the number of missing heights (NaN), the range of the valid heights, and undeclared missing values."""
     check_holes(source, values)
     valid_heights = values[np.isfinite(values)]
     low, high = float(valid_heights.min()), float(valid_heights.max())
     if not (HEIGHTS_M[0] <= low and high <= HEIGHTS_M[1]):
         extreme = low if low < HEIGHTS_M[0] else high
+        posts = int(np.count_nonzero(valid_heights == extreme))
         raise TerrainFileError(
-            f"{path}: contains heights of {extreme:g} m; allowed: {HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m; {advice}"
+            f"{path}: contains heights of {extreme:g} m; allowed: {HEIGHTS_M[0]:g} to {HEIGHTS_M[1]:g} m; "
+            f"number of posts with this height: {posts} of {values.size}; {advice}"
+        )
+    missing = find_missing_value(values, posting_m)
+    if missing is not None:
+        raise TerrainFileError(
+            f"{path}: the height {missing.height_m:.10g} m at {missing.posts} of {values.size} posts is probably a "
+            f"value for missing data: it is repeated exactly, with cliffs at its border; {advice}"
         )
 
 

@@ -42,14 +42,16 @@ def read_brightness(file: Any) -> Grid:
 
     Values are scaled with scale and offset of their band (GDAL's unscaling). Indices of a palette are replaced by the
     luminance of their colours, and red, green and blue by their luminance. Masked and transparent pixels are missing.
-    In a file of unsigned integers without mask, nodata value or alpha, pixels that are 0 in all bands are missing.
+    In a file of integers without mask, nodata value or alpha, pixels with the lowest integer in all bands are missing:
+    0 of unsigned integers, -32768 of 16 bits.
     """
     from rasterio.enums import MaskFlags
 
     names = [band.name for band in file.colorinterp]
     brightness: Grid = np.zeros(file.shape, dtype=np.float64)
     has_no_mask = file.mask_flag_enums[0] == [MaskFlags.all_valid] and "alpha" not in names
-    is_black = np.full(file.shape, has_no_mask and file.dtypes[0].startswith("uint") and names[0] != "palette")
+    dtype = np.dtype(file.dtypes[0])
+    is_lowest = np.full(file.shape, has_no_mask and dtype.kind in "iu" and names[0] != "palette")
     if names[0] == "palette":
         brightness += _palette_luminance(file.colormap(1))[file.read(1)]
     else:
@@ -59,9 +61,9 @@ def read_brightness(file: Any) -> Grid:
             if weight == 0.0:
                 continue
             band = file.read(number)
-            is_black &= band == 0
+            is_lowest &= band == (np.iinfo(dtype).min if dtype.kind in "iu" else 0)
             brightness += weight * (band * float(file.scales[number - 1]) + float(file.offsets[number - 1]))
-    is_missing = (file.dataset_mask() == 0) | is_black
+    is_missing = (file.dataset_mask() == 0) | is_lowest
     if "alpha" in names:  # the mask of rasterio does not contain the opacity of real numbers
         is_missing |= file.read(names.index("alpha") + 1) == 0
     return np.where(is_missing, np.nan, brightness)

@@ -209,13 +209,14 @@ def test_scale_and_offset_are_applied(
     np.testing.assert_allclose(log_brightness(source), expected, atol=1e-4)
 
 
-def test_black_border_of_scaled_integers_is_missing(tmp_path: Path) -> None:
-    """Without nodata value, 0 is missing even if its scaled value is positive; with a nodata value it is valid."""
-    stored = (BRIGHTNESS * 100).astype(np.uint16)[None]
-    stored[:, :, :6] = 0
-    settings: dict[str, Any] = {"scales": (0.01,), "offsets": (5.0,)}
+@pytest.mark.parametrize(("dtype", "lowest"), [("uint16", 0), ("int16", -32768)])
+def test_lowest_scaled_integer_is_missing(tmp_path: Path, dtype: str, lowest: int) -> None:
+    """Without nodata value, it is missing even if its scaled value is positive; with a nodata value it is valid."""
+    stored = (BRIGHTNESS * 100).astype(dtype)[None]
+    stored[:, :, :6] = lowest
+    settings: dict[str, Any] = {"scales": (0.01,), "offsets": (400.0,)}
     assert embed(make_source(tmp_path, stored, **settings), 128, 1.0).extent.ortho_holes == 6 * 2 * ROWS
-    assert embed(make_source(tmp_path, stored, nodata=65535, **settings), 128, 1.0).extent.ortho_holes == 0
+    assert embed(make_source(tmp_path, stored, nodata=32767, **settings), 128, 1.0).extent.ortho_holes == 0
 
 
 @pytest.mark.parametrize("transparent", [False, True])
