@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 import trimesh
 from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Relief
-from marsyard.scenarios.meshes import MeshFileError, MeshParameters, read_mesh
+from marsyard.scenarios.meshes import MeshFileError, MeshParameters, add_meshes, read_mesh
 from marsyard.scenarios.views import SiteGround
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Photometry, PixelRays, Scene, Sun, process_renderer
+from marsyard.sim.render.backend import default_backend
 from marsyard.sim.terrain import Surface, TerrainParameters, site, synthesise
 
 #: Edge lengths, m.
@@ -216,3 +221,39 @@ def test_surface_without_orientation_is_two_sided(tmp_path: Path) -> None:
         faces += [[a, b, d], [a, d, c]]
     file = export(tmp_path, trimesh.Trimesh(vertices, faces, process=False), "strip.ply")
     assert len(read_mesh(file).triangles) == 80
+
+
+@pytest.mark.parametrize("change", ["inverted", "mixed", "open", "open and inverted"])
+def test_images_do_not_depend_on_the_winding(tmp_path: Path, surface: Surface, change: str) -> None:
+    """A box of 1 m, seen from 8 m above: radiance, range and bodies are those of the intact box.
+
+    The open box has no bottom. The bottom lies on the ground, so that its image is the same.
+    """
+    box = trimesh.creation.box((3.0, 2.0, 1.0))
+    changed = reverse(box, {"mixed": slice(0, None, 2), "open": slice(0, 0)}.get(change, slice(None)))
+    if change.startswith("open"):
+        is_bottom = box.triangles_center[:, 2] < -0.49
+        changed = trimesh.Trimesh(box.vertices, changed.faces[~is_bottom], process=False)
+    camera = Cahv.from_field_of_view(
+        horizontal_rad=0.7,
+        size=(128, 128),
+        centre=np.zeros(3),
+        axis=np.array([0, 0, -1.0]),
+        right=np.array([1.0, 0, 0]),
+    )
+    sun = Sun(direction(np.radians(200.0), np.radians(35.0)))
+    scene = Scene(surface, (20.0, 30.0), sun, Photometry(), mesh_finest_m=0.1, mesh_half_width_m=50.0, edge_rays=1)
+    pose = rigid(Rotation.from_euler("x", 10.0, degrees=True), np.array([20.0, 30.0, surface.height(20.0, 30.0) + 8.0]))
+    intact, frame = (
+        process_renderer(default_backend()).render(
+            add_meshes(scene, [MeshParameters(file=file, kind="lander", east_m=20.0, north_m=30.5)], (20.0, 30.0)),
+            PixelRays.from_camera(camera),
+            pose,
+        )
+        for file in (export(tmp_path, box, "box.ply"), export(tmp_path, changed, "changed.ply"))
+    )
+    # The box covers 6 m2 of about 34 m2.
+    assert np.mean(intact.body >= 0) > 0.15
+    np.testing.assert_array_equal(frame.body, intact.body)
+    np.testing.assert_allclose(frame.range_m, intact.range_m, rtol=1e-9)
+    np.testing.assert_allclose(frame.radiance, intact.radiance, atol=1e-6)
