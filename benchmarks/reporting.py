@@ -23,6 +23,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 from benchmarks.timing import Measurement
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
+from marsyard.reports.campaign import sign_report
 
 #: Number of random columns that are added, so that a row has as many columns (99) as one of `dimes-gusev`.
 ADDITIONAL_COLUMNS = 82
@@ -154,6 +155,7 @@ def _copy_campaigns(folder: Path, original_run: Path, campaigns: int) -> Path:
         ):
             (run / name).unlink()
             (run / name).write_text(json.dumps(content), encoding="utf-8")
+        sign_report(run, run)
     return folder / "site"
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hmac
 import json
 import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache
 from pathlib import Path
@@ -17,6 +19,8 @@ import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.origin import sign
 from marsyard.reports import common_sections, explorer, sections
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences, read_budget
@@ -30,7 +34,7 @@ from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import read_search, search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
-from marsyard.reports.stored import StoredRun, table
+from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
@@ -58,6 +62,8 @@ PAGE_FILE = "report.html"
 REPORT_JSON = "report.json"
 VERIFICATION_FILE = "verification.csv"
 JUNIT_FILE = "junit.xml"
+#: Hash of page and data with the key of the user who wrote them; others' reports are written again for the dashboard.
+SIGNATURE_FILE = "report.signature"
 
 
 def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Path:
@@ -69,10 +75,10 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     return write_evaluation(evaluate_run(directory, requirements))
 
 
-def write_evaluation(evaluation: Evaluation) -> Path:
-    """Write the report of an evaluated campaign into its folder."""
+def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
+    """Write the report of an evaluated campaign into the folder `out`; None for the campaign's folder."""
     run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
-    directory = run.directory
+    directory = run.directory if out is None else out
     # statistics use only random cases
     exclude_nominal = evaluation.sampling.exclude_nominal_case
     random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
@@ -94,7 +100,32 @@ def write_evaluation(evaluation: Evaluation) -> Path:
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context["evidence"] = evaluation.evidence
     write_atomic(page, page_environment().get_template("report.html.j2").render(context))
+    with suppress(StoreError):  # without a key, the dashboard writes the report again
+        sign_report(directory, run.directory)
     return page
+
+
+def sign_report(directory: Path, campaign: Path) -> None:
+    """Record that this user's installation wrote the report in a folder from the present rows of a campaign's folder.
+
+    Raises StoreError if the key of the user cannot be read.
+    """
+    write_atomic(directory / SIGNATURE_FILE, _compute_signature(directory, campaign))
+
+
+def is_own_report(directory: Path, campaign: Path) -> bool:
+    """Whether this user's installation wrote the report in a folder from the present rows of a campaign's folder."""
+    try:
+        signature = (directory / SIGNATURE_FILE).read_bytes()
+        return hmac.compare_digest(signature, _compute_signature(directory, campaign).encode())
+    except (OSError, StoreError):
+        return False
+
+
+def _compute_signature(directory: Path, campaign: Path) -> str:
+    """Sign page and data of a report, the script that this version allows on pages, and the record and rows."""
+    files = (directory / PAGE_FILE, directory / REPORT_JSON, campaign / RECORD_FILE, campaign / TABLE_FILE)
+    return sign(explorer.read_script().encode(), *(path.read_bytes() if path.is_file() else b"" for path in files))
 
 
 def section_makers() -> list[SectionMaker]:

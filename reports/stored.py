@@ -12,6 +12,7 @@ import pandas as pd
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
+from marsyard.campaigns.store.record import reject_links
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
 
 #: Maximum number of cases of which all columns are read. In a larger campaign, all columns are read only for the first
@@ -96,10 +97,14 @@ class StoredRun:
 
 
 def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> StoredRun:
-    """Read a campaign's folder; `requirements` replace the campaign's requirements. Raises StoreError without rows."""
+    """Read a campaign's folder; `requirements` replace the campaign's requirements.
+
+    Raises StoreError without rows, or if the folder contains a symbolic link.
+    """
     path = directory / TABLE_FILE
     if not path.is_file():
         raise StoreError(f"{directory} contains no {TABLE_FILE}; a report needs the rows of a campaign")
+    reject_links(directory)
     try:
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
     except (OSError, ValueError):

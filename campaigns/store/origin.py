@@ -79,7 +79,13 @@ def _read_origin(directory: Path) -> dict[str, Any]:
 def _sign(configuration: CampaignConfiguration) -> str:
     """Compute the hash of everything in a configuration that can name code, with the key of this user."""
     contents = configuration.model_dump(mode="json", include=_KEYS)
-    return hmac.new(_read_key(), json.dumps(contents, sort_keys=True).encode(), hashlib.sha256).hexdigest()
+    return sign(json.dumps(contents, sort_keys=True).encode())
+
+
+def sign(*contents: bytes) -> str:
+    """Compute a hash of contents with the key of this user. Raises StoreError if the key cannot be created or read."""
+    digests = b"".join(hashlib.sha256(content).digest() for content in contents)
+    return hmac.new(_read_key(), digests, hashlib.sha256).hexdigest()
 
 
 def _read_key() -> bytes:

@@ -36,6 +36,19 @@ _KEY_TYPES: Mapping[str, tuple[type, str]] = {
 }
 
 
+def reject_links(directory: Path) -> None:
+    """Raise StoreError if a campaign's folder contains a symbolic link, which could point to files of its reader."""
+    folders = [str(directory)]
+    while folders:
+        # another process can remove a temporary folder
+        with suppress(FileNotFoundError), os.scandir(folders.pop()) as entries:
+            for entry in entries:
+                if entry.is_symlink():
+                    raise StoreError(f"{entry.path} is a symbolic link; a campaign's folder must contain its own files")
+                if entry.is_dir():
+                    folders.append(entry.path)
+
+
 def utc_now() -> str:
     """Return the current time in ISO 8601 with a resolution of one second."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
@@ -140,12 +153,13 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
 def read(directory: Path) -> dict[str, Any]:
     """Read a campaign's record.
 
-    Raises StoreError if the folder contains no record, or if the record has another version, missing keys, or values of
-    another JSON type.
+    Raises StoreError if the folder contains no record or a symbolic link, or if the record has another version, missing
+    keys, or values of another JSON type.
     """
     path = directory / RECORD_FILE
     if not directory.is_dir():
         raise StoreError(f"{directory}: no such folder")
+    reject_links(directory)
     if not path.is_file():
         hint = ""
         if (directory / ROWS_FILE).is_file() and is_empty_store(directory / ROWS_FILE):

@@ -5,17 +5,13 @@ The module also runs campaigns until their verdicts are decided (`--until-decide
 
 from __future__ import annotations
 
-import ipaddress
 import math
 import os
 import shutil
-import socket
 import subprocess
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -287,62 +283,3 @@ def continue_until_decided(directory: Path, executor: ExecutorConfig, observer: 
             observer.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
             return
         append_cases(directory, next_cases - cases, executor, observer)
-
-
-class _DashboardHandler(SimpleHTTPRequestHandler):
-    """Request handler that serves only files in the dashboard's folder, without folder listings and log messages.
-
-    `names` are the allowed host names of the server.
-    """
-
-    def __init__(self, *args: Any, names: Collection[str], **kwargs: Any) -> None:
-        self._names = names
-        super().__init__(*args, **kwargs)
-
-    def parse_request(self) -> bool:
-        """Reject requests with the host name of a different server (protection against DNS rebinding)."""
-        if not super().parse_request():
-            return False
-        if not is_own_host(self.headers.get("Host", ""), self._names):
-            self.send_error(403, "this server does not have that host name")
-            return False
-        return True
-
-    def translate_path(self, path: str) -> str:
-        """Map the path of a URL to a file; a path outside the dashboard's folder maps to a missing file."""
-        root = Path(self.directory).resolve()
-        try:
-            target = Path(super().translate_path(path)).resolve()
-        except (OSError, ValueError):  # for example a name with a zero byte
-            return str(root / "no such file")
-        return str(target if target.is_relative_to(root) else root / "no such file")
-
-    def list_directory(self, path: object) -> None:
-        """Reject the request."""
-        self.send_error(404, "no such file")
-
-    def log_message(self, *_: object) -> None:
-        """Print no log messages."""
-
-
-def is_own_host(header: str, names: Collection[str]) -> bool:
-    """Whether a Host header contains a name of this server, or an IP address (which DNS cannot redirect).
-
-    >>> [is_own_host(text, ["localhost"]) for text in ("127.0.0.1:80", "[::1]", "LOCALHOST:8", "evil.example", "")]
-    [True, True, True, False, False]
-    """
-    host = header.strip().lower()
-    host = host[1:].partition("]")[0] if host.startswith("[") else host.partition(":")[0]
-    if host in names:
-        return True
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
-
-
-def create_server(directory: Path, host: str, port: int) -> ThreadingHTTPServer:
-    """Create an HTTP server of a dashboard's folder; port 0 selects a free port."""
-    names = {"localhost", host.lower(), socket.gethostname().lower()}
-    return ThreadingHTTPServer((host, port), partial(_DashboardHandler, directory=str(directory), names=names))

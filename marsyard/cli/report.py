@@ -159,7 +159,7 @@ def dashboard(
     typer.echo(f"dashboard: {site.index}")
     if serve is None:
         return
-    from marsyard.cli.outcome import create_server
+    from marsyard.reports.dashboard.server import create_server
 
     try:
         server = create_server(out, host, serve)

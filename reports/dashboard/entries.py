@@ -7,14 +7,15 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.campaign import REPORT_JSON, SCHEMA, write_report
+from marsyard.campaigns.store.record import reject_links
+from marsyard.reports.campaign import REPORT_JSON, SCHEMA, is_own_report, write_evaluation
+from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import Algorithm, format_tested_algorithms, read_algorithms
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status
@@ -63,6 +64,7 @@ class Entry:
     """A stored campaign, from its record and its report; fields are empty if not recorded.
 
     - slug: name of the campaign's folder in the site: letters, digits and hyphens, with a hash of the campaign's path
+    - report: folder of the report: the campaign's folder, or that of its pages
     - evidence: kind of evidence of the run (`marsyard.campaigns.definition.evidence`)
     - tested: algorithms with versions, options and source hashes: those under test first, then those only compared
     - study: main result of a study; None for an ordinary campaign
@@ -71,6 +73,7 @@ class Entry:
 
     slug: str
     directory: Path
+    report: Path
     name: str
     system: str
     sites: tuple[str, ...]
@@ -124,36 +127,41 @@ def _find_below(directory: Path, depth: int) -> Iterator[Path]:
                 yield from _find_below(inner, depth - 1)
 
 
-def read_entries(paths: Iterable[Path]) -> tuple[list[Entry], list[str]]:
+def read_entries(paths: Iterable[Path], pages: Path) -> tuple[list[Entry], list[str]]:
     """Read the campaigns, the latest first; also return messages about campaigns that cannot be displayed.
 
-    A report that is missing, older than the rows, or of another schema is written again.
+    pages: folder of the site with a folder for each campaign; a report that this user's installation did not write from
+    the present rows, or that has another schema, is written again into it: the page of another user could contain
+    scripts, and its data other verdicts
     """
     entries, problems = [], []
     for path in paths:
         try:
-            entries.append(_read_entry(path))
+            entries.append(_read_entry(path, pages))
         except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
             problems.append(f"{path}: {error}")
     return sorted(entries, key=lambda entry: (entry.started, entry.name, entry.slug), reverse=True), problems
 
 
-def _read_entry(path: Path) -> Entry:
-    """Read one campaign; its report is written first if it is missing, outdated or of another schema."""
-    file = path / REPORT_JSON
-    report: Mapping[str, Any] = {}
-    with suppress(OSError, ValueError):
-        report = table(json.loads(file.read_text(encoding="utf-8")))
-    if report.get("schema") != SCHEMA or _is_outdated(file, path, report):
-        write_report(path)
-        report = table(json.loads(file.read_text(encoding="utf-8")))
+def _read_entry(path: Path, pages: Path) -> Entry:
+    """Read one campaign; its report is written into its folder of `pages` if there is no valid report."""
+    reject_links(path)
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
+    name = str(record.get("name") or table(record.get("configuration")).get("name") or path.resolve().name)
+    slug = make_slug(path, name)
+    folder = next((folder for folder in (path, pages / slug) if _is_valid(folder, path)), None)
+    if folder is None:
+        folder = pages / slug
+        folder.mkdir(parents=True, exist_ok=True)
+        write_evaluation(evaluate_run(path), folder)
+    report = _read_report(folder)
     parameters = table(table(record.get("configuration")).get("parameters"))
     system = find_system(str(table(record.get("configuration")).get("scenario")))
-    name, study = str(report.get("campaign") or path.name), table(report.get("study"))
+    study = table(report.get("study"))
     return Entry(
-        slug=make_slug(path, name),
+        slug=slug,
         directory=path,
+        report=folder,
         name=name,
         system="other" if system is None else system.name,
         sites=_read_names(report, "sites", parameters, "site"),
@@ -175,13 +183,20 @@ def _read_entry(path: Path) -> Entry:
     )
 
 
-def _is_outdated(file: Path, path: Path, report: Mapping[str, Any]) -> bool:
-    """Whether a report is older than the rows, or than the record of the confirmations that it joins."""
-    evidence, written_s = table(report.get("evidence")), file.stat().st_mtime
+def _read_report(folder: Path) -> Mapping[str, Any]:
+    return table(json.loads((folder / REPORT_JSON).read_text(encoding="utf-8")))
+
+
+def _is_valid(folder: Path, path: Path) -> bool:
+    """Whether a folder contains a report that this installation wrote from the rows and the confirmations of today."""
+    if not is_own_report(folder, path):
+        return False
+    report = _read_report(folder)
+    evidence, written_s = table(report.get("evidence")), (folder / REPORT_JSON).stat().st_mtime
     confirmations = Path(str(evidence.get("record") or ""))
     if evidence.get("claim") and (not confirmations.is_file() or confirmations.stat().st_mtime > written_s):
-        return True
-    return written_s < (path / TABLE_FILE).stat().st_mtime
+        return False
+    return report.get("schema") == SCHEMA
 
 
 def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:

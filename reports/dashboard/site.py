@@ -1,14 +1,13 @@
 """Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
-All pages are in the site's folder and need no other files; the reports of campaigns are linked or copied into it.
+All pages are in the site's folder and need no other files. The reports of campaigns are copied into it, if this user's
+installation wrote them, or are written again.
 Pages of unchanged campaigns are not written again.
 """
 
 from __future__ import annotations
 
 import math
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,13 +48,14 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
 
     `shared` contains the requirements that campaigns reference by id; None for those installed with Marsyard.
     """
-    entries, problems = stored.read_entries(stored.find_campaigns(sources))
-    rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)
     # the pages of a campaign are in the folder c/SLUG
-    (directory / "c").mkdir(parents=True, exist_ok=True)
+    pages = directory / "c"
+    pages.mkdir(parents=True, exist_ok=True)
+    entries, problems = stored.read_entries(stored.find_campaigns(sources), pages)
+    rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)
     for entry in entries:
-        _write_campaign(directory / "c" / entry.slug, entry)
-    script = (_TEMPLATES / "dashboard.js").read_text(encoding="utf-8")
+        _write_campaign(pages / entry.slug, entry)
+    script = read_script()
     filter_values = {
         "System": {entry.system for entry in entries},
         "Site": {site for entry in entries for site in entry.sites},
@@ -82,21 +82,19 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
     return Site(directory / INDEX, len(entries), problems)
 
 
+def read_script() -> str:
+    """Read the script of the index page."""
+    return (_TEMPLATES / "dashboard.js").read_text(encoding="utf-8")
+
+
 def _write_campaign(folder: Path, entry: Entry) -> None:
     """Write the pages of a campaign into its folder, unless they are newer than its report."""
-    page, report = folder / INDEX, entry.directory / PAGE_FILE
-    if page.is_file() and page.stat().st_mtime > (entry.directory / REPORT_JSON).stat().st_mtime:
+    page = folder / INDEX
+    if page.is_file() and page.stat().st_mtime > (entry.report / REPORT_JSON).stat().st_mtime:
         return
     folder.mkdir(parents=True, exist_ok=True)
-    if report.is_file():
-        # a hard link, or a copy if the file system does not allow links
-        partial_path = folder / f"{PAGE_FILE}.partial"
-        partial_path.unlink(missing_ok=True)
-        try:
-            os.link(report, partial_path)
-        except OSError:
-            shutil.copyfile(report, partial_path)
-        partial_path.replace(folder / PAGE_FILE)
+    if entry.report != folder:
+        write_atomic(folder / PAGE_FILE, (entry.report / PAGE_FILE).read_text(encoding="utf-8"))
     evaluation = evaluate_run(entry.directory)
     finder = CaseFinder(evaluation.run, evaluation.verdicts)
     cases = _write_cases(folder, entry, evaluation.run, finder)

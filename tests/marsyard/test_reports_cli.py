@@ -25,7 +25,8 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
 from marsyard.cli import app as cli
-from marsyard.cli.outcome import create_server, run_until_decided
+from marsyard.cli.outcome import run_until_decided
+from marsyard.reports.dashboard.server import create_server
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import next_look
 from marsyard.reports.presentation import notable_cases

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import http.client
+import socket
+import struct
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from marsyard.cli.outcome import create_server
+from marsyard.reports.dashboard import server
+from marsyard.reports.dashboard.server import create_server
 
 
 @pytest.fixture
@@ -47,3 +51,43 @@ def test_requests_for_another_host_are_rejected(port: int, host: str | None) -> 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "LOCALHOST:1234", "[::1]:80"])
 def test_requests_for_this_host_are_answered(port: int, host: str) -> None:
     assert _request_status(port, "/", host) == 200
+
+
+def test_answers_allow_no_foreign_scripts_and_no_frames(port: int) -> None:
+    for path in ("/", "/missing"):
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+        connection.request("GET", path)
+        headers = connection.getresponse().headers
+        connection.close()
+        policy = headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert "'unsafe-inline'" not in policy.partition("script-src")[2]
+        assert (headers["X-Content-Type-Options"], headers["X-Frame-Options"]) == ("nosniff", "DENY")
+
+
+def test_connections_are_limited_in_number_and_time(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that sends one letter after the other holds a connection for a limited time only."""
+    monkeypatch.setattr(server, "REQUEST_S", 4.0)
+    slow = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(server.MAX_CONNECTIONS)]
+    for connection in slow:
+        connection.sendall(b"G")
+    time.sleep(0.3)
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as further:
+        assert further.recv(1) == b""
+    assert slow[0].recv(1) == b""
+    for connection in slow:
+        connection.close()
+    assert _request_status(port, "/", "127.0.0.1") == 200
+
+
+def test_reset_connections_print_nothing(port: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "large.html").write_bytes(bytes(30_000_000))
+    for request in (b"", b"GET / HT", b"GET /large.html HTTP/1.0\r\nHost: localhost\r\n\r\n"):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
+            connection.sendall(request)
+            time.sleep(0.2)
+            # closing with a linger time of zero resets the connection
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    time.sleep(0.2)
+    assert capfd.readouterr().err == ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,9 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.definition.requirements import shipped_requirements
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store import record
+from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.entries import (
     RequirementVerdict,
     find_campaigns,
@@ -67,7 +71,7 @@ def test_finished_campaigns_precede_interrupted_ones(make_rows: Rows, make_run: 
         paths.append(record.parent.rename(tmp_path / name))
         text = (tmp_path / name / "campaign.json").read_text()
         (tmp_path / name / "campaign.json").write_text(text.replace("dimes-synthetic", f"dimes-{name}"))
-    entries, problems = read_entries(paths)
+    entries, problems = read_entries(paths, tmp_path / "pages")
     assert problems == []
     assert [entry.name for entry in entries] == ["dimes-c", "dimes-b", "dimes-a"]
     assert (entries[0].sites, entries[0].algorithms) == (("east", "west"), ("mine",))
@@ -151,9 +155,54 @@ def test_pages_of_unchanged_campaigns_are_not_rewritten(make_rows: Rows, make_ru
     page.write_text("page of the first run", encoding="utf-8")
     _write_index(tmp_path)
     assert page.read_text(encoding="utf-8") == "page of the first run"
-    (directory / "report.json").unlink()
+    stored = json.loads((directory / "campaign.json").read_text())
+    (directory / "campaign.json").write_text(json.dumps({**stored, "state": "interrupted"}))
     _write_index(tmp_path)
     assert "page of the first run" not in page.read_text(encoding="utf-8")
+
+
+def test_reports_of_others_are_written_again(
+    make_rows: Rows, make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page with a script, or data with another verdict, never reach the site; the campaign's folder is unchanged."""
+    directory = make_run(make_rows(24)[MIN_COLUMNS], name="elsewhere")
+    own_page = write_report(directory).read_text(encoding="utf-8")
+    _write_index(tmp_path)
+    (page,) = (tmp_path / "site" / "c").glob("*/report.html")
+    assert page.read_text(encoding="utf-8") == own_page
+    for name, text in (("report.html", "<script>alert(1)</script>"), ("report.json", '"verdict": "PASS"')):
+        write_report(directory)
+        (directory / name).write_text(text, encoding="utf-8")
+        index = _write_index(tmp_path)
+        assert page.read_text(encoding="utf-8") == own_page
+        assert "INSUFFICIENT" in index
+        assert (directory / name).read_text(encoding="utf-8") == text
+    # a signature of another user counts for nothing, and the date of the rows neither
+    write_report(directory)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
+    rows = directory / "cases.parquet"
+    make_rows(24, n_crashed=20)[MIN_COLUMNS].to_parquet(rows)
+    os.utime(rows, (0, 0))
+    _write_index(tmp_path)
+    assert "20 cases crashed" in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["report.html", "campaign.json", "cases/3/products.npz", "cases/7"])
+def test_folders_with_links_are_refused(
+    make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], name: str
+) -> None:
+    directory = make_run(make_rows(6)[MIN_COLUMNS], name="linked", products=dimes_products)
+    secret = tmp_path / "secret"
+    link = directory / name
+    secret.write_bytes(link.read_bytes() if link.is_file() else b"a file from elsewhere")
+    link.unlink(missing_ok=True)
+    link.symlink_to(secret)
+    site = write_site(tmp_path / "site", [tmp_path])
+    assert (site.campaigns, len(site.problems)) == (0, 1)
+    assert f"{name} is a symbolic link" in site.problems[0]
+    for read in (write_report, record.read):
+        with pytest.raises(StoreError, match="symbolic link"):
+            read(directory)
 
 
 def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
@@ -204,7 +253,7 @@ def test_failed_requirements_precede_others(
         {**velocity, "id": "FAILED", "bound": 0.1},
     ]
     make_run(make_rows(40, terrains=100_000), requirements)
-    entries, _ = read_entries(find_campaigns([tmp_path]))
+    entries, _ = read_entries(find_campaigns([tmp_path]), tmp_path / "pages")
     rows = requirement_rows(entries, shipped_requirements())
     assert [row.requirement for row in rows[:3]] == ["FAILED", "UNDECIDED", "MET"]
     assert all(row.latest is None for row in rows[3:])
