@@ -14,6 +14,7 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
+from marsyard.sim.files import report_damage
 
 #: Maximum number of cases of which all columns are read. In a larger campaign, all columns are read only for the first
 #: `FIRST_CASES` rows.
@@ -114,10 +115,8 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     record["requirements"] = configuration.get("requirements", record.get("requirements"))
     if requirements is not None:
         record["requirements"] = list(requirements)
-    try:
+    with report_damage(path, StoreError, "cannot be read"):
         rows, all_rows = _read_rows(path, record)
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path} cannot be read: {error}") from error
     try:
         case_folders = [entry.name for entry in (directory / "cases").iterdir() if (entry / "products.json").is_file()]
     except OSError:

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.mesh_orientation import orient_triangles
 from marsyard.scenarios.user_files import UserFile
-from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, expanded_bytes
+from marsyard.sim.files import check_regular, expanded_bytes, report_damage
 from marsyard.sim.render import Objects, Scene
 from marsyard.sim.terrain import Surface
 
@@ -31,6 +31,7 @@ MAX_BYTES, MAX_FACES = 1 << 28, 1_000_000
 #: Suffixes of archives, which are not supported, and of mesh formats that are zip archives.
 _ARCHIVES = frozenset({"zip", "bz2", "gz", "tar.gz", "tar.bz2"})
 _ZIPPED = frozenset({"3mf", "3dxml", "zae"})
+_NO_MESH = "cannot be read as a mesh"
 #: Numbers in an element of a glTF accessor.
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 #: First body number of meshes; the body numbers of rocks start at 0.
@@ -137,23 +138,24 @@ def _read(path: str, _modified_ns: int) -> Mesh:
     if kind not in formats:
         raise MeshFileError(f"{path}: '.{kind}' is not a supported mesh format; allowed: {', '.join(formats)}")
     # a small file may expand to a mesh that is too large
-    try:
-        size = 0
+    size = 0
+    with report_damage(path, MeshFileError, _NO_MESH):
         if kind in _ZIPPED:
             size = expanded_bytes(path)
         elif kind in ("glb", "gltf"):
             size = _accessor_bytes(Path(path).read_bytes(), kind)
-    except (*ARCHIVE_ERRORS, struct.error, AttributeError, RecursionError) as error:
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({error})") from error
     if size > MAX_BYTES:
         raise MeshFileError(f"{path}: expands to {size} bytes; allowed: up to {MAX_BYTES >> 20} MiB")
-    try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+    with report_damage(path, MeshFileError, _NO_MESH):
         digest = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-    except Exception as error:  # each reader raises different exceptions
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise MeshFileError(f"{path}: cannot be read as a mesh ({reason})") from error
-    triangles = np.array(getattr(mesh, "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
+        scene = trimesh.load_scene(path, process=False)
+        for body in scene.geometry.values():
+            corners = np.asarray(getattr(body, "faces", ()), dtype=np.int64)
+            if corners.size and (corners.shape[1:] != (3,) or corners.min() < 0 or corners.max() >= len(body.vertices)):
+                allowed = f"three of the {len(body.vertices)} vertices"
+                raise MeshFileError(f"{path}: a face has other corners than {allowed}")
+        # the arrays of trimesh are read-only, which rotations do not accept
+        triangles = np.array(getattr(scene.to_mesh(), "triangles", np.zeros((0, 3, 3))), dtype=np.float64)
     if len(triangles) == 0:
         raise MeshFileError(f"{path}: contains no triangle")
     if len(triangles) > MAX_FACES:

@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 from marsyard.scenarios.missing_heights import find_missing_value
-from marsyard.sim.files import ARCHIVE_ERRORS, check_regular, read_npz_headers
+from marsyard.sim.files import check_regular, read_npz_headers, report_damage
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.geotiff import brightness_problems, read_heights
 from marsyard.sim.terrain.imported import choose_grid
@@ -33,6 +33,7 @@ _MAX_STRETCH = 0.02
 HEIGHTS_M = (-11_500.0, 22_000.0)
 #: Names of the unit metre in a GeoTIFF; without a name, heights are assumed to be in metres.
 _METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
+_NO_GEOTIFF = "is not a valid GeoTIFF"
 #: Arrays of an .npz archive and their dimensions.
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
 
@@ -71,7 +72,8 @@ def _check_files(source: RealTerrain, _modified_ns: tuple[int, ...]) -> None:
     """Check the files; the modification times are a key of the cache, so that changed files are checked again."""
     dtm = source.dtm
     if dtm.suffix == ".npz":
-        _raise_first_problem(dtm, _npz_problems(source))
+        with report_damage(dtm, TerrainFileError, "is not a valid .npz archive of arrays"):
+            _raise_first_problem(dtm, _npz_problems(source))
         heights, _ = read_rasters(source)
         _check_values(dtm, heights.values, heights.posting_m, source, "mark posts without height with NaN")
         dtm_crs = None
@@ -103,10 +105,7 @@ def _require_file(path: Path) -> os.stat_result:
 
 def _npz_problems(source: RealTerrain) -> Iterator[str]:
     """Yield problems of an archive's headers."""
-    try:
-        headers = read_npz_headers(source.dtm)
-    except ARCHIVE_ERRORS as error:
-        raise TerrainFileError(f"{source.dtm}: is not a valid .npz archive of arrays ({error})") from error
+    headers = read_npz_headers(source.dtm)
     missing = [name for name in ("dem", "dem_gsd") if name not in headers]
     if missing:
         yield f"has no {', '.join(missing)}; required: dem (m, row 0 in the north), dem_gsd (m)"
@@ -178,7 +177,7 @@ def _raise_first_problem(path: Path, problems: Iterator[str]) -> None:
 
 def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None = None) -> Any:
     """Check the header and, for a DTM, the heights; return the projection."""
-    with _open(path) as file:
+    with report_damage(path, TerrainFileError, _NO_GEOTIFF), _open(path) as file:
         _raise_first_problem(path, _geotiff_problems(file, max_side, dtm_source is not None))
         if dtm_source is None:
             return file.crs
@@ -192,7 +191,7 @@ def _check_geotiff(path: Path, max_side: int, *, dtm_source: RealTerrain | None 
 
 
 def _open(path: Path) -> Any:
-    """Open a GeoTIFF. Raises TerrainFileError."""
+    """Open a GeoTIFF, for `report_damage`. Raises TerrainFileError without the file or rasterio."""
     _require_file(path)
     try:
         import rasterio
@@ -200,10 +199,7 @@ def _open(path: Path) -> Any:
         raise TerrainFileError(f"{path}: reading GeoTIFF needs rasterio: pip install rasterio (extra 'geo')") from error
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # `_geotiff_problems` reports a file without a position
-        try:
-            return rasterio.open(path)
-        except rasterio.errors.RasterioError as error:
-            raise TerrainFileError(f"{path}: is not a valid GeoTIFF ({error})") from error
+        return rasterio.open(path)
 
 
 def grid_north_deg(path: Path) -> float | None:
@@ -213,7 +209,7 @@ def grid_north_deg(path: Path) -> float | None:
     """
     if path.suffix == ".npz":
         return None
-    with _open(path) as file:
+    with report_damage(path, TerrainFileError, _NO_GEOTIFF), _open(path) as file:
         scale = map_scale(file)
     return None if scale is None else scale.grid_north_deg
 

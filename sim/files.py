@@ -6,6 +6,8 @@ import errno
 import os
 import stat
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,9 +20,22 @@ _SPECIAL_FILES = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
-#: Errors of numpy and zipfile for damaged archives and headers; NotImplementedError is an unknown compression.
-ARCHIVE_ERRORS = (OSError, ValueError, EOFError, TypeError, KeyError, NotImplementedError, zipfile.BadZipFile)
 ArrayHeader = tuple[tuple[int, ...], np.dtype[Any]]  #: Shape and type of an array.
+
+
+@contextmanager
+def report_damage(path: str | Path, error: type[Exception], problem: str, allowed: str = "") -> Iterator[None]:
+    """Convert every exception of the context, in which a library decodes a file, to `error` with path and problem.
+
+    NumPy, zlib, GDAL, trimesh, Arrow and pandas raise exceptions of many undocumented types for damaged files.
+    """
+    try:
+        yield
+    except (error, ImportError):
+        raise
+    except Exception as fault:
+        reason = " ".join(str(fault).split())[:200] or type(fault).__name__
+        raise error(f"{path}: {problem} ({reason}){allowed}") from fault
 
 
 def check_regular(path: str | Path) -> os.stat_result:
@@ -45,7 +60,7 @@ def open_regular(path: str | Path) -> BinaryIO:
 
 
 def read_npz_headers(path: str | Path) -> dict[str, ArrayHeader]:
-    """Read shape and type of each array of an .npz archive without expanding it; raises one of `ARCHIVE_ERRORS`."""
+    """Read shape and type of each array of an .npz archive without expanding it; for `report_damage`."""
     check_regular(path)
     headers: dict[str, ArrayHeader] = {}
     with zipfile.ZipFile(path) as archive:

@@ -159,7 +159,7 @@ def open_json(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
     """Yield the table of a JSON file; errors in the file or its use become a ValueError with the path and `kind`."""
     try:
         yield json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, KeyError, TypeError, IndexError, ValueError) as error:
+    except (OSError, KeyError, TypeError, IndexError, ValueError, AttributeError, RecursionError) as error:
         raise ValueError(f"{path} is not a valid {kind} file: {error}") from error
 
 

@@ -19,6 +19,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import CASES_FOLDER
 from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store, readable_store
+from marsyard.sim.files import report_damage
 
 #: State of a campaign folder in which all cases of a shard have rows, and its key in the record.
 SHARD_STATE, SHARD_KEY = "shard", "shard"
@@ -103,7 +104,10 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
 
 def _copy_rows(directory: Path, store: RowStore) -> None:
     """Copy all rows of a campaign folder into a store."""
-    with readable_store(directory / ROWS_FILE) as source:
+    with (
+        report_damage(directory / ROWS_FILE, StoreError, "is damaged"),
+        readable_store(directory / ROWS_FILE) as source,
+    ):
         columns = source.columns_by_layout()
         for chunk in source.chunks(_CHUNK):
             store.add(dict(zip(columns[layout], values, strict=True)) for layout, values in chunk)

@@ -14,13 +14,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.sim.files import report_damage
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
 _ARRAY_KEY = "__array__"
@@ -136,11 +137,9 @@ def load_products(directory: Path) -> dict[str, Any]:
 
     Raises StoreError if there are none.
     """
-    try:
+    with report_damage(directory, StoreError, "contains no products of a case"):
         files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
         return unpack_products(PackedProducts(*files))
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise StoreError(f"{directory} contains no products of a case: {error}") from error
 
 
 #: Folder of the stored products, with a folder for each case.

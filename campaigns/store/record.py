@@ -170,7 +170,7 @@ def read(directory: Path) -> dict[str, Any]:
         schema = record["schema"]
     except OSError as error:
         raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")

@@ -10,6 +10,7 @@ killed, nor at a power failure if the disk executes `fsync` correctly. Each batc
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -17,7 +18,6 @@ import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +158,7 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def count(self) -> int:
         """Return the number of cases that have a row."""
-        (number,) = self._query("SELECT count(*) FROM cases").fetchone()
+        ((number,),) = self._query("SELECT count(*) FROM cases")
         return int(number)
 
     def count_unfinished(self) -> int:
@@ -168,7 +168,11 @@ class RowStore(AbstractContextManager["RowStore"]):
     def list_missing_cases(self, total: int) -> list[range]:
         """List the cases below `total` that have no row, as ranges."""
         ends = [-1, *(number for (number,) in self._query("SELECT case_number FROM cases ORDER BY 1")), total]
-        return [range(previous + 1, following) for previous, following in pairwise(ends) if following > previous + 1]
+        return [
+            range(previous + 1, following)
+            for previous, following in itertools.pairwise(ends)
+            if following > previous + 1
+        ]
 
     def list_cases_with_outcomes(self, outcomes: Iterable[str]) -> list[int]:
         """List the cases with one of these outcomes."""
@@ -181,16 +185,16 @@ class RowStore(AbstractContextManager["RowStore"]):
         """Return the first finished case; None if no case is finished."""
         placeholders = ", ".join("?" * len(ENGINE_FAILURES))
         query = f"SELECT min(case_number) FROM cases WHERE outcome NOT IN ({placeholders})"  # noqa: S608
-        (case,) = self._query(query, sorted(ENGINE_FAILURES)).fetchone()
+        ((case,),) = self._query(query, sorted(ENGINE_FAILURES))
         return None if case is None else int(case)
 
     def row(self, case: int) -> Row | None:
         """Return the row of a case; None if it has none."""
-        record = self._query("SELECT layout, row FROM cases WHERE case_number = ?", [case]).fetchone()
+        record = next(self._query("SELECT layout, row FROM cases WHERE case_number = ?", [case]), None)
         try:
             columns = () if record is None else self.columns_by_layout()[record[0]]
             return None if record is None else dict(zip(columns, json.loads(record[1]), strict=True))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
 
     def columns_by_layout(self) -> dict[int, tuple[str, ...]]:
@@ -211,19 +215,22 @@ class RowStore(AbstractContextManager["RowStore"]):
 
     def chunks(self, size: int) -> Iterator[list[tuple[int, list[Any]]]]:
         """Yield layouts and values of all rows in the order of their cases, in chunks of `size` rows."""
-        cursor = self._query("SELECT layout, row FROM cases ORDER BY case_number")
-        while records := cursor.fetchmany(size):
+        rows = self._query("SELECT layout, row FROM cases ORDER BY case_number")
+        while records := list(itertools.islice(rows, size)):
             # parsing one joined text takes half the time of parsing each row
             try:
                 values = json.loads(f"[{','.join(text for _, text in records)}]")
-            except (ValueError, TypeError) as error:
+                chunk = [(layout, row) for (layout, _), row in zip(records, values, strict=True)]
+            except (ValueError, TypeError, RecursionError) as error:
                 raise StoreError(f"{self._path} is damaged: a row cannot be read: {error}") from error
-            yield [(layout, row) for (layout, _), row in zip(records, values, strict=True)]
+            yield chunk
 
-    def _query(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
-        """Execute a query. Raises StoreError on failure."""
+    def _query(self, query: str, values: Sequence[Any] = ()) -> Iterator[Any]:
+        """Execute a query, and yield its rows. Raises StoreError on failure, also for a text that is not UTF-8."""
         try:
-            return self._connection.execute(query, values)
+            # `yield from` would close the cursor, also after the store is closed
+            for row in self._connection.execute(query, values):  # noqa: UP028
+                yield row
         except sqlite3.Error as error:
             raise self._store_error(error) from error
 

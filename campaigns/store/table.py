@@ -21,6 +21,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, R
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.record import stored_configuration
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
+from marsyard.sim.files import report_damage
 
 TABLE_FILE = "cases.parquet"
 #: Number of rows in a row group.
@@ -119,14 +120,11 @@ def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
 
     Raises StoreError if there is no such table.
     """
-    import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
+    with report_damage(path, StoreError, "not a table of cases"):
         case_filter = None if case is None else [("case", "==", case)]
         rows: list[dict[str, Any]] = pq.read_table(path, filters=case_filter).to_pylist()
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a table of cases: {error}") from error
     return [{name: value for name, value in row.items() if value is not None} for row in rows]
 
 
@@ -173,7 +171,8 @@ def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: 
         return []
     import pyarrow.parquet as pq
 
-    rows = pq.read_table(table, columns=["case", "answered", metric])
+    with report_damage(table, StoreError, "not a table of cases"):
+        rows = pq.read_table(table, columns=["case", "answered", metric])
     magnitudes = np.abs(np.asarray(rows[metric].to_numpy(), dtype=np.float64))
     magnitudes = np.where(np.asarray(rows["answered"].to_numpy(), dtype=np.bool_), magnitudes, np.nan)
     order = np.argsort(-magnitudes, kind="stable")[:number]

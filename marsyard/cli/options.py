@@ -132,11 +132,16 @@ def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Paramete
 
     @functools.wraps(command)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        # imported here, so that `doctor` can report another package that shadows Marsyard
-        from marsyard.campaigns.errors import CampaignError
-
         try:
+            # imported here, so that `doctor` can report another package that shadows Marsyard
+            from marsyard.campaigns.errors import CampaignError
+
             command(*args, **kwargs)
+        except KeyboardInterrupt:
+            typer.echo("interrupted", err=True)
+            raise typer.Exit(Exit.INTERRUPTED) from None
+        except ImportError:  # `CampaignError` may be undefined
+            raise
         except (CampaignError, OSError) as error:
             if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
                 raise

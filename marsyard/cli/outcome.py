@@ -46,6 +46,7 @@ from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import count, format_fraction, primary_metric
+from marsyard.sim.files import report_damage
 
 #: Browsers that can print pages, in order of preference, and the time limit of printing.
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -122,10 +123,8 @@ def read_frame(directory: Path) -> pd.DataFrame:
     path = directory / TABLE_FILE
     if not path.is_file():
         raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign is not finished")
-    try:
+    with report_damage(path, StoreError, "is not a valid table of cases"):
         return pd.read_parquet(path)
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path} is not a valid table of cases: {error}") from error
 
 
 def write_csv(directory: Path) -> Path:

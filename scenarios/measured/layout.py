@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
-from marsyard.sim.files import check_regular, open_regular, read_npy_header
+from marsyard.sim.files import check_regular, open_regular, read_npy_header, report_damage
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded_field
 
@@ -335,7 +335,7 @@ def read_image_size(path: Path) -> tuple[int, int]:
 def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
     """Read a flat field: an array unchanged, or an image divided by its largest count. Raises IngestError."""
     head = read_header(path)
-    try:
+    with report_damage(path, IngestError, "is not a valid flat field"):
         if head.startswith(b"\x93NUMPY"):
             with path.open("rb") as file:
                 shape, dtype = read_npy_header(file)
@@ -345,8 +345,6 @@ def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
         else:
             counts = read_counts(path, read_image_size(path))
             response = counts / max(int(counts.max()), 1)
-    except (ValueError, EOFError) as error:
-        raise IngestError(f"{path}: is not a valid flat field: {error}") from error
     if not np.all(np.isfinite(response)) or response.min() <= 0.0 or response.max() > _MAX_RESPONSE:
         raise IngestError(f"{path}: is not a valid flat field; allowed: two dimensions, above 0, maximum about 1")
     return response

@@ -38,7 +38,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
-from marsyard.sim.files import check_regular
+from marsyard.sim.files import check_regular, report_damage
 from marsyard.sim.parameters import Parameters
 
 #: Minimum number of poses of a cubic spline.
@@ -179,13 +179,8 @@ def _read_file(path: str, _modified_ns: int, size: int) -> RecordedPoses:
             digest = hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as fault:
         raise TrajectoryFileError(f"{path}: cannot be read ({fault.strerror})") from fault
-    try:
+    with report_damage(path, TrajectoryFileError, "cannot be read as a table", f"; allowed: {_ALLOWED}"):
         values = _read_table(path, head)
-    except TrajectoryFileError:
-        raise
-    except (OSError, ValueError, UnicodeError) as fault:
-        reason = " ".join(str(fault).split())[:200]
-        raise TrajectoryFileError(f"{path}: cannot be read as a table ({reason}); allowed: {_ALLOWED}") from fault
     return _check_poses(path, digest, values)
 
 

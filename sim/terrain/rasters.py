@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from pydantic import Field
 
+from marsyard.sim.files import report_damage
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.terrain.geotiff import full_turn, read_brightness, read_heights
 
@@ -70,17 +71,19 @@ def read_rasters(source: RealTerrain) -> tuple[Raster, Raster | None]:
     """Read heights, and brightness if an orthoimage is used. Raises TerrainFileError."""
     if not source.dtm.exists():
         raise TerrainFileError(f"terrain file {source.dtm} does not exist")
-    if source.dtm.suffix == ".npz":
-        heights, ortho = _read_npz(source.dtm)
-    else:
-        heights, ortho = _read_geotiff(source.dtm, is_dtm=True)[0], None
+    with report_damage(source.dtm, TerrainFileError, "is damaged"):
+        if source.dtm.suffix == ".npz":
+            heights, ortho = _read_npz(source.dtm)
+        else:
+            heights, ortho = _read_geotiff(source.dtm, is_dtm=True)[0], None
     check_holes(source, heights.values)
     if not source.use_ortho:
         return heights, None
     if source.ortho is not None:
         if not source.ortho.exists():
             raise TerrainFileError(f"ortho image {source.ortho} does not exist")
-        ortho, full_turn_m = _read_geotiff(source.ortho, is_dtm=False)
+        with report_damage(source.ortho, TerrainFileError, "is damaged"):
+            ortho, full_turn_m = _read_geotiff(source.ortho, is_dtm=False)
         if full_turn_m is not None:
             ortho = replace(ortho, west_m=ortho.west_m - full_turn_m * _full_turns(heights, ortho, full_turn_m))
     if ortho is not None:
