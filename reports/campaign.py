@@ -20,6 +20,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.origin import sign
 from marsyard.reports import common_sections, explorer, sections
 from marsyard.reports.boundary import boundary_section
@@ -39,6 +40,7 @@ from marsyard.reports.tables import error_summaries, outcome_counts, statistics_
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count, label, number, numbers, primary_metric
+from marsyard.sim.cache import hide_folders
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -92,14 +94,17 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     extra_sections = [section for maker in makers if (section := maker(subject)) is not None]
     report_data = build_report_data(evaluation, subject, extra_sections)
     algorithms = read_algorithms(run.record)
-    write_atomic(directory / REPORT_JSON, json.dumps(report_data, indent=2, allow_nan=False) + "\n")
+    write_atomic(
+        directory / REPORT_JSON,
+        hide_folders(json.dumps(report_data, indent=2, allow_nan=False, ensure_ascii=False)) + "\n",
+    )
     rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
-    write_atomic(directory / VERIFICATION_FILE, verification_csv(rows))
-    write_atomic(directory / JUNIT_FILE, junit_xml(run.name, verdicts, overall_verdict, algorithms))
+    write_atomic(directory / VERIFICATION_FILE, hide_folders(verification_csv(rows)))
+    write_atomic(directory / JUNIT_FILE, hide_folders(junit_xml(run.name, verdicts, overall_verdict, algorithms)))
     page = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context["evidence"] = evaluation.evidence
-    write_atomic(page, page_environment().get_template("report.html.j2").render(context))
+    write_atomic(page, hide_folders(page_environment().get_template("report.html.j2").render(context)))
     with suppress(StoreError):  # without a key, the dashboard writes the report again
         sign_report(directory, run.directory)
     return page
@@ -169,7 +174,7 @@ def page_context(
         "summaries": {case.case: finder.summary(case.case) for case in showcases},
         "provenance": sections.list_provenance(run),
         "versions": sections.list_versions(run),
-        "configuration": json.dumps(run.configuration or run.record, indent=2, ensure_ascii=False, default=str),
+        "configuration": json.dumps(run.configuration, indent=2, ensure_ascii=False, default=str),
         "algorithms": read_algorithms(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
@@ -310,19 +315,18 @@ def page_environment() -> Environment:
 
 
 def _to_json_types(value: Any) -> Any:
-    """Convert a value to types of JSON; NaN and infinities become None."""
+    """Convert a value to types of JSON; NaN and infinities become None, folders of the user are hidden."""
     if isinstance(value, Mapping):
         return {str(name): _to_json_types(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
         return [_to_json_types(inner) for inner in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, str | int | bool) else str(value)
+    return value if value is None or isinstance(value, int | bool) else hide_folders(str(value))
 
 
 def write_atomic(path: Path, text: str) -> None:
     """Write a text file atomically: write a temporary file, then rename it."""
-    partial_path = path.with_suffix(path.suffix + ".partial")
-    # JSON can contain lone surrogates, which cannot be encoded as UTF-8
-    partial_path.write_text(text, encoding="utf-8", errors="replace")
-    partial_path.replace(path)
+    with replace_file(path) as partial_path:
+        # JSON can contain lone surrogates, which cannot be encoded as UTF-8
+        partial_path.write_text(text, encoding="utf-8", errors="replace")

@@ -49,6 +49,7 @@ from marsyard.reports.wording import (
     split_unit,
 )
 from marsyard.scenarios.systems import scenario, scenario_names
+from marsyard.sim.cache import hide_folders
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10
@@ -251,7 +252,7 @@ def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
         *(
             (f"Machine: {_FACT_NAMES.get(name, name)}", value)
             for name, value in environment.items()
-            if value not in ({}, None)
+            if name in _FACT_NAMES or isinstance(value, str)
         ),
         ("GL backend", _distinct_values(run.frame, "gl_backend")),
         ("GL version", _distinct_values(run.frame, "gl_version")),
@@ -280,7 +281,7 @@ def rerun_commands(run: StoredRun) -> list[str]:
             if run.recorded(key) is not None:
                 words += [option, str(run.recorded(key))]
         return [shlex.join(words)]
-    folder, words = run.command[0], list(run.command[1])
+    folder, words = hide_folders(run.command[0]), list(run.command[1])
     stored_blocks = run.configuration.get("appended")
     # a sequential campaign appends blocks of cases without a command
     block_sizes = [] if run.recorded("max_cases") or not isinstance(stored_blocks, list | tuple) else stored_blocks
@@ -288,7 +289,10 @@ def rerun_commands(run: StoredRun) -> list[str]:
     if block_sizes:
         words += ["--out", target]
     append_commands = [shlex.join(["marsyard", "append", target, str(cases)]) for cases in block_sizes]
-    return [*([shlex.join(["cd", folder])] if folder else []), shlex.join(words), *append_commands]
+    first, separator, rest = folder.partition("/")
+    # the shell expands ~ only without quotes
+    path = first + separator + (shlex.quote(rest) if rest else "") if first == "~" else shlex.quote(folder)
+    return [*([f"cd {path}"] if folder else []), shlex.join(words), *append_commands]
 
 
 def _cell_text(frame: pd.DataFrame, column: str, index: int) -> str:

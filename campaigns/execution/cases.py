@@ -26,7 +26,7 @@ from marsyard.campaigns.store.products import PackedProducts, ProductSelection, 
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by, recording_timelines
 from marsyard.scenarios.systems import scenario
-from marsyard.sim.cache import CacheWarning
+from marsyard.sim.cache import CacheWarning, hide_folders
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023
@@ -183,7 +183,8 @@ def make_unfinished_row(
 
 
 def _clean_text(text: str) -> str:
-    """Shorten a text, and remove lone surrogates and object addresses, which change from run to run."""
+    """Shorten a text; remove lone surrogates, and object addresses and folders, which change from run to run."""
+    text = hide_folders(text)
     if len(text) > _MAX_TEXT:
         half = _MAX_TEXT // 2
         text = f"{text[:half]}\n... {len(text) - 2 * half} characters omitted ...\n{text[-half:]}"

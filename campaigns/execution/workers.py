@@ -54,8 +54,9 @@ _MARK = "MARSYARD_WORKER"
 #: Number of attempts before a crash or lack of memory is attributed to the task; the last attempt is in a fresh worker.
 #: An earlier task may have damaged the worker or used its memory, or an external process may have killed the worker.
 _MAX_ATTEMPTS = 2
-#: Maximum number of consecutive deaths of workers before they start a task.
-_MAX_START_DEATHS = 3
+#: Maximum number of consecutive deaths of each worker before it starts a task, and the pause after the first, s; each
+#: pause is twice as long as the previous one, because a lack of memory or processes on the machine can be temporary.
+_MAX_START_DEATHS, _DEATH_PAUSE_S = 4, 1.0
 #: Prefix of the names of executors' temporary folders.
 _PREFIX = "marsyard-"
 #: Lock file in the folder of an executor; the process of the executor locks it while it runs.
@@ -314,14 +315,19 @@ class _WorkProgress:
         self._attempts: dict[int, int] = {}
         self._suspect_predecessors: dict[int, int | None] = {}
         self._running: dict[Future[Any], tuple[MonitoredWorker, Sequence[int]]] = {}
-        self._deaths_at_start = 0
+        # consecutive deaths before a task, and end of the pause (monotonic clock, s), by worker
+        self._deaths_at_start = dict.fromkeys(workers, 0)
+        self._pausing: dict[MonitoredWorker, float] = {}
 
     def results(self) -> Iterator[list[TaskResult[Any]]]:
         """Run the work as described in `Executor.run`."""
         while True:
             self._submit_batches()
             if not self._running:
-                return
+                if not self._pausing or not self._retries:
+                    return
+                time.sleep(_POLL_INTERVAL_S)
+                continue
             futures, _ = wait(self._running, timeout=_POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
             results = [result for future in futures for result in self._collect(future)]
             for worker, _ in self._running.values():
@@ -333,6 +339,9 @@ class _WorkProgress:
 
     def _submit_batches(self) -> None:
         """Submit a batch to each idle worker; items to be run again come first."""
+        for worker in [worker for worker, end_s in self._pausing.items() if end_s <= time.monotonic()]:
+            del self._pausing[worker]
+            self._idle.append(worker)
         while self._idle:
             batch = self._retries.popleft() if self._retries else self._batches.next()
             if not batch:
@@ -349,7 +358,7 @@ class _WorkProgress:
         if isinstance(error, BrokenProcessPool):
             return self._handle_worker_crash(worker, batch, error)
         if error is None:
-            self._deaths_at_start = 0
+            self._deaths_at_start[worker] = 0
             return self._handle_batch_result(worker, future.result())
         self._idle.append(worker)
         if len(batch) > 1:
@@ -390,14 +399,14 @@ class _WorkProgress:
         """Identify the task that ended the worker; run the other tasks of its batch again."""
         item, exit_error = worker.handle_death(error)
         if item is None or item not in batch:
-            self._deaths_at_start += 1
-            if self._deaths_at_start >= _MAX_START_DEATHS:
+            self._deaths_at_start[worker] = deaths = self._deaths_at_start[worker] + 1
+            if min(self._deaths_at_start.values()) >= _MAX_START_DEATHS:
                 reason = f"{exit_error}\n{exit_error.trace}".strip()
-                raise CampaignError(f"worker processes die before they start a case; last death: {reason}")
+                raise CampaignError(f"all worker processes die before they start a case; last death: {reason}")
             self._retries.append(list(batch))
-            self._idle.append(worker)
+            self._pausing[worker] = time.monotonic() + _DEATH_PAUSE_S * 2.0 ** min(deaths - 1, _MAX_START_DEATHS)
             return []
-        self._deaths_at_start = 0
+        self._deaths_at_start[worker] = 0
         index = batch.index(item)
         self._retries.extend(list(part) for part in (batch[:index], batch[index + 1 :]) if part)
         attempt = self._attempts.pop(item, 1)
@@ -442,8 +451,10 @@ class ExecutorConfig:
     cluster: str | None = None
 
     def describe(self) -> str:
-        """Describe the executor for the campaign's record."""
-        return f"{self.jobs} on this machine" if self.cluster is None else f"cluster {self.cluster}"
+        """Describe the executor for the campaign's record, without the names of hosts."""
+        if self.cluster is None:
+            return f"{self.jobs} on this machine"
+        return f"cluster {self.cluster}" if self.cluster.startswith("local:") else "cluster"
 
 
 def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:

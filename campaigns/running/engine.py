@@ -27,9 +27,9 @@ from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, rea
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
+from marsyard.campaigns.store.lock import folder_lock
 from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.products import ProductStore, create_product_selection
-from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, numeric_metrics, write_table
 from marsyard.scenarios.systems import RowColumns, row_columns

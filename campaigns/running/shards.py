@@ -16,8 +16,8 @@ from typing import Any
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.lock import folder_lock
 from marsyard.campaigns.store.products import CASES_FOLDER
-from marsyard.campaigns.store.record import folder_lock
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store, readable_store
 from marsyard.sim.files import report_damage
 

@@ -21,6 +21,7 @@ import numpy as np
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.store.lock import partial_suffix
 from marsyard.sim.files import report_damage
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
@@ -86,7 +87,7 @@ def replace_files(directory: Path) -> Iterator[Path]:
     """
     with report_write_errors(directory):
         directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=directory, prefix=".partial-") as name:
+        with tempfile.TemporaryDirectory(dir=directory, prefix=".", suffix=partial_suffix()) as name:
             folder = Path(name)
             yield folder
             # the outline is moved last, since its presence marks a folder as complete

@@ -1,8 +1,7 @@
-"""Record `campaign.json` of a campaign's folder (configuration, program, machine, progress), and the folder's lock."""
+"""Record `campaign.json` of a campaign's folder (configuration, program, machine, progress)."""
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -10,8 +9,8 @@ import platform
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,7 +19,9 @@ from typing import Any
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
+from marsyard.sim.cache import hide_folders
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
@@ -105,7 +106,9 @@ def write_first_record(
             "requirements": contents["requirements"],
             "configuration": contents,
             "identity": asdict(identity),
-            "command": {"words": list(command), "folder": str(Path.cwd())} if command else None,
+            "command": {"words": [*map(hide_folders, command)], "folder": hide_folders(str(Path.cwd()))}
+            if command
+            else None,
             "algorithms": list(algorithms),
             "evidence": None if evidence is None else dict(evidence),
             "origin": None if origin is None else dict(origin),
@@ -141,13 +144,10 @@ def write(directory: Path, record: Mapping[str, Any]) -> None:
     Raises StoreError on failure; the previous record then remains.
     """
     path = directory / RECORD_FILE
-    partial = path.with_suffix(".partial")
-    with report_write_errors(path):
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
+    with report_write_errors(path), replace_file(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.write(json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read(directory: Path) -> dict[str, Any]:
@@ -236,42 +236,4 @@ def describe_machine() -> dict[str, Any]:
         "machine": platform.machine(),
         "processor": model[1] if model else platform.processor(),
         "processor_features": hashlib.sha256(sorted_features.encode()).hexdigest()[:16] if sorted_features else None,
-        "variables": {name: value for name, value in sorted(os.environ.items()) if name.startswith("MARSYARD_")},
     }
-
-
-#: Lock file of the process that uses the folder; the kernel releases the lock when the process ends.
-_LOCK_FILE = "campaign.lock"
-
-
-@contextmanager
-def folder_lock(directory: Path) -> Iterator[None]:
-    """Lock a campaign's folder. Raises StoreError if another process holds the lock, or the folder is not writable."""
-    path = directory / _LOCK_FILE
-    with report_write_errors(directory):
-        file = path.open("a+", encoding="utf-8")
-    with file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise StoreError(f"{directory} is in use: {holder} uses it; wait until it ends, or stop it") from error
-        # a full disk is ignored, since the text is only used in messages of other processes
-        with suppress(OSError):
-            file.truncate(0)
-            file.write(f"process {os.getpid()} on {platform.node()}\n")
-            file.flush()
-        yield
-
-
-def is_locked(directory: Path) -> bool:
-    """Whether a process has locked a campaign's folder."""
-    try:
-        with (directory / _LOCK_FILE).open("r", encoding="utf-8") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-    return False

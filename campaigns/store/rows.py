@@ -17,11 +17,12 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError
+from marsyard.campaigns.store.lock import replace_file
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
@@ -47,16 +48,10 @@ COMMIT;
 
 def create_store(path: Path, about: Mapping[str, str]) -> None:
     """Create an empty store atomically; `about` contains texts by key that identify the campaign."""
-    partial = path.with_name(f"{path.name}.partial")
     try:
-        partial.unlink(missing_ok=True)
-        connection = sqlite3.connect(partial, isolation_level=None)
-        try:
+        with replace_file(path) as partial, closing(sqlite3.connect(partial, isolation_level=None)) as connection:
             connection.executescript(_TABLES)
             connection.executemany("INSERT INTO about VALUES (?, ?)", about.items())
-        finally:
-            connection.close()
-        partial.rename(path)
     except (sqlite3.Error, OSError) as error:
         raise StoreError(f"{path} cannot be written: {error}") from error
 

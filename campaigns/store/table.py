@@ -19,6 +19,7 @@ import numpy as np
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.record import stored_configuration
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
 from marsyard.sim.files import report_damage
@@ -44,9 +45,8 @@ def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ())
     names = (*LEADING_COLUMNS, *scenario_columns, *TRAILING_COLUMNS)
     types = {name: _choose_type(kinds.get(name, set())) for name in names}
     schema = pa.schema([(name, kind) for name, (kind, _) in types.items()])
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        with pq.ParquetWriter(partial, schema) as writer, ExitStack() as stack:
+        with replace_file(path) as partial, pq.ParquetWriter(partial, schema) as writer, ExitStack() as stack:
             if gc.isenabled():
                 # with millions of rows garbage collection takes as long as reading, and rows have no cyclic references
                 gc.disable()
@@ -62,13 +62,12 @@ def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ())
                     needs_fill = array.null_count and pa.types.is_floating(kind)
                     arrays.append(pc.fill_null(array, math.nan) if needs_fill else array)
                 writer.write_table(pa.Table.from_arrays(arrays, schema=schema), row_group_size=_GROUP_ROWS)
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        partial.replace(path)
+            writer.close()
+            with partial.open("rb") as file:
+                os.fsync(file.fileno())
     except OSError as error:
         raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
     except (TypeError, ValueError) as error:
-        partial.unlink(missing_ok=True)
         raise StoreError(f"{path} cannot be written: {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
 
 

@@ -30,6 +30,7 @@ from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
+from marsyard.campaigns.store.lock import folder_lock
 from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
@@ -223,7 +224,7 @@ def start_study(
     """
     study_campaign = prepare_campaign(campaign, max_cases)
     record.claim_folder(directory)
-    with record.folder_lock(directory):
+    with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock
         record.claim_folder(directory)
         create_study(study_campaign, directory, session.executor.describe(), dict(settings))
@@ -237,7 +238,7 @@ def continue_study(
 
     Raises CampaignError if the program has changed.
     """
-    with record.folder_lock(directory):
+    with folder_lock(directory):
         configuration = record.stored_configuration(directory)
         if additional_cases:
             blocks = (*configuration.appended, additional_cases)

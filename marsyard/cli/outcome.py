@@ -30,8 +30,9 @@ from marsyard.campaigns.running.preparation import estimate_campaign
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.lock import is_locked, replace_file
 from marsyard.campaigns.store.products import case_directory, save_packed
-from marsyard.campaigns.store.record import is_locked, stored_configuration
+from marsyard.campaigns.store.record import stored_configuration
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
 from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
@@ -130,13 +131,11 @@ def read_frame(directory: Path) -> pd.DataFrame:
 def write_csv(directory: Path) -> Path:
     """Write all rows as CSV in batches, atomically."""
     path = directory / "cases.csv"
-    partial_path = path.with_name(f"{path.name}.partial")
-    with report_write_errors(path):
+    with report_write_errors(path), replace_file(path) as partial_path:
         table = pq.ParquetFile(directory / TABLE_FILE)
         with pa_csv.CSVWriter(partial_path, table.schema_arrow) as writer:
             for batch in table.iter_batches():
                 writer.write_batch(batch)
-        partial_path.replace(path)
     return path
 
 

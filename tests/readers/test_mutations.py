@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -55,7 +56,7 @@ from tests.sim.camera.test_files import CMOD_TEXT, LABEL
 from tests.sim.camera.test_pds4 import LABEL as PDS4_LABEL
 from tests.sim.sensor.test_datasheet import DATASHEET
 
-ROWS = [
+ROWS: list[dict[str, Any]] = [
     {"case": case, "outcome": "VALID", "answered": True, "velocity_error_m_s": 0.1 * case, "site": "gusev",
      "wall_time_s": 1.0, "cpu_time_s": 1.0, "error": "", "traceback": ""}
     for case in range(40)
@@ -306,11 +307,11 @@ def _read_mutated(name: str, mutate: Callable[[bytes], bytes], tmp_path: Path) -
     shutil.rmtree(folder)
 
 
-_SETTINGS = {"deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture], "database": None}
+_SETTINGS = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], database=None)
 
 
 @pytest.mark.parametrize("name", READERS)
-@settings(max_examples=12, derandomize=True, **_SETTINGS)
+@settings(_SETTINGS, max_examples=12, derandomize=True)
 @given(mutate=mutations())
 def test_damaged_files_raise_the_documented_error(name: str, mutate: Callable[[bytes], bytes], tmp_path: Path) -> None:
     _read_mutated(name, mutate, tmp_path)
@@ -318,7 +319,7 @@ def test_damaged_files_raise_the_documented_error(name: str, mutate: Callable[[b
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
-@settings(max_examples=400, **_SETTINGS)
+@settings(_SETTINGS, max_examples=400)
 @given(mutate=mutations())
 def test_many_damaged_files_raise_the_documented_error(
     name: str, mutate: Callable[[bytes], bytes], tmp_path: Path

@@ -14,8 +14,11 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.store.record import describe_machine
 from marsyard.reports.campaign import write_report
 from marsyard.reports.sections import script_hash
+from marsyard.sim.cache import hide_folders
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
@@ -277,3 +280,33 @@ def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun, 
     answers = report["sections"]["answers"]
     wrong_answers = next(fraction for name, fraction in answers.items() if name.startswith("wrong"))
     assert (wrong_answers["hits"], wrong_answers["n"]) == (6, 24)
+
+
+def test_reports_contain_no_folder_of_the_user(
+    make_rows: Rows, make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home = tmp_path / "home of alice"
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("MARSYARD_CACHE", "/scratch/alice/cache")
+    command = {"words": ["marsyard", "run", f"{home}/x.toml"], "folder": str(home / "my project")}
+    environment = {"machine": "x86_64", "variables": {"MARSYARD_TOKEN": "secret"}}
+    frame = make_rows(12, n_crashed=1).assign(error=f"cannot read {home}/a.npy, /scratch/alice/cache/terrain/1.npy")
+    directory = make_run(frame, command=command, environment=environment, name="home of alice/run")
+    write_report(directory)
+    for path in directory.iterdir():
+        if path.name not in ("campaign.json", "cases.parquet"):
+            text = path.read_text(encoding="utf-8")
+            assert not [word for word in (str(home), "/scratch/alice", "MARSYARD_TOKEN", "secret") if word in text], (
+                path
+            )
+    assert "cd ~/&#39;my project&#39;" in (directory / "report.html").read_text(encoding="utf-8")
+
+
+def test_records_contain_no_variables_and_no_folder_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MARSYARD_TOKEN", "secret")
+    assert "secret" not in json.dumps(describe_machine())
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert hide_folders(f"cannot read '{tmp_path}/a', {tmp_path}-b") == f"cannot read '~/a', {tmp_path}-b"
+    assert ExecutorConfig(cluster="tcp://login.example:8786").describe() == "cluster"

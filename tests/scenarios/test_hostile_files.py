@@ -107,7 +107,7 @@ def test_flat_field_size_is_checked_before_expansion(tmp_path: Path) -> None:
     path = tmp_path / "flat.npy"
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**6, 10**6)})
-    with pytest.raises(IngestError, match=r"not a valid flat field: contains an array of shape \(1000000, 1000000\)"):
+    with pytest.raises(IngestError, match=r"not a valid flat field \(contains an array of shape \(1000000, 1000000\)"):
         read_flat_field(path)
 
 

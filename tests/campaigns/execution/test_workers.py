@@ -20,7 +20,7 @@ import pytest
 
 from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
-from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits, run_batch
 from marsyard.campaigns.execution.workers import MAX_BATCH, Batches, LocalExecutor
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
@@ -209,10 +209,35 @@ def exit_at_start(*_: object) -> None:
 
 
 def test_workers_that_die_at_start_raise_a_campaign_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    with LocalExecutor(1) as workers:
+    monkeypatch.setattr("marsyard.campaigns.execution.workers._DEATH_PAUSE_S", 0.01)
+    with LocalExecutor(2) as workers:
         monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", exit_at_start)
-        with pytest.raises(CampaignError, match="worker processes die before they start a case"):
-            list(workers.run(Work(get_process_id, range(3))))
+        with pytest.raises(CampaignError, match="all worker processes die before they start a case"):
+            list(workers.run(Work(get_process_id, range(9))))
+
+
+def exit_while_marked(folder: str, task: Callable[[int], Any], items: Any) -> Any:
+    """Die before a case while the folder contains a file, which is removed: a temporary lack of memory."""
+    marker = next(iter(Path(folder).iterdir()), None)
+    if marker is not None:
+        marker.unlink()
+        os._exit(7)
+    return run_batch(task, items)
+
+
+def test_campaign_survives_several_deaths_at_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A worker dies three times, and pauses before each start."""
+    monkeypatch.setattr("marsyard.campaigns.execution.workers._DEATH_PAUSE_S", 0.5)
+    for number in range(3):
+        (tmp_path / str(number)).touch()
+    start_s = time.monotonic()
+    with LocalExecutor(1) as workers:
+        monkeypatch.setattr("marsyard.campaigns.execution.workers.run_batch", partial(exit_while_marked, str(tmp_path)))
+        results = list(run_items(workers, get_process_id, range(4)))
+    assert sorted(result.item for result in results) == [0, 1, 2, 3]
+    assert all(result.error is None for result in results)
+    # pauses of 0.5, 1 and 2 s
+    assert time.monotonic() - start_s >= 3.5
 
 
 def test_used_memory_counts_only_private_pages(tmp_path: Path) -> None:

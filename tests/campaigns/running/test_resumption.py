@@ -15,7 +15,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.record import folder_lock
+from marsyard.campaigns.store.lock import folder_lock
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, sign_folder, write_campaign
 
 CampaignFile = Callable[..., Path]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,9 +21,9 @@ from hypothesis import strategies as st
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store import record
+from marsyard.campaigns.store import lock, record
+from marsyard.campaigns.store.lock import folder_lock, is_locked
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
-from marsyard.campaigns.store.record import folder_lock, is_locked
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import numeric_metrics, read_rows, write_table
 
@@ -253,3 +256,57 @@ def test_numeric_metrics_contain_the_summands_of_a_sum() -> None:
     total = Requirement.model_validate({"id": "A", "metric": "a_s + b_s", "bound": 2.0, **confidence})
     boolean = Requirement.model_validate({"id": "B", "metric": "safe", **confidence})
     assert numeric_metrics([total, boolean]) == ["a_s", "b_s"]
+
+
+@pytest.fixture
+def without_locks(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """A file system without locks (an error number), or with locks that other machines do not see (0)."""
+
+    def flock(*_: object) -> None:
+        if request.param:
+            raise OSError(request.param, os.strerror(request.param))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+    monkeypatch.setattr(lock, "_BEAT_S", 0.1)
+    monkeypatch.setattr(lock, "_SILENCE_S", 1.5)
+
+
+@pytest.mark.usefixtures("without_locks")
+@pytest.mark.parametrize("without_locks", [errno.ENOLCK, errno.EOPNOTSUPP, 0], indirect=True)
+def test_heartbeat_locks_a_folder_without_locks(tmp_path: Path) -> None:
+    with folder_lock(tmp_path):
+        assert is_locked(tmp_path)
+        with pytest.raises(StoreError, match=f"is in use: process {os.getpid()} on"), folder_lock(tmp_path):
+            pass
+    assert not is_locked(tmp_path)
+    # a process of another machine that has ended without a sign
+    (tmp_path / "campaign.lock").write_text("process 1 on another machine (0123abcd)\n")
+    assert not is_locked(tmp_path)
+    with folder_lock(tmp_path):
+        assert is_locked(tmp_path)
+
+
+def test_temporary_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
+    program = (
+        "import os, sys, pathlib\n"
+        "from marsyard.campaigns.store.lock import replace_file, partial_suffix\n"
+        "folder = pathlib.Path(sys.argv[1])\n"
+        "(folder / 'cases' / '3' / ('.x' + partial_suffix())).mkdir(parents=True)\n"
+        "with replace_file(folder / 'cases.parquet') as partial:\n"
+        "    partial.touch()\n"
+        "    os._exit(9)\n"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False)
+    own, foreign = tmp_path / f"own{lock.partial_suffix()}", tmp_path / "x.0123abcd-1.partial"
+    own.touch()
+    foreign.touch()
+    assert len([*tmp_path.rglob("*.partial")]) == 4
+    with folder_lock(tmp_path):
+        pass
+    assert {*tmp_path.rglob("*.partial")} == {own, foreign}
+
+
+def test_failed_writing_leaves_no_temporary_file(tmp_path: Path) -> None:
+    with pytest.raises(TypeError):
+        record.write(tmp_path, {"key": object()})
+    assert not list(tmp_path.iterdir())
