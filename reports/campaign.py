@@ -105,7 +105,7 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context["evidence"] = evaluation.evidence
     write_atomic(page, hide_folders(page_environment().get_template("report.html.j2").render(context)))
-    with suppress(StoreError):  # without a key, the dashboard writes the report again
+    with suppress(StoreError, RuntimeError):  # without a key or a home folder, the dashboard writes the report again
         sign_report(directory, run.directory)
     return page
 
@@ -123,7 +123,7 @@ def is_own_report(directory: Path, campaign: Path) -> bool:
     try:
         signature = (directory / SIGNATURE_FILE).read_bytes()
         return hmac.compare_digest(signature, _compute_signature(directory, campaign).encode())
-    except (OSError, StoreError):
+    except (OSError, StoreError, RuntimeError):
         return False
 
 
