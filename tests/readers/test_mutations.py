@@ -48,7 +48,7 @@ from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.sim.camera import CameraFileError, read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
-from marsyard.sim.terrain.imported import RealTerrain, TerrainFileError, read_rasters
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 from tests.scenarios.measured.folders import write_velocity_folder
 from tests.scenarios.test_terrain_files import write_tif
 from tests.sim.camera.test_calibrations import KALIBR, OPENCV
