@@ -4,6 +4,7 @@
 - body: fixed to the vehicle. With the identity attitude its axes are those of the world: x east ("forward"), y north
   ("left"), z up. A descent camera looks along -z.
 - site: the frame of rover operations (x north, y east, z down), used only when files are read or written.
+- Mars-fixed (MCMF): origin in the centre of Mars, x on the prime meridian, z north; only when files are read.
 
 Transforms are SciPy's `RigidTransform` and `Rotation`. Their names contain the target and the source frame:
 ``world_from_body.apply(points_body)`` gives ``points_world``. Names of quaternion arrays contain the component order
@@ -18,6 +19,32 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 #: Rotation from world axes (east, north, up) to site axes (north, east, down); it is equal to its inverse.
 SITE_FROM_WORLD = Rotation.from_matrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
+
+#: Equatorial and polar radius of Mars, metres (Archinal et al. 2018, table 4).
+MARS_RADII_M = (3_396_190.0, 3_376_200.0)
+
+
+def world_from_mars_fixed(origin_m: Float[np.ndarray, "3"]) -> RigidTransform:
+    """Return the transform from the Mars-fixed frame to the world (east, north, up) with this origin, metres.
+
+    Up is the normal of the reference ellipsoid; its latitude is Bowring's (1976), exact to 1e-9 rad up to 10 km height.
+    Raises ValueError if the origin is not within 10 % of the radius of Mars, for example in kilometres.
+    """
+    equatorial, polar = MARS_RADII_M
+    if not 0.9 * polar < float(np.linalg.norm(origin_m)) < 1.1 * equatorial:
+        raise ValueError(f"the position {origin_m.tolist()} m is not near the surface of Mars")
+    x, y, z = origin_m.tolist()
+    distance = np.hypot(x, y)
+    reduced = np.arctan2(z * equatorial, distance * polar)
+    squared = equatorial**2 - polar**2
+    latitude = np.arctan2(
+        z + squared / polar * np.sin(reduced) ** 3, distance - squared / equatorial * np.cos(reduced) ** 3
+    )
+    longitude = np.arctan2(y, x)
+    up = np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    axes = np.stack([east, np.cross(up, east), up])
+    return rigid_from_axes(axes, -axes @ origin_m)
 
 
 def rigid(rotation: Rotation, translation: Float[np.ndarray, "3"]) -> RigidTransform:

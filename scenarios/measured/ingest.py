@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt16
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.descent.parameters import binned_size_for
@@ -33,9 +33,18 @@ from marsyard.scenarios.measured.layout import (
 from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import format_problems
-from marsyard.sim.camera import CameraModel, mount_looking_down, read_cameras, read_pds3_product
+from marsyard.sim.camera import (
+    CameraModel,
+    Frame,
+    FramedCamera,
+    Pds3Product,
+    mount_looking_down,
+    read_framed_cameras,
+    read_pds3_product,
+)
+from marsyard.sim.camera.label_frames import MARS_FIXED
 from marsyard.sim.camera.pds import is_pds3
-from marsyard.sim.frames import SITE_FROM_WORLD
+from marsyard.sim.frames import SITE_FROM_WORLD, compose, rigid, world_from_mars_fixed
 
 #: Columns of a position.
 _POSITION = ("x_m", "y_m", "z_m")
@@ -132,7 +141,11 @@ def infer_summed_rows(camera: CameraModel) -> int:
 
 @dataclass(frozen=True)
 class _RecordedImage:
-    """An image as read, with its pose in the world axes of Marsyard."""
+    """An image as read, with its pose in the world axes of Marsyard.
+
+    - frame: frame of the pose in the image's label; None for a pose from the table
+    - world_from_frame: transform from the label's frame
+    """
 
     row: ImageRow
     counts: UInt16[np.ndarray, "rows columns"]
@@ -140,6 +153,8 @@ class _RecordedImage:
     time_s: float
     attitude: Rotation
     position_m: Float64[np.ndarray, "3"] | None
+    frame: Frame | None = None
+    world_from_frame: RigidTransform | None = None
 
 
 @dataclass
@@ -154,7 +169,9 @@ class _FolderReader:
 
     def store_case(self, number: int, name: str, rows: Sequence[ImageRow]) -> store.StoredCase:
         """Read and check the rows of a case, and write its images."""
-        images = [self._read_image(row) for row in rows]
+        images: list[_RecordedImage] = []
+        for row in rows:
+            images.append(self._read_image(row, images[0] if images else None))
         for earlier, later in itertools.pairwise(images):
             if later.time_s <= earlier.time_s:
                 raise later.row.error(f"time goes from {earlier.time_s:g} to {later.time_s:g} s; it must increase")
@@ -181,20 +198,29 @@ class _FolderReader:
             raise rows[0].error(f"case '{name}': some images have a position and some have none")
         return store.StoredCase(name=name, images=tuple(stored_images), truth=truth, **measurements)
 
-    def _read_image(self, row: ImageRow) -> _RecordedImage:
-        """Read a row's image and its camera in the body frame; a PDS3 label supplies missing values of the row."""
+    def _read_image(self, row: ImageRow, first: _RecordedImage | None) -> _RecordedImage:
+        """Read a row's image and its camera in the body frame; a PDS3 label supplies missing values of the row.
+
+        `first` is the case's first image, whose world is that of all images; None for itself.
+        """
         path, table = self.source / row.texts["file"], self.file.camera
         is_product = is_pds3(read_header(path))
         camera_name = row.texts.get("camera", table.file)
         if camera_name is None and not is_product:
             raise row.error(f"no camera: the column camera and camera.file of {INGEST_FILE} are both empty")
         camera_file = path if camera_name is None else self.source / camera_name
-        cameras = read_cameras(str(camera_file), subframe_folded_in=table.subframe_folded_in)
+        cameras = read_framed_cameras(str(camera_file), subframe_folded_in=table.subframe_folded_in)
         if table.number >= len(cameras):
             raise row.error(f"{camera_file}: contains {len(cameras)} cameras; camera.number is {table.number}")
-        camera, rotation = cameras[table.number], row.rotation()
+        framed, rotation = cameras[table.number], row.rotation()
+        camera = framed.camera
         if not table.pose_in_file and rotation is not None:  # the row's attitude is that of a camera looking down
             camera = mount_looking_down(camera)
+        elif not framed.frame.is_vehicle and (rotation is not None or camera_name is not None):
+            raise row.error(
+                f"{camera_file}: the camera model is in the frame {framed.frame}, without the transform to the rover's "
+                "frame; allowed: a model in the rover's frame"
+            )
         product = read_pds3_product(path) if is_product else None
         counts = read_counts(path, camera.size) if product is None else product.counts
         max_count = (1 << self.file.detector.bits) - 1
@@ -202,13 +228,21 @@ class _FolderReader:
             raise row.error(
                 f"{path}: has counts up to {counts.max()}; detector.bits = {self.file.detector.bits} allows {max_count}"
             )
+        frame, world_from_frame = None, None
         if rotation is not None:
             attitude, position = self._body_pose(row, rotation, row.vector(*_POSITION))
-        elif product is None or product.site_from_rover is None:
-            raise row.error("qx to qw are empty, and no label contains them")
-        else:  # the label's body is the rover
-            world, pose = SITE_FROM_WORLD.inv(), product.site_from_rover
-            attitude, position = world * pose.rotation, np.asarray(world.apply(pose.translation))
+        else:
+            camera, frame, frame_from_body = _label_pose(row, framed, product)
+            world_from_frame = None if first is None else first.world_from_frame
+            if world_from_frame is None:
+                world_from_frame = _world_from(row, frame, frame_from_body)
+            world_from_body = compose(world_from_frame, frame_from_body)
+            attitude, position = world_from_body.rotation, np.asarray(world_from_body.translation)
+        if first is not None and not _is_same_world(frame, first.frame):
+            raise row.error(
+                f"the pose is in {_describe(frame)}, that of the case's first image in {_describe(first.frame)}; "
+                "allowed: one frame in a case"
+            )
         up = float(attitude.apply(camera.boresight())[2])
         if self.file.task in (VELOCITY, LANDING) and up >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(up, -1.0, 1.0)))
@@ -219,7 +253,7 @@ class _FolderReader:
         time_s = row.numbers.get("time_s", None if product is None else product.time_s)
         if time_s is None:
             raise row.error("time_s is empty, and no label contains it")
-        return _RecordedImage(row, counts, camera, time_s, attitude, position)
+        return _RecordedImage(row, counts, camera, time_s, attitude, position, frame, world_from_frame)
 
     def _body_pose(
         self, row: ImageRow, rotation: Rotation, position: Float64[np.ndarray, "n"] | None
@@ -334,6 +368,44 @@ class _FolderReader:
 def _to_vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
     x, y, z = values.tolist()
     return x, y, z
+
+
+def _label_pose(
+    row: ImageRow, framed: FramedCamera, product: Pds3Product | None
+) -> tuple[CameraModel, Frame, RigidTransform]:
+    """Return the camera in the body's frame, and the body's pose in the frame that the label names.
+
+    The body is the rover or, for a model in a frame that the label does not connect to the rover, the camera's centre
+    with the axes of that frame.
+    """
+    camera = framed.camera
+    if not framed.frame.is_vehicle:
+        frame_from_body = rigid(Rotation.identity(), camera.c)
+        return camera.transform(frame_from_body.inv()), framed.frame, frame_from_body
+    if product is None or product.pose is None:
+        raise row.error("qx to qw are empty, and no label contains them")
+    return camera, *product.pose
+
+
+def _world_from(row: ImageRow, frame: Frame, frame_from_body: RigidTransform) -> RigidTransform:
+    """Return the transform to world axes: from a site, or from the Mars-fixed frame with the origin at the body."""
+    if frame.name != MARS_FIXED:
+        return rigid(SITE_FROM_WORLD.inv(), np.zeros(3))
+    try:
+        return world_from_mars_fixed(np.asarray(frame_from_body.translation))
+    except ValueError as error:
+        raise row.error(f"the label's pose in {frame}: {error}; allowed: metres from the centre of Mars") from error
+
+
+def _is_same_world(frame: Frame | None, first: Frame | None) -> bool:
+    """Return whether positions in both frames have the same origin; that of the table (None) can be a site's."""
+    if frame is None or first is None:
+        return MARS_FIXED not in [known.name for known in (frame, first) if known is not None]
+    return frame.matches(first)
+
+
+def _describe(frame: Frame | None) -> str:
+    return "the table's axes" if frame is None else f"the label's frame {frame}"
 
 
 def _to_quaternion(rotation: Rotation) -> store.Quaternion:

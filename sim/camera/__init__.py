@@ -14,9 +14,19 @@ from marsyard.sim.camera.calibrations import (
     from_opencv_fisheye,
     read_calibrations,
 )
+from marsyard.sim.camera.label_frames import Frame, FramedCamera
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
-from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product, read_pds4
-from marsyard.sim.camera.text_files import BODY_FRAME, HEAD_FRAME, read_cahvor, read_camera, read_cameras, write_cahvor
+from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product
+from marsyard.sim.camera.pds4 import read_pds4
+from marsyard.sim.camera.text_files import (
+    BODY_FRAME,
+    HEAD_FRAME,
+    read_cahvor,
+    read_camera,
+    read_cameras,
+    read_framed_cameras,
+    write_cahvor,
+)
 
 __all__ = [
     "BODY_FRAME",
@@ -27,6 +37,8 @@ __all__ = [
     "Calibration",
     "CameraFileError",
     "CameraModel",
+    "Frame",
+    "FramedCamera",
     "Pds3Product",
     "Residual",
     "from_opencv",
@@ -36,6 +48,7 @@ __all__ = [
     "read_calibrations",
     "read_camera",
     "read_cameras",
+    "read_framed_cameras",
     "read_pds3",
     "read_pds3_product",
     "read_pds4",

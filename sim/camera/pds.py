@@ -1,13 +1,10 @@
-"""Readers of PDS3 and PDS4 labels: camera models; for PDS3 products also the image and the rover's pose.
+"""Reader of PDS3 labels and products: camera models, image and the rover's pose.
 
-PDS3: each group GEOMETRIC_CAMERA_MODEL (Curiosity: GEOMETRIC_CAMERA_MODEL_PARMS) contains MODEL_TYPE, the letters of
-the components (MODEL_COMPONENT_ID) and the components, in the frame named by REFERENCE_COORD_SYSTEM_NAME (a rover's
-frame, metres: x forward, y right, z down). The vectors are returned in that frame. The image's size is that of the
-label's IMAGE object. Labels are attached to the product or detached; Curiosity's begin with ODL_VERSION_ID.
-
-PDS4: the class `geom:Camera_Model_Parameters` of the geometry dictionary. Vectors are returned in the frame named by
-the label (`Coordinate_Space_Reference`). The image's size is that of the label's image array. Prefixes and versions
-of namespaces are ignored.
+Each group GEOMETRIC_CAMERA_MODEL (Curiosity: GEOMETRIC_CAMERA_MODEL_PARMS) contains MODEL_TYPE, the letters of the
+components (MODEL_COMPONENT_ID) and the components, in the frame named by REFERENCE_COORD_SYSTEM_NAME (by default the
+rover's frame, metres: x forward, y right, z down). Groups such as ROVER_COORDINATE_SYSTEM define the transforms between
+frames (`marsyard.sim.camera.label_frames`). The image's size is that of the label's IMAGE object. Labels are attached
+to the product or detached; Curiosity's begin with ODL_VERSION_ID.
 """
 
 from __future__ import annotations
@@ -18,16 +15,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import UInt16
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.calibrations import MAX_BYTES, MODELS, Source, create_camera, linearity_of_type
+from marsyard.sim.camera.label_frames import (
+    ROVER_FRAME,
+    SITE,
+    CoordinateSystem,
+    Frame,
+    FramedCamera,
+    find_pose,
+    resolve_camera,
+    transform_from_label,
+)
 from marsyard.sim.files import check_regular
-from marsyard.sim.frames import rigid
 
 #: PDS3: group of a camera model, and its two names.
 _CAMERA_GROUP = "GEOMETRIC_CAMERA_MODEL"
@@ -38,44 +43,33 @@ _FIRST_BYTES = 1 << 16
 _START = re.compile(rb"^\s*(?:PDS|ODL)_VERSION_ID\s*=", re.MULTILINE)
 #: Number of bytes in which the start of a label is searched.
 _START_BYTES = 4096
-_END = re.compile(rb"^END\s*$", re.MULTILINE)
+#: The label's last line: END alone, before a character that no label contains, or before padding; and END as the last
+#: bytes before the image.
+_END = re.compile(rb"^[ \t]*END(?=[ \t]*(?:[\r\n]|[^\x20-\x7e\t])| {8})", re.MULTILINE)
+_END_OF_HEAD = re.compile(rb"^[ \t]*END\s*\Z", re.MULTILINE)
 #: Units of C and E that are metres; without a unit, metres are assumed.
 _PDS3_METRES = ("METER", "METERS", "METRE", "METRES", "M", "N/A")
-#: Names of the group with the rover's pose; the second is Curiosity's.
-_POSE_GROUPS = ("ROVER_COORDINATE_SYSTEM", "ROVER_COORDINATE_SYSTEM_PARMS")
-#: The ^IMAGE line with one of `9`, `20481 <BYTES>`, `("A.IMG", 9)`, `("A.IMG", 20481 <BYTES>)`, `"A.IMG"`: the image's
-#: first record or byte (counted from 1), and its file. Groups: `file...` with both, `file_only`, `position`.
+#: Groups that define frames, and the frames to which their definitions refer by default; Curiosity's end in _PARMS.
+_FRAME_GROUPS = {
+    f"{name}_COORDINATE_SYSTEM{end}": (name, reference)
+    for name, reference in (("ROVER", SITE), ("LANDER", SITE), ("SITE", SITE), ("LOCAL_LEVEL", SITE))
+    for end in ("", "_PARMS")
+}
+#: Values of numbers that are not known.
+_UNKNOWN = ("UNK", "N/A", "NULL")
+#: The pointer ^IMAGE, on one line or several, with one of `9`, `20481 <BYTES>`, `"A.IMG"`, `("A.IMG")`, `("A.IMG", 9)`,
+#: `("A.IMG", 20481 <BYTES>)`: the image's file, and its first record or byte (counted from 1).
 _POINTER = re.compile(
-    r"^[ \t]*\^IMAGE[ \t]*=[ \t]*"
-    r"(?:\([ \t]*\"(?P<file>[^\"\n]+)\"[ \t]*,[ \t]*(?P<file_position>\d+)[ \t]*(?P<file_in_bytes><BYTES>)?[ \t]*\)"
-    r"|\"(?P<file_only>[^\"\n]+)\"|(?P<position>\d+)[ \t]*(?P<in_bytes><BYTES>)?)[ \t]*\r?$",
-    re.MULTILINE,
+    r"^[ \t]*\^IMAGE\s*=\s*(?P<list>\()?\s*(?:[\"'](?P<file>[^\"'\n]+)[\"']\s*)?(?(file)(?:,\s*)?)"
+    r"(?:(?P<position>\d+)\s*(?P<in_bytes><\s*BYTES?\s*>)?\s*)?(?(list)\))[ \t]*(?:/\*|\r?$)",
+    re.MULTILINE | re.IGNORECASE,
 )
 _RECORD = re.compile(r"^[ \t]*RECORD_BYTES[ \t]*=[ \t]*(\d+)", re.MULTILINE)
 _CLOCK = re.compile(r"^[ \t]*SPACECRAFT_CLOCK_(START|STOP)_COUNT[ \t]*=[ \t]*\"?(\d+\.?\d*)\"?[ \t]*\r?$", re.MULTILINE)
 #: Byte orders of integer samples by the first word of SAMPLE_TYPE; for 8-bit samples the order has no effect.
 _BYTE_ORDERS = {"MSB": ">", "LSB": "<", "PC": "<", "SUN": ">", "UNSIGNED": ">", "INTEGER": ">"}
-#: Tolerance on the length of a quaternion.
-_QUATERNION_TOLERANCE = 1e-3
 #: End of the message for images that are refused by default.
-_SUBFRAME = "of a part of the detector or of averaged pixels"
-
-#: PDS4: start of an XML file, and names in the geometry dictionary.
-_XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
-_PARAMETERS = "Camera_Model_Parameters"
-_POSITION, _DIRECTION, _PIXEL = (tuple(f"{axis}_{kind}" for axis in "xyz") for kind in ("position", "unit", "pixel"))
-_TERMS = ("c0", "c1", "c2")
-#: Element and components of each vector of a model.
-_VECTORS = {
-    "C": ("Vector_Center", _POSITION),
-    "A": ("Vector_Axis", _DIRECTION),
-    "H": ("Vector_Horizontal", _PIXEL),
-    "V": ("Vector_Vertical", _PIXEL),
-    "O": ("Vector_Optical", _DIRECTION),
-    "R": ("Radial_Terms", _TERMS),
-    "E": ("Entrance_Terms", _TERMS),
-}
-_PDS4_METRES = (None, "m", "meter", "metre")
+SUBFRAME = "of a part of the detector or of averaged pixels"
 
 
 @dataclass(frozen=True)
@@ -83,13 +77,19 @@ class Pds3Product:
     """An image of a rover with the rover's pose and the time from the image's label.
 
     - counts: the stored numbers of the pixels, DN
-    - site_from_rover: the rover's pose in the site frame (x north, y east, z down), metres; None if not in the label
+    - pose: frame of reference (a site's or the Mars-fixed frame) and the rover's pose in it, metres; None if not in the
+      label
     - time_s: spacecraft clock at the middle of the exposure; None if not in the label
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
-    site_from_rover: RigidTransform | None
+    pose: tuple[Frame, RigidTransform] | None
     time_s: float | None
+
+    @property
+    def site_from_rover(self) -> RigidTransform | None:
+        """The rover's pose in the site frame (x north, y east, z down), metres; None if unknown."""
+        return self.pose[1] if self.pose is not None and self.pose[0].name == SITE else None
 
 
 def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
@@ -97,11 +97,23 @@ def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
 
     The standard does not define whether the model of a subframe, or of an image with averaged pixels, describes the
     stored image or the whole detector. Such labels are refused by default. With `subframe_folded_in` they are accepted,
-    and the vectors are assumed to describe the stored image. Raises CameraFileError if the label cannot be read or has
-    no camera model, or if a model is incomplete or wrong. The message contains file, field and allowed values.
+    and the vectors are assumed to describe the stored image. Models are returned in the frame that `read_pds3_framed`
+    chooses. Raises CameraFileError if the label cannot be read or has no camera model, or if a model is incomplete or
+    wrong. The message contains file, field and allowed values.
+    """
+    return tuple(framed.camera for framed in read_pds3_framed(path, subframe_folded_in=subframe_folded_in))
+
+
+def read_pds3_framed(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[FramedCamera, ...]:
+    """Read every camera model as `read_pds3` does, and the frames in which they are returned.
+
+    This is the rover's frame if the label contains the transform to it, else the site's or the Mars-fixed frame. Raises
+    CameraFileError also if the label contains none of these transforms.
     """
     source = Source(str(path))
-    label = _parse_blocks(_read_label(source), (*_CAMERA_GROUPS, "IMAGE", "INSTRUMENT_STATE_PARMS"), source)
+    label = _parse_blocks(
+        _read_label(source), (*_CAMERA_GROUPS, *_FRAME_GROUPS, "IMAGE", "INSTRUMENT_STATE_PARMS"), source
+    )
     groups = [group for name, group in label.items() if name in _CAMERA_GROUPS]
     if not groups:
         raise source.error(_CAMERA_GROUP, "missing or not closed", "a label with at least one such group")
@@ -114,8 +126,15 @@ def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
     for field, quantity in fields.items():
         value = getattr(quantity, "value", quantity)  # pvl parses 2 <pixel> to an object with value and unit
         if not subframe_folded_in and isinstance(value, int) and value != 1:
-            raise source.error(field, f"{value}: {_SUBFRAME}", "1, or subframe_folded_in=True")
-    return tuple(_create_pds3_camera(group, size, source) for group in groups)
+            raise source.error(field, f"{value}: {SUBFRAME}", "1, or subframe_folded_in=True")
+    systems = _read_systems(label, source)
+    field = f"{_CAMERA_GROUP}.REFERENCE_COORD_SYSTEM_NAME"
+    return tuple(
+        resolve_camera(
+            _create_pds3_camera(group, size, source), _read_frame(group, "REFERENCE"), systems, field, source
+        )
+        for group in groups
+    )
 
 
 def read_pds3_product(path: str | Path) -> Pds3Product:
@@ -126,27 +145,52 @@ def read_pds3_product(path: str | Path) -> Pds3Product:
     """
     source = Source(str(path))
     text = _read_label(source)
-    label = _parse_blocks(text, ("IMAGE", *_POSE_GROUPS), source)
+    label = _parse_blocks(text, ("IMAGE", *_FRAME_GROUPS), source)
     size = _read_size(label, source)
     counts = _read_counts(text, label["IMAGE"], size, source)
     # middle of the exposure: mean of the start and stop counts
     times = [float(match[2]) for match in _CLOCK.finditer(text)]
     time_s = float(np.mean(times)) if times else None
-    name = next((name for name in _POSE_GROUPS if name in label), None)
-    if name is None:
-        return Pds3Product(counts, None, time_s)
-    vectors = []
-    for field, length in (("ORIGIN_OFFSET_VECTOR", 3), ("ORIGIN_ROTATION_QUATERNION", 4)):
-        value = label[name].get(field) if isinstance(label[name], Mapping) else None
-        is_numeric = isinstance(value, list) and all(isinstance(number, int | float) for number in value)
-        if not is_numeric or len(value) != length:  # type: ignore[arg-type]  # numeric values are a list
-            raise source.error(f"{name}.{field}", f"{value!r}", f"{length} numbers")
-        vectors.append(np.array(value, dtype=np.float64))
-    offset, quaternion = vectors
-    if abs(float(np.linalg.norm(quaternion)) - 1.0) > _QUATERNION_TOLERANCE:
-        raise source.error(f"{name}.ORIGIN_ROTATION_QUATERNION", "is not of length 1", "a unit quaternion")
-    # the label's quaternion is (w, x, y, z), SciPy's is (x, y, z, w)
-    return Pds3Product(counts, rigid(Rotation.from_quat(quaternion[[1, 2, 3, 0]]), offset), time_s)
+    systems = _read_systems(label, source)
+    vehicle = next((system.frame for system in systems if system.frame.is_vehicle), None)
+    pose = None if vehicle is None else find_pose(vehicle, systems)
+    if vehicle is not None and pose is None:
+        field = f"{vehicle.name}_COORDINATE_SYSTEM.REFERENCE_COORD_SYSTEM_NAME"
+        raise source.error(field, "is a frame without known pose", "SITE_FRAME or MCMF_FRAME")
+    return Pds3Product(counts, pose, time_s)
+
+
+def _read_frame(group: Any, kind: str, default: str = ROVER_FRAME.name) -> Frame:
+    """Read the frame of a group: its own (kind COORDINATE) or the one that it refers to (kind REFERENCE)."""
+    prefix = "COORDINATE_SYSTEM" if kind == "COORDINATE" else "REFERENCE_COORD_SYSTEM"
+    name, indices = group.get(f"{prefix}_NAME"), group.get(f"{prefix}_INDEX", [])
+    indices = indices if isinstance(indices, list) else [indices]
+    is_known = all(isinstance(index, int) for index in indices)
+    return Frame.of(name if isinstance(name, str) else default, indices if is_known else ())
+
+
+def _read_systems(label: Any, source: Source) -> list[CoordinateSystem]:
+    """Read the definitions of frames, except those whose values are unknown. Raises CameraFileError."""
+    systems = []
+    for name, group in label.items():
+        if name not in _FRAME_GROUPS or not isinstance(group, Mapping):
+            continue
+        vectors: list[list[float]] = []
+        for field, length in (("ORIGIN_OFFSET_VECTOR", 3), ("ORIGIN_ROTATION_QUATERNION", 4)):
+            value = group.get(field)
+            items: list[Any] = value if isinstance(value, list) else [value]
+            if any(isinstance(item, str) and item.upper() in _UNKNOWN for item in items):
+                break
+            if len(items) != length or not all(isinstance(item, int | float) for item in items):
+                raise source.error(f"{name}.{field}", f"{value!r}", f"{length} numbers")
+            vectors.append(items)
+        else:
+            offset, quaternion = vectors
+            transform = transform_from_label(offset, quaternion, f"{name}.ORIGIN_ROTATION_QUATERNION", source)
+            own, reference = _FRAME_GROUPS[name]
+            frames = _read_frame(group, "COORDINATE", own), _read_frame(group, "REFERENCE", reference)
+            systems.append(CoordinateSystem(*frames, transform))
+    return systems
 
 
 def is_pds3(head: bytes) -> bool:
@@ -160,10 +204,28 @@ def _read_label(source: Source) -> str:
         head = source.read_head(count)
         if not is_pds3(head):
             raise source.error("PDS_VERSION_ID", "missing at the start of the file", "a PDS3 label or product")
-        end = _END.search(head)
+        end = _END.search(head) or (_END_OF_HEAD.search(head) if len(head) < count else None)
+        text = head[: len(head) if end is None else end.end()].decode("latin-1")
+        if end is None:  # the image can follow END without a line break
+            pointer = _POINTER.search(text)
+            if pointer is None or pointer["file"] or not (pointer["in_bytes"] or _RECORD.search(text)):
+                continue
+            end = _END_OF_HEAD.search(head[: _image_offset(pointer, text, source)])
+            text = text[: 0 if end is None else end.end()]
         if end is not None:
-            return head[: end.end()].decode("latin-1")
+            return text
     raise source.error("END", f"missing in the first {MAX_BYTES} bytes", "a label that ends with a line END")
+
+
+def _image_offset(pointer: re.Match[str], text: str, source: Source) -> int:
+    """Return the number of bytes before the image. Raises CameraFileError if the length of a record is missing."""
+    offset = int(pointer["position"] or 1) - 1
+    if offset > 0 and not pointer["in_bytes"]:
+        record = _RECORD.search(text)
+        if record is None:
+            raise source.error("RECORD_BYTES", "missing", "the number of bytes of a record")
+        offset *= int(record[1])
+    return offset
 
 
 def _parse_blocks(text: str, names: Sequence[str], source: Source) -> Any:
@@ -227,27 +289,33 @@ def _create_pds3_camera(group: Any, size: tuple[int, int], source: Source) -> Ca
         if letter in ("C", "E") and str(unit).upper() not in _PDS3_METRES:
             raise source.error(f"{_CAMERA_GROUP}.MODEL_COMPONENT_UNIT", f"{unit!r} for {letter}", "METER")
     vectors: dict[str, list[float]] = {}
-    lens: dict[str, float] = {}
-    for letter in (*name, "T", "P") if name == "CAHVORE" else name:
+    for letter in name:
         if letter not in letters:
-            if letter in name:
-                raise source.error(id_field, f"has no {letter}", "every letter of the model")
-            continue
+            raise source.error(id_field, f"has no {letter}", "every letter of the model")
         keyword = f"MODEL_COMPONENT_{letters.index(letter) + 1}"
         value: Any = group.get(keyword)
-        field = f"{_CAMERA_GROUP}.{keyword} ({letter})"
-        if letter in name:
-            if not isinstance(value, list) or len(value) != 3 or not all(is_number(number) for number in value):
-                raise source.error(field, _describe_fault(value), "three finite numbers")
-            vectors[letter] = [float(number) for number in value]
-        elif not is_number(value):
-            raise source.error(field, _describe_fault(value), "a finite number")
-        else:
-            lens[letter] = float(value)
+        if not isinstance(value, list) or len(value) != 3 or not all(is_number(number) for number in value):
+            raise source.error(f"{_CAMERA_GROUP}.{keyword} ({letter})", _describe_fault(value), "three finite numbers")
+        vectors[letter] = [float(number) for number in value]
     if name != "CAHVORE":
         return create_camera(name, vectors, size, None, source)
-    linearity = linearity_of_type(lens.get("T"), lens.get("P"), f"{id_field} T, P", source)
-    return create_camera(name, vectors, size, linearity, source)
+
+    def read_lens(letter: str, default_number: int) -> float | None:
+        """Read the type T or the parameter P; labels of Mars 2020's landing camera name no letters for them."""
+        number = letters.index(letter) + 1 if letter in letters else default_number
+        value: Any = group.get(f"MODEL_COMPONENT_{number}")
+        if value is None and letter not in letters:
+            return None
+        if not is_number(value):
+            field = f"{_CAMERA_GROUP}.MODEL_COMPONENT_{number} ({letter})"
+            raise source.error(field, _describe_fault(value), "a finite number")
+        return float(value)
+
+    lens_type = read_lens("T", 8)
+    parameter = read_lens("P", 9) if lens_type == 3 else None
+    return create_camera(
+        name, vectors, size, linearity_of_type(lens_type, parameter, f"{id_field} T, P", source), source
+    )
 
 
 def _describe_fault(value: Any) -> str:
@@ -257,9 +325,9 @@ def _describe_fault(value: Any) -> str:
 def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -> UInt16[np.ndarray, "rows columns"]:
     """Read the image's samples at the label's pointer ^IMAGE. Raises CameraFileError."""
     pointer = _POINTER.search(text)
-    if pointer is None:
+    if pointer is None or not (pointer["file"] or pointer["position"]):
         raise source.error("^IMAGE", "missing or not readable", 'a record, bytes, or ("FILE", record)')
-    name = pointer["file"] or pointer["file_only"]
+    name = pointer["file"]
     path = Path(source.path)
     if name is not None:
         if Path(name).name != name:
@@ -267,12 +335,7 @@ def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -
         # some archives write the file name in lower or upper case
         paths = [path.parent / name, path.parent / name.lower(), path.parent / name.upper()]
         path = next((path for path in paths if path.exists()), paths[0])
-    offset = int(pointer["file_position"] or pointer["position"] or 1) - 1
-    if offset > 0 and not (pointer["file_in_bytes"] or pointer["in_bytes"]):
-        record = _RECORD.search(text)
-        if record is None:
-            raise source.error("RECORD_BYTES", "missing", "the number of bytes of a record")
-        offset *= int(record[1])
+    offset = _image_offset(pointer, text, source)
     bits, type_name = image.get("SAMPLE_BITS"), str(image.get("SAMPLE_TYPE", ""))
     order = _BYTE_ORDERS.get(type_name.split("_")[0])
     if bits not in (8, 16) or order is None or not type_name.endswith("INTEGER"):
@@ -298,110 +361,3 @@ def _read_counts(text: str, image: Any, size: tuple[int, int], source: Source) -
     if is_signed and counts.min() < 0:
         raise source.error("IMAGE", f"contains counts down to {counts.min()}", "counts from 0")
     return counts.astype(np.uint16)
-
-
-def is_xml(head: bytes) -> bool:
-    """Return whether the first bytes of a file are XML."""
-    return _XML_START.match(head) is not None
-
-
-def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
-    """Read every camera model of a PDS4 label (.xml or .lblx), in order.
-
-    Raises CameraFileError as `read_pds3` does, also if ground processing cropped or averaged the image. With
-    `subframe_folded_in` such images are accepted, and the vectors are assumed to describe the stored image, as in the
-    labels of Mars 2020. Images that the camera itself cropped or averaged on command are always accepted.
-    """
-    source = Source(str(path))
-    text = source.read_text()
-    if "<!ENTITY" in text:  # labels do not need entities, and nested entities can fill the memory
-        raise source.error("label", "declares entities", "a PDS4 label, which has none")
-    try:
-        root = ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise source.error("label", f"cannot be parsed ({error})", "a PDS4 label, which is XML") from error
-    models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]
-    if not models:
-        raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class with a model_type")
-    arrays = _find_elements(root, "Array_2D_Image", "Array_3D_Image")
-    if not arrays:
-        raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
-    extents = {}
-    for axis in (element for element in arrays[0] if _local_name(element) == "Axis_Array"):
-        axis_name, count = _element_text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
-        if axis_name in ("Line", "Sample") and count is not None:
-            if not (_element_text(count).isdecimal() and int(_element_text(count)) > 0):
-                raise source.error("Axis_Array.elements", f"{_element_text(count)!r}", "a positive integer")
-            extents[axis_name] = int(_element_text(count))
-    if set(extents) != {"Line", "Sample"}:
-        raise source.error("Axis_Array", f"names {sorted(extents)}", "the axes Line and Sample")
-    size = extents["Sample"], extents["Line"]
-    parts = [part for imaging in _find_elements(root, "Imaging") for part in imaging]
-    for part in (
-        part for part in parts if _local_name(part) in ("Subframe", "Downsampling") and not subframe_folded_in
-    ):
-        for field in _find_elements(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
-            if _element_text(field) not in ("", "1"):
-                name = f"{_local_name(part)}.{_local_name(field)}"
-                raise source.error(name, f"{_element_text(field)}: {_SUBFRAME}", "1, or subframe_folded_in = true")
-    return tuple(_create_pds4_camera(element, size, source) for element in models)
-
-
-def _local_name(element: ElementTree.Element) -> str:
-    """Return an element's name without its namespace."""
-    return element.tag.rpartition("}")[2] if isinstance(element.tag, str) else ""
-
-
-def _find_elements(element: ElementTree.Element, *names: str) -> list[ElementTree.Element]:
-    return [descendant for descendant in element.iter() if _local_name(descendant) in names]
-
-
-def _find_child(element: ElementTree.Element, name: str) -> ElementTree.Element | None:
-    return next((child for child in element if _local_name(child) == name), None)
-
-
-def _element_text(element: ElementTree.Element | None) -> str:
-    return "" if element is None else (element.text or "").strip()
-
-
-def _create_pds4_camera(element: ElementTree.Element, size: tuple[int, int], source: Source) -> CameraModel:
-    """Create the camera of a class `Camera_Model_Parameters`. Raises CameraFileError."""
-    name = _element_text(_find_child(element, "model_type"))
-    if name not in MODELS:
-        raise source.error(f"{_PARAMETERS}.model_type", f"{name!r}", ", ".join(MODELS))
-    class_name = f"{name}_Model"
-    model = _find_child(element, class_name)
-    if model is None:
-        raise source.error(f"{_PARAMETERS}.{class_name}", "missing", "the class that belongs to the model_type")
-    vectors: dict[str, list[float]] = {}
-    for letter in name:
-        vector_name, parts = _VECTORS[letter]
-        vector, field = _find_child(model, vector_name), f"{class_name}.{vector_name} ({letter})"
-        if vector is None:
-            raise source.error(field, "missing", "every vector of the model")
-        vectors[letter] = []
-        for part in parts:
-            number = _parse_number(vector, part, f"{field}.{part}", source)
-            if number is None:
-                raise source.error(f"{field}.{part}", "missing", "a finite number")
-            unit = getattr(_find_child(vector, part), "attrib", {}).get("unit")
-            if parts is _POSITION and unit not in _PDS4_METRES:
-                raise source.error(f"{field}.{part}", f"is in {unit!r}", "metres (unit m)")
-            vectors[letter].append(number)
-    if name != "CAHVORE":
-        return create_camera(name, vectors, size, None, source)
-    field = f"{class_name}.cahvore_model_type, cahvore_model_parameter"
-    model_type, parameter = (
-        _parse_number(model, f"cahvore_model_{part}", field, source) for part in ("type", "parameter")
-    )
-    return create_camera(name, vectors, size, linearity_of_type(model_type, parameter, field, source), source)
-
-
-def _parse_number(element: ElementTree.Element, name: str, field: str, source: Source) -> float | None:
-    child = _find_child(element, name)
-    if child is None:
-        return None
-    try:
-        return float(_element_text(child))
-    except ValueError:
-        raise source.error(field, f"{_element_text(child)!r} is not a number", "a finite number") from None

@@ -20,8 +20,10 @@ from pathlib import Path
 
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.calibrations import Source, create_camera, is_calibration, linearity_of_type, read_calibrations
+from marsyard.sim.camera.label_frames import ROVER_FRAME, FramedCamera
 from marsyard.sim.camera.models import Cahvore
-from marsyard.sim.camera.pds import is_pds3, is_xml, read_pds3, read_pds4
+from marsyard.sim.camera.pds import is_pds3, read_pds3_framed
+from marsyard.sim.camera.pds4 import is_xml, read_pds4_framed
 
 #: Number of leading bytes that identify a format.
 _FORMAT_BYTES = 4096
@@ -52,16 +54,30 @@ def read_cameras(
     - subframe_folded_in: accept PDS labels of subframes and averaged pixels, see `read_pds3`
     - size: (columns, rows) of the image, required for JPL text files without the line Dimensions
 
-    Raises CameraFileError if the file cannot be read or is wrong. The message contains file, field and allowed values.
+    Models of PDS labels are returned in the vehicle's frame if the label contains the transform to it, else in the
+    site's or the Mars-fixed frame; `read_framed_cameras` also returns the frame. Raises CameraFileError if the file
+    cannot be read or is wrong. The message contains file, field and allowed values.
+    """
+    return tuple(
+        framed.camera for framed in read_framed_cameras(path, subframe_folded_in=subframe_folded_in, size=size)
+    )
+
+
+def read_framed_cameras(
+    path: str | Path, *, subframe_folded_in: bool = False, size: tuple[int, int] | None = None
+) -> tuple[FramedCamera, ...]:
+    """Read every camera model as `read_cameras` does, with its frame.
+
+    Files other than PDS labels do not name the frame; their models are assumed to be in the vehicle's frame.
     """
     leading_bytes = Source(str(path)).read_head(_FORMAT_BYTES)
     if is_pds3(leading_bytes):
-        return read_pds3(path, subframe_folded_in=subframe_folded_in)
+        return read_pds3_framed(path, subframe_folded_in=subframe_folded_in)
     if is_xml(leading_bytes):
-        return read_pds4(path, subframe_folded_in=subframe_folded_in)
+        return read_pds4_framed(path, subframe_folded_in=subframe_folded_in)
     if is_calibration(leading_bytes):
-        return tuple(calibration.camera for calibration in read_calibrations(path))
-    return (read_cahvor(path, size=size),)
+        return tuple(FramedCamera(calibration.camera, ROVER_FRAME) for calibration in read_calibrations(path))
+    return (FramedCamera(read_cahvor(path, size=size), ROVER_FRAME),)
 
 
 def read_camera(path: str | Path, *, subframe_folded_in: bool = False) -> CameraModel:

@@ -137,6 +137,45 @@ def test_components_are_assigned_by_letter(tmp_path: Path, hazcam: Cahvore) -> N
     assert read_camera(write_file(tmp_path, text)) == dataclasses.replace(hazcam, size=(1020, 1024))
 
 
+def test_type_and_parameter_need_no_letters(tmp_path: Path, hazcam: Cahvore) -> None:
+    """Labels of Mars 2020's landing camera name C to E; type and parameter are the components 8 and 9."""
+    expected = dataclasses.replace(hazcam, size=(1020, 1024))
+    text = LABEL.replace("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,E)")
+    assert read_camera(write_file(tmp_path, text)) == expected
+    without_parameter = text.replace("  MODEL_COMPONENT_9               = 0.37\n", "")
+    fish_eye = without_parameter.replace("MODEL_COMPONENT_8               = 3.0", "MODEL_COMPONENT_8 = 2")
+    assert read_camera(write_file(tmp_path, fish_eye)) == dataclasses.replace(expected, linearity=0.0)
+    with pytest.raises(CameraFileError, match="type 3 has no parameter"):
+        read_camera(write_file(tmp_path, without_parameter))
+    with pytest.raises(CameraFileError, match="type is missing"):
+        read_camera(write_file(tmp_path, text.replace("MODEL_COMPONENT_8 ", "MODEL_COMPONENT_10 ")))
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [b"", b" " * 20, b" " * 20 + b"binary", b"\0\xff\x80", b" \r", b"\r\n\0binary", b"\t\xe9binary"],
+    ids=["end of file", "padding", "padding and image", "image", "carriage return", "line break", "tab and image"],
+)
+def test_the_end_of_the_label_needs_no_line_break(tmp_path: Path, hazcam: Cahvore, rest: bytes) -> None:
+    path = tmp_path / "camera.img"
+    path.write_bytes(LABEL.rstrip().encode() + rest)
+    assert read_camera(path) == dataclasses.replace(hazcam, size=(1020, 1024))
+
+
+def test_an_image_directly_after_the_end_is_found_by_its_pointer(tmp_path: Path, hazcam: Cahvore) -> None:
+    """The first bytes of the image are letters."""
+    text = LABEL.rstrip().replace("= 3\n", "= 2\nRECORD_BYTES = 00000\n", 1)
+    text = text.replace("00000", f"{len(text):05d}")
+    path = tmp_path / "camera.img"
+    path.write_bytes(text.encode() + b"letters in place of counts")
+    assert read_camera(path) == dataclasses.replace(hazcam, size=(1020, 1024))
+
+
+def test_end_within_a_text_is_not_the_end(tmp_path: Path, hazcam: Cahvore) -> None:
+    text = LABEL.replace("^IMAGE", 'DESCRIPTION = "From START to\nEND of the traverse, an\nEND_OF_FILE."\n^IMAGE')
+    assert read_camera(write_file(tmp_path, text)) == dataclasses.replace(hazcam, size=(1020, 1024))
+
+
 def test_label_with_several_models_needs_a_selection(tmp_path: Path) -> None:
     start, end = LABEL.index("GROUP "), LABEL.index("GROUP                             = INSTRUMENT")
     path = write_file(tmp_path, LABEL[:end] + LABEL[start:])
@@ -164,7 +203,6 @@ LABEL_FAULTS = [
     ("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,Q,T,P)", "MODEL_COMPONENT_ID: has no E"),
     ("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,E,R,P)", "repeats a letter"),
     ("(C,A,H,V,O,R,E,T,P)", "CAHVORE", "a list of letters"),
-    ("(C,A,H,V,O,R,E,T,P)", "(C,A,H,V,O,R,E)", "type is missing"),
     ("(351.362,452.204,353.494)", "(351.362,452.204)", r"MODEL_COMPONENT_3 \(H\): .*three finite numbers"),
     ("(351.362,452.204,353.494)", '(351.362,"N/A",353.494)', r"MODEL_COMPONENT_3 \(H\)"),
     ("(0.703447,-0.005161,0.710729)", "(0.703447,-0.005161,0.810729)", "A: a must be a unit vector"),

@@ -112,6 +112,11 @@ def test_opportunity_images_match_label_statistics(
         ('("made_data.IMG", 101 <BYTES>)', 100),
         ('("MADE_DATA.IMG",1)', 0),
         ('"made_data.IMG"', 0),
+        ('("made_data.IMG")', 0),
+        ("('made_data.IMG')", 0),
+        ('( "made_data.IMG" ,\n      3 )', 1024),
+        ('\n   ("made_data.IMG",\r\n  101 <bytes>)', 100),
+        ('("made_data.IMG", 3) /* the image */', 1024),
     ],
 )
 def test_images_with_detached_label_are_read(tmp_path: Path, pointer: str, offset_bytes: int) -> None:
