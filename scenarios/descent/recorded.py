@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from decimal import Decimal
 from enum import Enum
 from typing import Annotated
 
@@ -53,9 +54,14 @@ class FlightFile(UserFile, RecordedAxes):
     @property
     def start_s(self) -> float:
         """File's time of the first image."""
+        return self.first_image_s if self.first_image_s is not None else float(self._start)
+
+    @property
+    def _start(self) -> Decimal:
+        """File's time of the first image, exact: a large time in floating point would be rounded."""
         if self.first_image_s is not None:
-            return self.first_image_s
-        return float(read_poses(self.file).times_s[0]) + self.lead_s
+            return Decimal(repr(self.first_image_s))
+        return read_poses(self.file).start_s + Decimal(repr(self.lead_s))
 
     def check(self, image_times_s: Sequence[float]) -> None:
         """Raise ValueError if the flight does not cover the images, or its camera looks up or is below the ground."""
@@ -63,7 +69,8 @@ class FlightFile(UserFile, RecordedAxes):
         first, last = motion.span_s
         # tolerance of 1e-9 s for rounding
         if first > -self.lead_s + 1e-9 or last < max(image_times_s) + END_MARGIN_S:
-            begin, end = read_poses(self.file).times_s[[0, -1]]
+            poses = read_poses(self.file)
+            begin, end = (poses.start_s + Decimal(time) for time in poses.times_s[[0, -1]].tolist())
             raise TrajectoryFileError(
                 f"{self.file}: covers {begin:.3f} to {end:.3f} s; images from {self.start_s:.3f} to "
                 f"{self.start_s + max(image_times_s):.3f} s, lead_s {self.lead_s:g} s before and {END_MARGIN_S:g} s "
@@ -87,7 +94,8 @@ class FlightFile(UserFile, RecordedAxes):
         positions = world_from_file.apply(poses.positions_m) + self.lever_arms(attitudes)
         if self.origin is FlightOrigin.LOCATION:
             positions = positions + ground_m
-        return RecordedMotion(poses.times_s - self.start_s, positions, self.body_attitudes(attitudes), gravity_m_s2)
+        times = poses.times_s - float(self._start - poses.start_s)
+        return RecordedMotion(times, positions, self.body_attitudes(attitudes), gravity_m_s2)
 
 
 def check_looks_down(name: str, motion: RecordedMotion, image_times_s: Sequence[float]) -> None:

@@ -106,6 +106,26 @@ def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
     assert state.position_m[2] == pytest.approx(2000.0 - 250.0 - 2.0)
 
 
+@pytest.mark.parametrize("first_image_s", [None, 1750000005.0])
+def test_times_since_1970_are_subtracted_before_rounding(tmp_path: Path, first_image_s: float | None) -> None:
+    """The specific force of a fall without acceleration is that of gravity (3.7 m/s^2), with poses at 400 Hz."""
+    times = np.arange(10_000)
+    positions = np.column_stack([0.0 * times, 0.0 * times, 2200.0 - 0.0025 * 70.0 * times])
+    down = np.tile([1.0, 0.0, 0.0, 0.0], (times.size, 1))
+    frame = pd.DataFrame(np.column_stack([times, positions, down]), columns=["time_ns", *COLUMNS[1:]])
+    frame["time_ns"] = 1_750_000_000_000_000_000 + 2_500_000 * times
+    frame.to_parquet(tmp_path / "flight.parquet")
+    flight = FlightFile.model_validate(
+        {"file": str(tmp_path / "flight.parquet"), "axes": "enu", "first_image_s": first_image_s}
+    )
+    assert flight.start_s == 1750000005.0
+    motion = flight.motion(np.zeros(3), 3.7)
+    assert motion.span_s[0] == -5.0
+    forces = motion.motion(np.linspace(0.0, 15.0, 999)).specific_forces_m_s2
+    # rounding errors of the positions: 2200 m x 2^-53 x 12 / (2.5 ms)^2 = 5e-7 m/s^2
+    assert np.abs(forces - [0.0, 0.0, 3.7]).max() < 1e-5
+
+
 def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
     def expect_error(match: str, file: str, **settings: Any) -> None:
         with pytest.raises(ValidationError, match=match):

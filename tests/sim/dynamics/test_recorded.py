@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ def write_poses(folder: Path, text: str, name: str = "poses.txt") -> Path:
 
 def test_tum_file_is_read(tmp_path: Path) -> None:
     poses = read_poses(write_poses(tmp_path, TUM))
-    assert poses.times_s[0] == 1305031098.6659
+    assert poses.start_s == Decimal("1305031098.6659")
+    assert poses.times_s.tolist() == [0.0, 0.0099, 1.0, 1.0099]
     assert np.allclose(poses.positions_m[1], [1.3543, 0.6306, 1.6360])
     # The file has four digits; the reader normalises the quaternions.
     assert np.allclose(poses.quaternions[0], [0.6132, 0.5962, -0.3311, -0.3986], atol=1e-4)
@@ -54,7 +56,8 @@ def test_tum_file_is_read(tmp_path: Path) -> None:
 
 def test_euroc_ground_truth_is_read(tmp_path: Path) -> None:
     poses = read_poses(write_poses(tmp_path, EUROC, "data.csv"))
-    # The scalar is first in the file and last in Marsyard. The conversion of nanoseconds preserves the steps of 5 ms.
+    # The scalar is first in the file and last in Marsyard. Nanoseconds are subtracted as integers.
+    assert poses.times_s.tolist() == [0.0, 0.004999680, 0.009999872, 0.014999808]
     assert np.allclose(poses.quaternions[0], [-0.153029, -0.827383, -0.082152, 0.534108], atol=1e-5)
     assert np.allclose(np.diff(poses.times_s), 0.005, atol=1e-6)
     motion = RecordedMotion(
@@ -152,6 +155,79 @@ def test_pandas_tables_are_read(tmp_path: Path) -> None:
     # A file is read only once. Different files have different hashes.
     assert read_poses(tmp_path / "poses.csv") is read_poses(tmp_path / "poses.csv")
     assert read_poses(tmp_path / "poses.csv").sha256 != read_poses(tmp_path / "poses.parquet").sha256
+
+
+#: First time of a flight in 2025 (s, ns since 1970), and the time between its poses.
+EPOCH_NS, EPOCH_STEP_NS = 1_750_000_000_123_456_789, 2_500_000
+
+
+def _write_epoch_flight(folder: Path, kind: str) -> Path:
+    """Write 2 s of fall at 80 m/s without acceleration at 400 Hz, with times since 1970 in one of the formats."""
+    nanoseconds = [EPOCH_NS + number * EPOCH_STEP_NS for number in range(800)]
+    seconds = [f"{time // 10**9}.{time % 10**9:09d}" for time in nanoseconds]
+    microseconds = [time // 1000 / 1e6 for time in nanoseconds]
+    positions = np.zeros((800, 3))
+    positions[:, 2] = -80.0 * np.arange(800) * EPOCH_STEP_NS * 1e-9
+    frame = make_table(np.zeros(800), positions, Rotation.identity(800))
+    path = folder / ("poses.parquet" if kind.startswith("parquet") else "poses.csv")
+    match kind.partition(" ")[2]:
+        case "s":
+            frame["time_s"] = seconds
+        case "ns":
+            frame = frame.rename(columns={"time_s": "time_ns"}).assign(time_ns=nanoseconds)
+        case "decimal":
+            frame["time_s"] = [Decimal(text) for text in seconds]
+        case "timestamp":
+            frame["time_s"] = pd.to_datetime(nanoseconds)
+        case "us":
+            frame["time_s"] = microseconds
+        case "us by numpy":
+            frame["time_s"] = [f"{time:.18e}" for time in microseconds]
+        case "rounded":
+            frame["time_s"] = [float(text) for text in seconds]
+        case "rounded by numpy":
+            frame["time_s"] = [f"{float(text):.18e}" for text in seconds]
+    if kind.startswith("parquet"):
+        frame.to_parquet(path)
+    else:
+        is_tum = kind.startswith("tum")
+        frame.to_csv(path, index=False, header=not is_tum, sep=" " if is_tum else ",")
+    return path
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("csv s", "csv ns", "csv us", "csv us by numpy", "tum s", "tum ns", "tum us", "tum us by numpy"),
+        *("parquet ns", "parquet decimal", "parquet timestamp", "parquet us"),
+    ],
+)
+def test_times_since_1970_add_no_acceleration(tmp_path: Path, kind: str) -> None:
+    """Times in floating point are rounded to 0.2 us, an error of several m/s^2; the specific force is that of rest."""
+    poses = read_poses(_write_epoch_flight(tmp_path, kind))
+    resolution_ns = 1000 if kind.split()[1] == "us" else 1
+    assert poses.start_s == Decimal(EPOCH_NS // resolution_ns * resolution_ns).scaleb(-9)
+    # The tolerance is that of spline derivatives in floating point: 160 m x 2^-53 x 12 / (2.5 ms)^2.
+    motion = RecordedMotion(poses.times_s, poses.positions_m, Rotation.from_quat(poses.quaternions), GRAVITY)
+    forces = motion.motion(np.linspace(0.1, 1.9, 999)).specific_forces_m_s2
+    assert np.abs(forces - [0.0, 0.0, GRAVITY]).max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["parquet rounded", "csv rounded", "tum rounded", "tum rounded by numpy"])
+def test_times_rounded_by_the_file_are_refused(tmp_path: Path, kind: str) -> None:
+    """The error is 0.5^0.5 x 2.4e-7 s x 80 m/s / (2.5 ms)^2 = 2.2 m/s^2."""
+    path = _write_epoch_flight(tmp_path, kind)
+    with pytest.raises(
+        TrajectoryFileError, match=r"rounded to 2e-07 s: an acceleration error of 2.2 m/s\^2; allowed: integers"
+    ):
+        read_poses(path)
+
+
+def test_text_that_is_no_time_is_reported(tmp_path: Path) -> None:
+    path = _write_epoch_flight(tmp_path, "csv s")
+    path.write_text(path.read_text().replace("1750000000.125956789", "noon"))
+    with pytest.raises(TrajectoryFileError, match="the time 'noon' is not a number"):
+        read_poses(path)
 
 
 def _write_faulty_poses(tmp_path: Path, **changes: float) -> Path:
