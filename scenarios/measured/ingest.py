@@ -15,6 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.descent.parameters import binned_size_for
 from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.image_files import read_counts, read_flat_field, read_header
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
@@ -24,9 +25,6 @@ from marsyard.scenarios.measured.layout import (
     IngestError,
     IngestFile,
     SunTable,
-    read_counts,
-    read_flat_field,
-    read_header,
     read_ingest_file,
     read_table,
 )

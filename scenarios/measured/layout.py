@@ -1,27 +1,21 @@
-"""Read the inputs of `marsyard ingest` (docs/real-images.md): `ingest.toml`, `images.csv`, images, flat fields.
-
-Images are PNG, PGM and TIFF of one band with 8 or 16 bits.
-"""
+"""Read `ingest.toml` and `images.csv`, inputs of `marsyard ingest` (docs/real-images.md)."""
 
 from __future__ import annotations
 
 import itertools
-import re
-import struct
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-import cv2
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import Float64
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
-from marsyard.sim.files import check_regular, open_regular, read_npy_header, report_damage
+from marsyard.sim.files import check_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded_field
 
@@ -173,17 +167,6 @@ _COLUMN_GROUPS = (
 _QUATERNION_TOLERANCE = 5e-3
 #: Maximum number of rows; matching more images would take days.
 _MAX_ROWS = 200_000
-#: Number of first bytes that are read as header: enough for a PGM file with comments.
-_HEADER_BYTES = 4096
-#: Maximum number of pixels along a side of a flat field.
-_MAX_SIDE = 16384
-#: Maximum relative response: noise raises the response of the brightest pixel slightly above 1.
-_MAX_RESPONSE = 1.5
-#: Tags of a TIFF file (image width and image length), and the type of 16-bit values.
-_TIFF_WIDTH, _TIFF_LENGTH, _TIFF_SHORT = 256, 257, 3
-#: Header of a PGM file: width and height, with comments between them.
-_PGM = re.compile(rb"\AP[25]\s+(?:#[^\n]*\n\s*)*(\d+)\s+(?:#[^\n]*\n\s*)*(\d+)\s")
-_ALLOWED = "allowed: PNG, PGM or TIFF of one band with 8 or 16 bits, or a PDS3 product"
 
 
 @dataclass(frozen=True)
@@ -271,80 +254,3 @@ def _parse_row(line: int, cells: Mapping[str, str]) -> ImageRow:
                 f"allowed: 1 to {_QUATERNION_TOLERANCE:g}"
             )
     return row
-
-
-def read_header(path: Path) -> bytes:
-    """Read the file's first bytes. Raises IngestError if the file is missing, empty or unreadable."""
-    try:
-        with open_regular(path) as file:
-            head = file.read(_HEADER_BYTES)
-    except OSError as error:
-        raise IngestError(f"{path}: {error.strerror or error}") from error
-    if not head:
-        raise IngestError(f"{path}: is empty (0 bytes)")
-    return head
-
-
-def read_counts(path: Path, size: tuple[int, int]) -> UInt16[np.ndarray, "rows columns"]:
-    """Decode an image after its header has confirmed the size (columns, rows).
-
-    Raises IngestError if the file is unreadable, or of another format or size.
-    """
-    columns, rows = read_image_size(path)
-    if (columns, rows) != size:
-        raise IngestError(
-            f"{path}: has {columns} x {rows} pixels; its camera has {size[0]} x {size[1]} (columns x rows)"
-        )
-    counts = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if counts is None:
-        raise IngestError(f"{path}: cannot be decoded; {_ALLOWED}")
-    if counts.ndim != 2:
-        raise IngestError(f"{path}: has {counts.shape[2]} bands; {_ALLOWED}")
-    if counts.dtype not in (np.uint8, np.uint16):
-        raise IngestError(f"{path}: its counts are {counts.dtype}; {_ALLOWED}")
-    return np.asarray(counts, dtype=np.uint16)
-
-
-def read_image_size(path: Path) -> tuple[int, int]:
-    """Read (columns, rows) from the header. Raises IngestError for other formats."""
-    head = read_header(path)
-    if head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) >= 24:  # width and height in the IHDR chunk
-        return struct.unpack(">II", head[16:24])
-    pgm = _PGM.match(head)
-    if pgm is not None:
-        return int(pgm[1]), int(pgm[2])
-    if head[:4] in (b"II*\0", b"MM\0*"):
-        order, extents = "<" if head.startswith(b"II") else ">", dict[int, int]()
-        try:
-            with path.open("rb") as file:
-                file.seek(4)
-                file.seek(struct.unpack(f"{order}I", file.read(4))[0])
-                (entries,) = struct.unpack(f"{order}H", file.read(2))
-                for _ in range(entries):  # of the first directory
-                    tag, kind, _count, value = struct.unpack(f"{order}HHI4s", file.read(12))
-                    if tag in (_TIFF_WIDTH, _TIFF_LENGTH):
-                        (extents[tag],) = struct.unpack_from(f"{order}{'H' if kind == _TIFF_SHORT else 'I'}", value)
-        except (OSError, struct.error) as error:
-            raise IngestError(f"{path}: is a damaged TIFF: {error}") from error
-        if len(extents) != 2:
-            raise IngestError(f"{path}: is a damaged TIFF: its first directory contains no size")
-        return extents[_TIFF_WIDTH], extents[_TIFF_LENGTH]
-    raise IngestError(f"{path}: is not a supported image; {_ALLOWED}")
-
-
-def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
-    """Read a flat field: an array unchanged, or an image divided by its largest count. Raises IngestError."""
-    head = read_header(path)
-    with report_damage(path, IngestError, "is not a valid flat field"):
-        if head.startswith(b"\x93NUMPY"):
-            with path.open("rb") as file:
-                shape, dtype = read_npy_header(file)
-            if len(shape) != 2 or max(shape) > _MAX_SIDE or dtype.kind not in "iuf":
-                raise ValueError(f"contains an array of shape {shape} and type {dtype}")
-            response = np.asarray(np.load(path, allow_pickle=False), dtype=np.float64)
-        else:
-            counts = read_counts(path, read_image_size(path))
-            response = counts / max(int(counts.max()), 1)
-    if not np.all(np.isfinite(response)) or response.min() <= 0.0 or response.max() > _MAX_RESPONSE:
-        raise IngestError(f"{path}: is not a valid flat field; allowed: two dimensions, above 0, maximum about 1")
-    return response

@@ -4,7 +4,8 @@ All files are YAML with a camera matrix and OpenCV's distortion in OpenCV's axes
 of the upper left pixel is (0, 0), as in Marsyard. Each is converted to the nearest camera of the CAHV family
 (`from_opencv`, `from_opencv_fisheye`). The conversion is exact if only k1 and k2 are not zero. A residual above
 `MAX_RMS_PX` (RMS over the frame) or `MAX_PX` (at any pixel) is an error (docs/adr/0020). All cameras of a chain are in
-the axes of its first camera.
+the axes of its first camera. The matrix of ROS describes the whole detector: its images are cropped to `roi`, then each
+block of `binning_x` x `binning_y` pixels becomes one pixel.
 
 OpenCV's pinhole model distorts about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential), for a point
 (x, y) of the plane z = 1:
@@ -171,11 +172,11 @@ class _Reader:
             names: tuple[str, ...] = ("distortion_coeffs", "distortion_coefficients")
             is_fisheye = False
         else:
-            flat = self.read_numbers(("camera_matrix", "cameraMatrix", "K"), "a matrix of 3 x 3 numbers")
+            flat = self.read_numbers(("camera_matrix", "cameraMatrix", "K", "k"), "a matrix of 3 x 3 numbers")
             if len(flat) != 9:
                 raise self.error("camera_matrix", f"has {len(flat)} numbers", "3 x 3")
             matrix = np.array(flat, dtype=np.float64).reshape(3, 3)
-            names = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D")
+            names = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
             is_fisheye = bool(self.data.get("fisheye_model", False))
         coefficients = self.read_numbers(names, "a list of numbers", default=[])
         lens = self.data.get("distortion_model")
@@ -198,12 +199,51 @@ class _Reader:
                 f"{residual.max_px:.2g} px at most",
                 f"{MAX_RMS_PX:g} and {MAX_PX:g} px; crop the image, or calibrate with fewer coefficients",
             )
-        return Calibration(name, camera, residual)
+        if self.prefix:
+            return Calibration(name, camera, residual)
+        camera, binning = self.apply_readout(camera)
+        return Calibration(name, camera, Residual(residual.rms_px / binning, residual.max_px / binning))
+
+    def apply_readout(self, camera: CameraModel) -> tuple[CameraModel, int]:
+        """Crop and bin the camera as `roi`, `binning_x` and `binning_y` of ROS say; return also the smaller binning.
+
+        Offsets and sizes of the region are in pixels of the whole detector. A region of size 0 is the whole detector, a
+        binning of 0 is none; pixels that do not fill a block are not delivered.
+        """
+        region = self.data.get("roi") or {}
+        if not isinstance(region, Mapping):
+            raise self.error("roi", f"{region!r}", "x_offset, y_offset, width and height")
+        column, row, width, height = (
+            self.read_count(region, name, "roi.") for name in ("x_offset", "y_offset", "width", "height")
+        )
+        if width == height == 0:
+            width, height = camera.size[0] - column, camera.size[1] - row
+        if min(width, height) < 1 or column + width > camera.size[0] or row + height > camera.size[1]:
+            raise self.error(
+                "roi",
+                f"{width} x {height} pixels at ({column}, {row})",
+                f"a region within image_width x image_height, {camera.size[0]} x {camera.size[1]} (without binning)",
+            )
+        columns, rows = (max(self.read_count(self.data, name), 1) for name in ("binning_x", "binning_y"))
+        if columns > width or rows > height:
+            raise self.error(
+                "binning_x, binning_y", f"{columns}, {rows}", f"at most {width}, {height}, the image's size"
+            )
+        cropped = camera.crop(column, row, (width // columns * columns, height // rows * rows))
+        return cropped.bin(columns, rows), min(columns, rows)
+
+    def read_count(self, values: Mapping[Any, Any], name: str, prefix: str = "") -> int:
+        """Read an integer of 0 or more; 0 if it is missing."""
+        value = values.get(name, 0)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise self.error(f"{prefix}{name}", f"{value!r}", "an integer of 0 or more")
+        return value
 
     def read_size(self) -> tuple[int, int]:
         """Read (columns, rows)."""
         pair = next((self.data[name] for name in ("resolution", "image_size", "imageSize") if name in self.data), None)
-        pair = pair if pair is not None else [self.data.get("image_width"), self.data.get("image_height")]
+        for width, height in (("image_width", "image_height"), ("width", "height")):  # the latter in messages of ROS
+            pair = pair if pair not in (None, [None, None]) else [self.data.get(width), self.data.get(height)]
         if isinstance(pair, Mapping):
             pair = [pair.get("width"), pair.get("height")]
         match pair:

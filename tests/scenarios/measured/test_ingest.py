@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.measured.image_files import read_counts
 from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
 from marsyard.scenarios.measured.scenarios import MatchingScenario
@@ -127,6 +130,53 @@ def test_image_formats_preserve_the_counts(tmp_path: Path, suffix: str) -> None:
     for image, original in zip(images, measurements.images, strict=True):
         assert np.array_equal(image.counts, original.counts)
         assert image.camera == original.camera
+
+
+def _write_png_with_orientation(path: Path, counts: np.ndarray, orientation: int) -> None:
+    """Write a PNG whose chunk eXIf contains one entry: tag 274, type SHORT, the orientation."""
+    data = cv2.imencode(".png", counts)[1].tobytes()
+    exif = b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHHI", 1, 274, 3, 1, orientation, 0, 0)
+    chunk = struct.pack(">I", len(exif)) + b"eXIf" + exif + struct.pack(">I", zlib.crc32(b"eXIf" + exif))
+    end = data.index(b"IEND") - 4
+    path.write_bytes(data[:end] + chunk + data[end:])
+
+
+def _write_tiff_with_orientation(path: Path, counts: np.ndarray, orientation: int) -> None:
+    """Write an uncompressed TIFF of 8 bits with one strip; entries: tag, type (3 SHORT, 4 LONG), count, value."""
+    rows, columns = counts.shape
+    tags = {
+        256: columns,
+        257: rows,
+        258: 8,
+        259: 1,
+        262: 1,
+        273: 200,
+        274: orientation,
+        277: 1,
+        278: rows,
+        279: counts.size,
+    }
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    directory = struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
+    path.write_bytes(
+        (b"II*\0" + struct.pack("<I", 8) + directory).ljust(200, b"\0") + counts.astype(np.uint8).tobytes()
+    )
+
+
+@pytest.mark.parametrize("write", [_write_png_with_orientation, _write_tiff_with_orientation])
+def test_rotated_images_are_refused(tmp_path: Path, write: Callable[[Path, np.ndarray, int], None]) -> None:
+    """OpenCV mirrors such TIFF files without a word, or cannot decode them; it ignores the orientation of PNG files."""
+    counts = np.arange(48, dtype=np.uint8).reshape(6, 8)
+    for orientation in range(1, 9):
+        path = tmp_path / f"{orientation}.image"
+        write(path, counts, orientation)
+        if orientation == 1:
+            assert np.array_equal(read_counts(path, (8, 6)), counts)
+        else:
+            with pytest.raises(
+                IngestError, match=rf"{orientation}.image: has the orientation {orientation} .*allowed: 1"
+            ):
+                read_counts(path, (8, 6))
 
 
 def test_opportunity_images_agree_with_the_cameras_of_their_labels(tmp_path: Path, shared_data: Path) -> None:

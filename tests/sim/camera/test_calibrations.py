@@ -227,6 +227,77 @@ def test_ros_camera_info_is_read(tmp_path: Path) -> None:
     assert calibration.residual.rms_px < 0.2
 
 
+def _project_with_readout(camera: CameraModel, column: int, row: int, binning: tuple[int, int]) -> np.ndarray:
+    """Return pixels of the cropped and binned image for a grid of pixels of the whole detector.
+
+    The centre of the block of pixels 0 to b - 1 is the pixel (b - 1) / 2, which becomes pixel 0.
+    """
+    pixels = np.stack(np.meshgrid([200.0, 700.0, 1200.0], [100.0, 500.0, 900.0]), axis=-1).reshape(-1, 2)
+    directions = camera.rays(pixels)[1]
+    factor = np.array(binning)
+    return np.concatenate([directions, (pixels - [column, row] - (factor - 1) / 2) / factor], axis=1)
+
+
+@pytest.mark.parametrize("separator", ["image_", ""])
+@pytest.mark.parametrize(
+    ("readout", "offset", "binning", "size"),
+    [
+        ("binning_x: 2\nbinning_y: 4\n", (0, 0), (2, 4), (960, 270)),
+        (
+            "binning_x: 0\nbinning_y: 0\nroi: {x_offset: 0, y_offset: 0, height: 0, width: 0}\n",
+            (0, 0),
+            (1, 1),
+            (1920, 1080),
+        ),
+        ("roi: {x_offset: 100, y_offset: 60, height: 600, width: 801}\n", (100, 60), (1, 1), (801, 600)),
+        (
+            "binning_x: 2\nbinning_y: 2\nroi: {x_offset: 100, y_offset: 60, height: 601, width: 801, do_rectify: 0}\n",
+            (100, 60),
+            (2, 2),
+            (400, 300),
+        ),
+        ("roi: {x_offset: 20, y_offset: 80}\n", (20, 80), (1, 1), (1900, 1000)),
+    ],
+)
+def test_ros_binning_and_region_are_applied(
+    tmp_path: Path,
+    separator: str,
+    readout: str,
+    offset: tuple[int, int],
+    binning: tuple[int, int],
+    size: tuple[int, int],
+) -> None:
+    text = ROS.replace("image_width", f"{separator}width").replace("image_height", f"{separator}height")
+    (whole,) = read_calibrations(write_file(tmp_path, ROS))
+    (calibration,) = read_calibrations(write_file(tmp_path, text + readout))
+    assert calibration.camera.size == size
+    samples = _project_with_readout(whole.camera, *offset, binning)
+    pixels, _ = calibration.camera.project(calibration.camera.c + samples[:, :3])
+    assert np.allclose(pixels, samples[:, 3:], rtol=0.0, atol=1e-9)
+    assert calibration.residual.max_px == pytest.approx(whole.residual.max_px / min(binning))
+
+
+@pytest.mark.parametrize(
+    ("readout", "fault"),
+    [
+        (
+            "roi: {x_offset: 1200, width: 800, height: 600}",
+            r"roi: 800 x 600 pixels at \(1200, 0\); allowed: a region within",
+        ),
+        ("roi: {width: 800, height: 0}", "roi: 800 x 0 pixels"),
+        ("roi: {x_offset: -1, width: 8, height: 8}", "roi.x_offset: -1; allowed: an integer of 0 or more"),
+        ("roi: {width: 8.5, height: 8}", "roi.width: 8.5"),
+        ("roi: all", "roi: 'all'; allowed: x_offset"),
+        ("binning_x: 1.5", "binning_x: 1.5; allowed: an integer"),
+        ("binning_y: -2", "binning_y: -2"),
+        ("binning_x: 3000", "binning_x, binning_y: 3000, 1; allowed: at most 1920, 1080"),
+    ],
+)
+def test_impossible_readouts_are_rejected(tmp_path: Path, readout: str, fault: str) -> None:
+    with pytest.raises(CameraFileError, match=fault):
+        read_calibrations(write_file(tmp_path, ROS + readout + "\n"))
+
+
 def test_ros_rational_lens_is_fitted(tmp_path: Path) -> None:
     """The eight coefficients of an Azure Kinect colour camera, scaled to the field of view of the smartphone."""
     coefficients = [0.52, -2.6, 4e-4, -2e-4, 1.5, 0.40, -2.4, 1.45]
