@@ -10,6 +10,9 @@ Positions are geometric, without light time; times are TDB seconds since `begin`
     begin = "2030-01-01T00:00:00"
     end = "2030-01-01T00:01:30"
     step_s = 0.1               # time between poses
+
+A kernel can be a meta-kernel, which names further kernels. SPICE reads their relative paths from the current folder;
+here they are relative to the meta-kernel or, if the kernel is not there, to the file ``*.spice.toml``.
 """
 
 from __future__ import annotations
@@ -28,6 +31,12 @@ from marsyard.sim.parameters import Parameters
 
 #: Maximum number of poses sampled from SPICE kernels: five hours at 50 Hz.
 MAX_SPICE_POSES = 1_000_000
+#: Variables of a meta-kernel: kernels, and values of symbols in their names; and the last character of a string that
+#: the next string continues.
+_KERNELS, _VALUES, _SYMBOLS = "KERNELS_TO_LOAD", "PATH_VALUES", "PATH_SYMBOLS"
+_CONTINUATION = "+"
+#: Maximum length of a path in SPICE; and architectures of binary and transfer kernels, which are no meta-kernels.
+_MAX_PATH, _NO_TEXT = 1024, ("DAF", "DAS", "XFR", "DEC")
 
 
 class SpiceFlight(Parameters):
@@ -55,18 +64,16 @@ def sample_kernels(path: str, min_poses: int) -> tuple[str, Float64[np.ndarray, 
         first = error.errors()[0]
         raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
     kernels = [Path(path).parent / name for name in flight.kernels]
-    digest = hashlib.sha256(Path(path).read_bytes())
-    for kernel in kernels:
-        if not kernel.is_file():
-            raise ValueError(f"the kernel {kernel} does not exist")
-        with kernel.open("rb") as file:
-            digest.update(hashlib.file_digest(file, "sha256").digest())
+    missing = next((kernel for kernel in kernels if not kernel.is_file()), None)
+    if missing is not None:
+        raise ValueError(f"the kernel {missing} does not exist")
     import spiceypy
     from spiceypy.utils.exceptions import SpiceyError
 
     try:
         # SPICE has one kernel pool per process; kernels that other code has loaded remain in it
-        with spiceypy.KernelPool([str(kernel) for kernel in kernels]):
+        with spiceypy.KernelPool([]):
+            files = [file for kernel in kernels for file in _load_kernel(kernel, Path(path).parent)]
             begin, end = (float(spiceypy.str2et(utc)) for utc in (flight.begin, flight.end))
             count = int(np.floor((end - begin) / flight.step_s + 1e-9)) + 1
             if not min_poses <= count <= MAX_SPICE_POSES:
@@ -79,5 +86,65 @@ def sample_kernels(path: str, min_poses: int) -> tuple[str, Float64[np.ndarray, 
         # put the message on one line, without SPICE's banner and traceback
         words = [getattr(error, "short", ""), *str(getattr(error, "long", "") or error).split()]
         raise ValueError(f"SPICE: {' '.join(words).strip()[:300]}") from error
+    digest = hashlib.sha256(Path(path).read_bytes())
+    for kernel in files:
+        with kernel.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     quaternions = Rotation.from_matrix(rotations).as_quat()
     return digest.hexdigest(), np.concatenate([times[:, None], 1e3 * np.asarray(positions), quaternions], axis=1)
+
+
+def _load_kernel(kernel: Path, folder: Path) -> list[Path]:
+    """Load a kernel and, if it is a meta-kernel, the kernels that it names; return all files in this order.
+
+    Raises ValueError for a kernel that does not exist, or a meta-kernel in a meta-kernel.
+    """
+    import spiceypy
+
+    if not _is_meta_kernel(kernel):
+        spiceypy.furnsh(str(kernel))
+        return [kernel]
+    spiceypy.ldpool(str(kernel))  # assigns the variables without loading the named kernels
+    names, values, symbols = (_read_strings(name) for name in (_KERNELS, _VALUES, _SYMBOLS))
+    for name in (_KERNELS, _VALUES, _SYMBOLS):
+        spiceypy.dvpool(name)
+    if len(values) != len(symbols):
+        raise ValueError(f"{kernel}: has {len(symbols)} {_SYMBOLS} and {len(values)} {_VALUES}; allowed: equal numbers")
+    files = [kernel]
+    for name in names:
+        expanded = name
+        for symbol, value in sorted(zip(symbols, values, strict=True), key=lambda pair: -len(pair[0])):
+            expanded = expanded.replace(f"${symbol}", value)
+        candidates = [kernel.parent / expanded, folder / expanded]
+        file = next((candidate for candidate in candidates if candidate.is_file()), None)
+        if file is None:
+            absent = " and ".join(map(str, dict.fromkeys(candidates)))
+            raise ValueError(
+                f"{kernel}: names the kernel {name}, but {absent} do not exist; "
+                "allowed: paths relative to the meta-kernel or to this file, or absolute paths"
+            )
+        if _is_meta_kernel(file):
+            raise ValueError(f"{kernel}: names the meta-kernel {name}; allowed: kernels that name no other kernels")
+        spiceypy.furnsh(str(file))
+        files.append(file)
+    return files
+
+
+def _is_meta_kernel(kernel: Path) -> bool:
+    """Return whether a kernel is a text kernel that names other kernels."""
+    import spiceypy
+
+    return spiceypy.getfat(str(kernel))[0] not in _NO_TEXT and _KERNELS.encode() in kernel.read_bytes()
+
+
+def _read_strings(name: str) -> list[str]:
+    """Read the strings of a variable in the kernel pool; empty if it is not assigned."""
+    import spiceypy
+
+    strings: list[str] = []
+    with spiceypy.no_found_check():
+        while True:
+            text, _, is_found = spiceypy.stpool(name, len(strings), _CONTINUATION, _MAX_PATH)
+            if not is_found:
+                return strings
+            strings.append(text.strip())

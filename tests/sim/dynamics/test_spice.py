@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,98 @@ def test_hash_covers_all_kernels(kernels: Path, tmp_path: Path) -> None:
     with (changed_copy / "site.tf").open("a") as file:
         file.write("\\begintext\nanother remark\n")
     assert read_poses(changed_copy / "flight.spice.toml").sha256 != read_poses(kernels / "flight.spice.toml").sha256
+
+
+#: A meta-kernel in the folder mk; a path is continued in the next string.
+META_KERNEL = """KPL/MK
+\\begindata
+PATH_SYMBOLS    = ( 'K', 'KERNELS' )
+PATH_VALUES     = ( '{first}', '{second}' )
+KERNELS_TO_LOAD = ( '$KERNELS/leap.tls', '$K/lander.tsc', '$KERNELS/+'
+                    'site.tf', '$KERNELS/lander.bsp', '$K/lander.bc' )
+BODY-999_EXTRA  = ( 1.0 )
+"""
+
+
+@pytest.fixture
+def meta_kernel(kernels: Path, tmp_path: Path) -> Path:
+    """Return a file whose only kernel is a meta-kernel, with paths relative to the meta-kernel."""
+    for folder in ("mk", "a", "b"):
+        (tmp_path / folder).mkdir()
+    for name, folder in (
+        ("leap.tls", "b"),
+        ("lander.tsc", "a"),
+        ("site.tf", "b"),
+        ("lander.bsp", "b"),
+        ("lander.bc", "a"),
+    ):
+        shutil.copy(kernels / name, tmp_path / folder / name)
+    (tmp_path / "mk" / "flight.tm").write_text(META_KERNEL.format(first="../a", second="../b"))
+    kernel_list = FLIGHT_FILE.partition("\n")[0]
+    path = tmp_path / "flight.spice.toml"
+    path.write_text(FLIGHT_FILE.replace(kernel_list, 'kernels = ["mk/flight.tm"]'))
+    return path
+
+
+@pytest.mark.parametrize("folder", [".", "mk", "/"])
+def test_meta_kernels_are_read_from_any_folder(
+    kernels: Path, meta_kernel: Path, monkeypatch: pytest.MonkeyPatch, folder: str
+) -> None:
+    monkeypatch.chdir(meta_kernel.parent / folder)
+    poses, expected = read_poses(meta_kernel), read_poses(kernels / "flight.spice.toml")
+    np.testing.assert_array_equal(poses.positions_m, expected.positions_m)
+    np.testing.assert_array_equal(poses.quaternions, expected.quaternions)
+
+
+@pytest.mark.parametrize("values", [("a", "b"), ("{folder}/a", "{folder}/b")])
+def test_paths_in_meta_kernels_may_be_absolute_or_relative_to_the_flight(
+    meta_kernel: Path, values: tuple[str, str]
+) -> None:
+    # strings of text kernels have at most 80 characters; a plus sign continues a string
+    folder = meta_kernel.parent.as_posix()
+    first, second = (value.format(folder="+'\n'".join(textwrap.wrap(folder, 50))) for value in values)
+    (meta_kernel.parent / "mk" / "flight.tm").write_text(META_KERNEL.format(first=first, second=second))
+    assert read_poses(meta_kernel).times_s.size == N_POSES
+
+
+@pytest.mark.parametrize("changed", ["mk/flight.tm", "b/site.tf", "a/lander.bc"])
+def test_hash_covers_kernels_in_meta_kernels(meta_kernel: Path, tmp_path: Path, changed: str) -> None:
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    for name in ("mk", "a", "b"):
+        shutil.copytree(meta_kernel.parent / name, copy / name)
+    path = copy / meta_kernel.name
+    shutil.copy(meta_kernel, path)
+    assert read_poses(path).sha256 == read_poses(meta_kernel).sha256
+    with (copy / changed).open("ab") as file:
+        file.write(b"\n")
+    other = copy / "other.spice.toml"
+    shutil.copy(path, other)
+    assert read_poses(other).sha256 != read_poses(meta_kernel).sha256
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "lander.bc",
+            "absent.bc",
+            r"flight.tm: names the kernel \$K/absent.bc, but .*mk/../a/absent.bc .*do not exist",
+        ),
+        ("'K', 'KERNELS'", "'KERNELS'", "has 1 PATH_SYMBOLS and 2 PATH_VALUES"),
+        ("$K/lander.bc", "flight.tm", "names the meta-kernel flight.tm"),
+        ("KERNELS_TO_LOAD =", "KERNELS_TO_LOAD", "SPICE: "),
+    ],
+)
+def test_faulty_meta_kernels_are_reported(meta_kernel: Path, old: str, new: str, message: str) -> None:
+    path = meta_kernel.parent / "mk" / "flight.tm"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    count = spiceypy.ktotal("ALL")
+    with pytest.raises(TrajectoryFileError, match=f"flight.spice.toml: .*{message}"):
+        read_poses(meta_kernel)
+    assert spiceypy.ktotal("ALL") == count
 
 
 @pytest.mark.parametrize(
