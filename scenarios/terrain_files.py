@@ -148,8 +148,14 @@ def _geotiff_problems(file: Any, max_side: int, is_dtm: bool) -> Iterator[str]:
         yield "is in degrees; project it to metres with rio warp --dst-crs"
     elif not crs.is_projected:
         yield "its coordinates are not those of a map projection; project it with rio warp --dst-crs"
-    scale = map_scale(file)
-    # a projection without a known inverse is accepted
+    try:
+        scale = map_scale(file)
+    except NoInverseError as error:
+        yield (
+            f"its projection has no inverse in PROJ ({error}), so that lengths and true north are unknown; allowed: a "
+            "projection with an inverse, such as stereographic, Lambert conformal or transverse Mercator"
+        )
+        return
     if scale is not None and max(scale.max_ratio - 1.0, 1.0 - scale.min_ratio) > _MAX_STRETCH:
         yield (
             f"its projection stretches lengths by {scale.min_ratio:.3f} to {scale.max_ratio:.3f}, depending on their "
@@ -253,8 +259,16 @@ class MapScale:
     grid_north_deg: float | None
 
 
+class NoInverseError(Exception):
+    """PROJ cannot compute the ground position of a point of a map projection."""
+
+
 def map_scale(file: Any) -> MapScale | None:
-    """Compute the scale of a rasterio dataset's projection at its centre; None without a known inverse."""
+    """Compute the scale of a rasterio dataset's projection at its centre; None if its terms are unknown.
+
+    Raises NoInverseError for a projection without inverse.
+    """
+    from rasterio._err import CPLE_BaseError  # GDAL's errors, which are no RasterioError
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError
     from rasterio.warp import transform
@@ -272,6 +286,8 @@ def map_scale(file: Any) -> MapScale | None:
         positions = np.array(transform(file.crs, body_fixed, xs, ys, [0.0] * 4), dtype=np.float64).T
     except (RasterioError, ValueError):
         return None
+    except CPLE_BaseError as error:
+        raise NoInverseError(str(error)) from error
     # derivatives of the ground position with respect to the map's x and y
     length = 2.0 * step * unit_m
     tangent_x, tangent_y = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
@@ -291,7 +307,7 @@ def map_scale(file: Any) -> MapScale | None:
 
 
 #: File suffixes of terrain models.
-SUFFIXES = (".npz", ".tif", ".tiff")
+SUFFIXES = (".npz", ".tif", ".tiff", ".img", ".cub")
 #: Preset that supplies light, air, scattering and fine texture for imported ground.
 LIGHT_PRESET = "gusev"
 #: Default maximum fraction of posts without height in a terrain model.
@@ -303,12 +319,23 @@ def is_terrain_file(name: str) -> bool:
     return Path(name).suffix.lower() in SUFFIXES
 
 
+def check_site_name(name: str) -> None:
+    """Raise TerrainFileError if a name that is no terrain model is the name of a file, not of a site."""
+    path = Path(name)
+    if name not in sites() and (path.suffix or len(path.parts) > 1 or path.is_file()):
+        raise TerrainFileError(
+            f"{name}: is not a terrain model; allowed: {', '.join(SUFFIXES)} (GeoTIFF, PDS3 or ISIS products, "
+            f"arrays); convert other rasters with rio convert {path.name} {path.stem}.tif"
+        )
+
+
 def load_site(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
     """Return a preset by name, or a terrain model's file as a site: one terrain at both scales, no rocks or craters.
 
     Raises ValueError, or TerrainFileError.
     """
     if not is_terrain_file(name):
+        check_site_name(name)
         return site(name)
     path = Path(name)
     source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)

@@ -21,7 +21,7 @@ from jaxtyping import Bool, UInt16
 
 from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.horizon import add_unresolved_rocks
-from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, is_terrain_file, load_site
+from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
 from marsyard.scenarios.views import (
     CAMERA_MOUNTINGS,
     SiteGround,
@@ -72,6 +72,7 @@ class ImageRequest:
     def from_defaults(cls, site: str, camera: str, **settings: Any) -> ImageRequest:
         """Create a request with the camera's default pose, changed by `settings`; raises ValueError if invalid."""
         if not is_terrain_file(site):
+            check_site_name(site)
             _check_name("site", site, sites())
         _check_name("camera", camera, sensor.PRESETS)
         mounting = CAMERA_MOUNTINGS[camera]

@@ -34,7 +34,8 @@ CampaignArgument = Annotated[
 SiteArgument = Annotated[
     str,
     Argument(
-        metavar="SITE", help="A site from `marsyard terrain list`, or a digital terrain model (DTM): .tif or .npz."
+        metavar="SITE",
+        help="A site from `marsyard terrain list`, or a digital terrain model (DTM): .tif, .img, .cub or .npz.",
     ),
 ]
 MaxHolesOption = Annotated[

@@ -1,6 +1,6 @@
-"""Camera calibrations of other programs: OpenCV (YAML, JSON), ROS `camera_info`, Kalibr camera chains, EuRoC sensors.
+"""Camera calibrations of other programs: OpenCV, ROS `camera_info`, Kalibr camera chains, EuRoC sensors.
 
-All files are YAML with a camera matrix and OpenCV's distortion in OpenCV's axes: z forward, x right, y down; the centre
+All files are YAML, or are converted to its values (`marsyard.sim.camera.calibration_files`), with a camera matrix and OpenCV's distortion in OpenCV's axes: z forward, x right, y down; the centre
 of the upper left pixel is (0, 0), as in Marsyard. Each is converted to the nearest camera of the CAHV family
 (`from_opencv`, `from_opencv_fisheye`). The conversion is exact if only k1 and k2 are not zero. A residual above
 `MAX_RMS_PX` (RMS over the frame) or `MAX_PX` (at any pixel) is an error (docs/adr/0020). All cameras of a chain are in
@@ -36,9 +36,20 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera.base import CameraModel, Number
+from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.calibration_files import (
+    OPENCV_ROOT,
+    is_colmap,
+    is_pinhole,
+    is_xml,
+    read_colmap,
+    read_opencv_xml,
+    read_pinhole,
+    refuse_foreign,
+    xml_root,
+)
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
-from marsyard.sim.files import open_regular
+from marsyard.sim.camera.source import CALIBRATION_FILES, Source
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=CameraModel)
@@ -49,6 +60,8 @@ MAX_RMS_PX, MAX_PX = 0.3, 3.0
 #: Tolerance on the elements of R R^T - I for a chain's rotation matrix R.
 _ORTHONORMAL_TOLERANCE = 1e-4
 
+#: Number of leading bytes that identify a format.
+HEAD_BYTES = 4096
 #: First bytes of a YAML or JSON file.
 _START = re.compile(rb"\A(\xef\xbb\xbf)?\s*(#[^\n]*\n\s*)*(%YAML|---|\{|[A-Za-z_]\w*\s*:)")
 #: Line with the YAML version, and names of the cameras in a Kalibr chain.
@@ -57,10 +70,8 @@ _CHAIN = re.compile(r"cam\d+$")
 #: Names of the two lens models in the formats.
 _PINHOLE = frozenset({"plumb_bob", "rational_polynomial", "radtan", "radial-tangential", "none", "pinhole"})
 _FISHEYE = frozenset({"equidistant", "fisheye"})
-_ALLOWED_FILES = (
-    "a calibration of OpenCV (camera_matrix, distortion_coefficients, image_width, image_height), ROS (the same and "
-    "distortion_model), Kalibr (cam0: ...) or EuRoC (intrinsics, resolution, ...)"
-)
+#: Names of the image's width and height: OpenCV, its older programs, messages of ROS.
+_SIZES = (("image_width", "image_height"), ("image_Width", "image_Height"), ("width", "height"))
 
 #: Number of pixels along each side of the frame, from edge to edge, at which cameras are compared.
 _SAMPLES_PER_SIDE = 33
@@ -113,25 +124,40 @@ for _kind in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def is_calibration(head: bytes) -> bool:
-    """Return whether a file with these first bytes can be a calibration in YAML or JSON."""
-    return _START.match(head) is not None
+    """Return whether a file with these first bytes can be a calibration."""
+    if is_xml(head):
+        return xml_root(head) == OPENCV_ROOT
+    return is_colmap(head) or is_pinhole(head) or _START.match(head) is not None
 
 
-def read_calibrations(path: str | Path) -> tuple[Calibration, ...]:
+def read_calibrations(path: str | Path, *, size: tuple[int, int] | None = None) -> tuple[Calibration, ...]:
     """Read every camera of a calibration file, in order.
+
+    `size` is (columns, rows) of the image, required for a pinhole model of Ames Stereo Pipeline.
 
     Raises CameraFileError if the file cannot be read or is not a calibration, or if it contains an impossible camera or
     a lens that the CAHV family cannot represent. The message contains file, field and allowed values.
     """
     source = Source(str(path))
+    head = source.read_head(HEAD_BYTES)
+    refuse_foreign(source, head)
+    if is_xml(head):
+        return (_Reader(source, read_opencv_xml(source), "").read_calibration("", None),)
+    if is_colmap(head):
+        return tuple(
+            _Reader(source, values, f"camera {name}: ").read_calibration(name, None)
+            for name, values in read_colmap(source)
+        )
+    if is_pinhole(head):
+        return (_Reader(source, read_pinhole(source, size), "").read_calibration("", None),)
     text = source.read_text().encode("latin-1").decode("utf-8-sig", errors="replace")
     try:
         data = yaml.load(_DIRECTIVE.sub("", text), Loader=_Loader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, ValueError, RecursionError, TypeError) as fault:
         message = " ".join(str(fault).split())
-        raise source.error("file", f"is not valid YAML ({message[:200]})", _ALLOWED_FILES) from fault
+        raise source.error("file", f"is not valid YAML ({message[:200]})", CALIBRATION_FILES) from fault
     if not isinstance(data, Mapping):
-        raise source.error("file", "contains no named values", _ALLOWED_FILES)
+        raise source.error("file", "contains no named values", CALIBRATION_FILES)
     names = [name for name in data if isinstance(name, str) and _CHAIN.match(name) and isinstance(data[name], Mapping)]
     if not names:
         return (_Reader(source, data, "").read_calibration(str(data.get("camera_name", "")), None),)
@@ -160,7 +186,7 @@ class _Reader:
 
     def read_calibration(self, name: str, pose: RigidTransform | None) -> Calibration:
         """Read the camera; its lens model follows from the model's name and, in OpenCV's files, the coefficients."""
-        if self.prefix or "intrinsics" in self.data:  # Kalibr, EuRoC
+        if "intrinsics" in self.data or _CHAIN.match(self.prefix.removesuffix(".")):  # EuRoC, Kalibr
             model = self.data.get("camera_model", "pinhole")
             if model != "pinhole":
                 raise self.error("camera_model", f"{model!r}", "pinhole")
@@ -172,11 +198,13 @@ class _Reader:
             names: tuple[str, ...] = ("distortion_coeffs", "distortion_coefficients")
             is_fisheye = False
         else:
-            flat = self.read_numbers(("camera_matrix", "cameraMatrix", "K", "k"), "a matrix of 3 x 3 numbers")
+            flat = self.read_numbers(
+                ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k"), "a matrix of 3 x 3 numbers"
+            )
             if len(flat) != 9:
                 raise self.error("camera_matrix", f"has {len(flat)} numbers", "3 x 3")
             matrix = np.array(flat, dtype=np.float64).reshape(3, 3)
-            names = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "D", "d")
+            names = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs", "D", "d")
             is_fisheye = bool(self.data.get("fisheye_model", False))
         coefficients = self.read_numbers(names, "a list of numbers", default=[])
         lens = self.data.get("distortion_model")
@@ -242,7 +270,7 @@ class _Reader:
     def read_size(self) -> tuple[int, int]:
         """Read (columns, rows)."""
         pair = next((self.data[name] for name in ("resolution", "image_size", "imageSize") if name in self.data), None)
-        for width, height in (("image_width", "image_height"), ("width", "height")):  # the latter in messages of ROS
+        for width, height in _SIZES:
             pair = pair if pair not in (None, [None, None]) else [self.data.get(width), self.data.get(height)]
         if isinstance(pair, Mapping):
             pair = [pair.get("width"), pair.get("height")]
@@ -481,67 +509,3 @@ def _compute_residual(differences: Array) -> Residual:
     """Compute RMS and maximum of the lengths of pixel differences, shape (n, 2)."""
     squares = np.sum(differences * differences, axis=-1)
     return Residual(rms_px=float(np.sqrt(np.mean(squares))), max_px=float(np.sqrt(np.max(squares))))
-
-
-#: Maximum size of a camera file; some labels have several megabytes.
-MAX_BYTES = 1 << 23
-#: Names of the models; each letter of a name is the name of one of the model's vectors.
-MODELS = ("CAHV", "CAHVOR", "CAHVORE")
-
-
-class CameraFileError(ValueError):
-    """A camera file that cannot be used. The message contains the file, the field and the allowed values."""
-
-
-@dataclass(frozen=True)
-class Source:
-    """Path of a camera file: reads its content and creates error messages."""
-
-    path: str
-
-    def error(self, field: str, fault: str, allowed: str) -> CameraFileError:
-        """Create the error for a field."""
-        return CameraFileError(f"{self.path}: {field}: {fault}; allowed: {allowed}")
-
-    def read_text(self) -> str:
-        """Read the whole file. Raises CameraFileError if it is unreadable, empty or larger than `MAX_BYTES`."""
-        contents = self.read_head(MAX_BYTES + 1)
-        if len(contents) > MAX_BYTES:
-            raise self.error("file", f"is larger than {MAX_BYTES >> 20} MiB", "a camera file or label, not an image")
-        return contents.decode("latin-1")
-
-    def read_head(self, count: int) -> bytes:
-        """Read at most the first `count` bytes. Raises CameraFileError if the file is unreadable or empty."""
-        try:
-            with open_regular(self.path) as file:
-                first_bytes = file.read(count)
-        except OSError as fault:
-            raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault
-        if not first_bytes:
-            raise self.error("file", "is empty (0 bytes)", "a camera file")
-        return first_bytes
-
-
-def linearity_of_type(kind: Number | None, parameter: float | None, field: str, source: Source) -> float:
-    """Return CAHVORE's linearity: 1 for type 1 (perspective), 0 for type 2 (fish-eye), `parameter` for type 3."""
-    if kind in (1, 2):
-        return 1.0 if kind == 1 else 0.0
-    if kind != 3:
-        raise source.error(field, f"CAHVORE's type is {'missing' if kind is None else kind}", "type 1, 2 or 3")
-    if parameter is None:
-        raise source.error(field, "CAHVORE of type 3 has no parameter", "type 3 with its linearity, from -1 to 1")
-    return parameter
-
-
-def create_camera(
-    name: str, vectors: Mapping[str, Sequence[float]], size: tuple[int, int], linearity: float | None, source: Source
-) -> CameraModel:
-    """Create the camera of a model's name and its vectors by letter. Raises CameraFileError for impossible values."""
-    c, a, h, v, *lens = (np.array(vectors[letter], dtype=np.float64) for letter in name)
-    try:
-        if linearity is not None:
-            return Cahvore(c, a, h, v, lens[0], lens[1], lens[2], linearity=linearity, size=size)
-        return Cahvor(c, a, h, v, lens[0], lens[1], size) if lens else Cahv(c, a, h, v, size)
-    except ValueError as fault:
-        field, allowed = str(fault).partition(" ")[0].upper(), "a camera model of unit A and O and independent H, V, A"
-        raise source.error(field, str(fault), allowed) from fault

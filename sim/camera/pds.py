@@ -21,7 +21,6 @@ from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibrations import MAX_BYTES, MODELS, Source, create_camera, linearity_of_type
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     SITE,
@@ -32,6 +31,7 @@ from marsyard.sim.camera.label_frames import (
     resolve_camera,
     transform_from_label,
 )
+from marsyard.sim.camera.source import MAX_BYTES, MODELS, Source, create_camera, linearity_of_type
 from marsyard.sim.files import check_regular
 
 #: PDS3: group of a camera model, and its two names.

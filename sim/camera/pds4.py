@@ -12,7 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibrations import MODELS, Source, create_camera, linearity_of_type
+from marsyard.sim.camera.calibration_files import parse_xml
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     CoordinateSystem,
@@ -22,9 +22,9 @@ from marsyard.sim.camera.label_frames import (
     transform_from_label,
 )
 from marsyard.sim.camera.pds import SUBFRAME
+from marsyard.sim.camera.source import MODELS, Source, create_camera, linearity_of_type
 
-#: Start of an XML file, and names in the geometry dictionary.
-_XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|[A-Za-z_][\w:.-]*[\s>])")
+#: Names in the geometry dictionary.
 _PARAMETERS = "Camera_Model_Parameters"
 _POSITION, _DIRECTION, _PIXEL = (tuple(f"{axis}_{kind}" for axis in "xyz") for kind in ("position", "unit", "pixel"))
 _TERMS = ("c0", "c1", "c2")
@@ -46,11 +46,6 @@ _FORWARD, _REVERSE = "Forward", "Reverse"
 _IDENTIFIER = re.compile(r"(?P<name>[A-Za-z]\w*?)(?P<indices>(?:_\d+)+)(?:_[A-Za-z]+)?")
 
 
-def is_xml(head: bytes) -> bool:
-    """Return whether the first bytes of a file are XML."""
-    return _XML_START.match(head) is not None
-
-
 def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
     """Read every camera model of a PDS4 label (.xml or .lblx), in order.
 
@@ -65,13 +60,7 @@ def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[Ca
 def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[FramedCamera, ...]:
     """Read every camera model as `read_pds4` does, with its frame as `read_pds3_framed` does."""
     source = Source(str(path))
-    text = source.read_text()
-    if "<!ENTITY" in text:  # labels do not need entities, and nested entities can fill the memory
-        raise source.error("label", "declares entities", "a PDS4 label, which has none")
-    try:
-        root = ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise source.error("label", f"cannot be parsed ({error})", "a PDS4 label, which is XML") from error
+    root = parse_xml(source, "a PDS4 label")
     models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]
     if not models:
         raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class with a model_type")

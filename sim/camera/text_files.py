@@ -19,14 +19,18 @@ import re
 from pathlib import Path
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibrations import Source, create_camera, is_calibration, linearity_of_type, read_calibrations
+from marsyard.sim.camera.calibration_files import is_xml, refuse_foreign, xml_root
+from marsyard.sim.camera.calibrations import HEAD_BYTES, is_calibration, read_calibrations
 from marsyard.sim.camera.label_frames import ROVER_FRAME, FramedCamera
 from marsyard.sim.camera.models import Cahvore
 from marsyard.sim.camera.pds import is_pds3, read_pds3_framed
-from marsyard.sim.camera.pds4 import is_xml, read_pds4_framed
+from marsyard.sim.camera.pds4 import read_pds4_framed
+from marsyard.sim.camera.source import FORMATS, Source, create_camera, linearity_of_type
 
-#: Number of leading bytes that identify a format.
-_FORMAT_BYTES = 4096
+#: Names of lines in a JPL text file, of which a file in this format has at least one.
+_LINES = ("Model", "Dimensions", "C", "A", "H", "V")
+#: Start of the names of root elements of PDS4 labels.
+_PDS4_ROOT = "Product_"
 
 #: Descriptions of the frames of reference, written into the files.
 BODY_FRAME = "body (metres); the file next to this one contains the body's pose in the world if it is known"
@@ -49,10 +53,12 @@ def read_cameras(
     """Detect the format of a file and read every camera model in it.
 
     Formats: a PDS3 label or product (`read_pds3`), a PDS4 label (`read_pds4`), a JPL text file (`read_cahvor`), a
-    calibration of OpenCV, ROS, Kalibr or EuRoC in YAML (`read_calibrations`, which also reports the residuals).
+    calibration of OpenCV, ROS, Kalibr, EuRoC, COLMAP or Ames Stereo Pipeline (`read_calibrations`, which also reports
+    the residuals).
 
     - subframe_folded_in: accept PDS labels of subframes and averaged pixels, see `read_pds3`
-    - size: (columns, rows) of the image, required for JPL text files without the line Dimensions
+    - size: (columns, rows) of the image, required for files that do not contain it: JPL text files without the line
+      Dimensions, and models of Ames Stereo Pipeline
 
     Models of PDS labels are returned in the vehicle's frame if the label contains the transform to it, else in the
     site's or the Mars-fixed frame; `read_framed_cameras` also returns the frame. Raises CameraFileError if the file
@@ -70,13 +76,21 @@ def read_framed_cameras(
 
     Files other than PDS labels do not name the frame; their models are assumed to be in the vehicle's frame.
     """
-    leading_bytes = Source(str(path)).read_head(_FORMAT_BYTES)
+    source = Source(str(path))
+    leading_bytes = source.read_head(HEAD_BYTES)
     if is_pds3(leading_bytes):
         return read_pds3_framed(path, subframe_folded_in=subframe_folded_in)
-    if is_xml(leading_bytes):
-        return read_pds4_framed(path, subframe_folded_in=subframe_folded_in)
+    refuse_foreign(source, leading_bytes)
     if is_calibration(leading_bytes):
-        return tuple(FramedCamera(calibration.camera, ROVER_FRAME) for calibration in read_calibrations(path))
+        calibrations = read_calibrations(path, size=size)
+        return tuple(FramedCamera(calibration.camera, ROVER_FRAME) for calibration in calibrations)
+    if is_xml(leading_bytes):
+        root = xml_root(leading_bytes)
+        if not root.startswith(_PDS4_ROOT):
+            raise source.error("file", f"is XML with the root element {root!r}", FORMATS)
+        return read_pds4_framed(path, subframe_folded_in=subframe_folded_in)
+    if b"\0" in leading_bytes:
+        raise source.error("file", "is binary and no PDS3 product", FORMATS)
     return (FramedCamera(read_cahvor(path, size=size), ROVER_FRAME),)
 
 
@@ -104,6 +118,9 @@ def read_cahvor(path: str | Path, *, size: tuple[int, int] | None = None) -> Cam
             raise source.error(name, f"defined twice, in lines {lines[name][1]} and {line_number}", "once")
         if match is not None:
             lines[match["name"]] = match["value"], line_number
+
+    if not any(name in lines for name in _LINES):
+        raise source.error("file", "is in an unknown format", FORMATS)
 
     def find_line(name: str) -> tuple[str, int]:
         if name not in lines:

@@ -36,7 +36,7 @@ class RealTerrain(Parameters):
     are interpolated; beyond the edges of the image the synthetic albedo remains.
     """
 
-    dtm: Annotated[Path, Field(description="GeoTIFF or .npz with the heights")]
+    dtm: Annotated[Path, Field(description="GeoTIFF, PDS3 or ISIS product (.img, .cub), or .npz with the heights")]
     ortho: Annotated[Path | None, Field(description="GeoTIFF with the orthoimage; an .npz can contain it")] = None
     use_ortho: Annotated[bool, Field(description="whether the orthoimage determines the albedo")] = True
     ortho_east_m: Annotated[float, Field(description="eastward offset of the orthoimage from the DTM, m")] = 0.0

@@ -16,14 +16,8 @@ import pyarrow.parquet as pq
 import pytest
 import trimesh
 
-from marsyard.scenarios.measured.layout import (
-    VELOCITY,
-    IngestError,
-    read_counts,
-    read_flat_field,
-    read_ingest_file,
-    read_table,
-)
+from marsyard.scenarios.measured.image_files import read_counts, read_flat_field
+from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file, read_table
 from marsyard.scenarios.measured.store import CasesFile
 from marsyard.scenarios.meshes import MAX_BYTES, MeshFileError, read_mesh
 from marsyard.scenarios.offline import VELOCITY_FORMAT, read_answers

@@ -24,8 +24,8 @@ from rasterio.warp import transform
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios import terrain_files
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.terrain_files import check_source, grid_north_deg
-from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError
+from marsyard.scenarios.terrain_files import check_source, grid_north_deg, load_site
+from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 
 #: Mars, equidistant cylindrical about the equator, in metres (IAU 2000 sphere).
 MARS = "+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs"
@@ -53,6 +53,69 @@ def write_tif(folder: Path, name: str = "dtm.tif", **changes: Any) -> Path:
             for key, value in tags.items():
                 setattr(file, key, value)
     return path
+
+
+@pytest.mark.parametrize("projection", ["airy +lat_0=10", "vandg2", "adams_ws1"])
+def test_projections_without_inverse_are_refused(tmp_path: Path, projection: str) -> None:
+    path = write_tif(tmp_path, crs=CRS.from_string(f"+proj={projection} +R=3396190 +units=m +no_defs"))
+    with pytest.raises(TerrainFileError, match=r"projection has no inverse in PROJ .*; allowed: a projection"):
+        check_source(RealTerrain(dtm=path))
+
+
+def write_pds3_dtm(folder: Path, heights: np.ndarray) -> Path:
+    """Write a DTM as PDS3 product with posts every 2 m, in the form of HiRISE's; missing heights are NaN."""
+    rows, columns = heights.shape
+    label = f"""PDS_VERSION_ID = PDS3
+RECORD_TYPE = FIXED_LENGTH
+RECORD_BYTES = 4096
+^IMAGE = 2
+OBJECT = IMAGE_MAP_PROJECTION
+  MAP_PROJECTION_TYPE = "EQUIRECTANGULAR"
+  A_AXIS_RADIUS = 3396.19 <KM>
+  B_AXIS_RADIUS = 3396.19 <KM>
+  C_AXIS_RADIUS = 3396.19 <KM>
+  CENTER_LATITUDE = 0.0 <DEG>
+  CENTER_LONGITUDE = 137.0 <DEG>
+  COORDINATE_SYSTEM_NAME = PLANETOCENTRIC
+  POSITIVE_LONGITUDE_DIRECTION = EAST
+  MAP_SCALE = 2.0 <METERS/PIXEL>
+  LINE_PROJECTION_OFFSET = 0.5 <PIXEL>
+  SAMPLE_PROJECTION_OFFSET = 0.5 <PIXEL>
+END_OBJECT = IMAGE_MAP_PROJECTION
+OBJECT = IMAGE
+  LINES = {rows}
+  LINE_SAMPLES = {columns}
+  SAMPLE_TYPE = PC_REAL
+  SAMPLE_BITS = 32
+  BANDS = 1
+  MISSING_CONSTANT = 16#FF7FFFFB#
+END_OBJECT = IMAGE
+END
+"""
+    missing = np.array([0xFF7FFFFB], dtype="<u4").view("<f4")[0]
+    samples = np.where(np.isnan(heights), missing, heights).astype("<f4")
+    path = folder / "DTEEC_SMALL.IMG"
+    path.write_bytes(label.encode().ljust(4096) + samples.tobytes())
+    return path
+
+
+def test_pds3_products_are_terrain_models(tmp_path: Path) -> None:
+    heights = np.add.outer(np.linspace(-2000.0, -1990.0, 48), np.linspace(0.0, 5.0, 64))
+    heights[3, 4] = np.nan
+    path = write_pds3_dtm(tmp_path, heights)
+    raster, _ = read_rasters(RealTerrain(dtm=path))
+    assert raster.posting_m == 2.0
+    np.testing.assert_allclose(raster.values[::-1], heights, atol=1e-3)
+    assert load_site(str(path)).terrain().source == RealTerrain(dtm=path)
+
+
+def test_other_files_are_refused_with_the_command_that_converts_them(tmp_path: Path) -> None:
+    (tmp_path / "dtm.asc").write_text("ncols 4")
+    for name in (str(tmp_path / "dtm.asc"), "absent.jp2", "folder/gusev"):
+        with pytest.raises(TerrainFileError, match=r"is not a terrain model; allowed: .npz, .tif, .*rio convert"):
+            load_site(name)
+    with pytest.raises(ValueError, match="no site is called 'gusow'; allowed: pisgah"):
+        load_site("gusow")
 
 
 def test_hirise_tile_is_valid(shared_data: Path) -> None:

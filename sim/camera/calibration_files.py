@@ -1,0 +1,199 @@
+"""Readers of calibrations that are not YAML: OpenCV's XML, COLMAP's `cameras.txt`, Ames Stereo Pipeline's pinholes.
+
+Each is converted to the names of OpenCV's YAML files (`camera_matrix`, `distortion_coefficients`, `image_width`,
+`image_height`), which `marsyard.sim.camera.calibrations` reads. COLMAP counts pixels from the corner of the image:
+0.5 is subtracted from its principal point. Files of Ames Stereo Pipeline do not contain the image's size.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+from xml.etree import ElementTree
+
+from marsyard.sim.camera.source import CALIBRATION_FILES, FORMATS, Source
+
+Values = Mapping[str, Any]
+
+#: Start of an XML file, and the first element: an optional declaration, comments, and a name with an optional prefix.
+_XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|!--|!DOCTYPE|[A-Za-z_][\w:.-]*[\s>/])")
+_XML_ROOT = re.compile(rb"<(?:[A-Za-z_][\w.-]*:)?(?P<root>[A-Za-z_][\w.-]*)")
+_XML_PROLOGUE = re.compile(rb"<\?.*?\?>|<!--.*?-->", re.DOTALL)
+#: Root element of OpenCV's files.
+OPENCV_ROOT = "opencv_storage"
+#: First line of a camera in COLMAP's file, after comments; start of a camera of Ames Stereo Pipeline.
+_COLMAP = re.compile(rb"\A(?:\s*#[^\n]*\n|\s*\n)*\s*\d+\s+[A-Z][A-Z_]+\s+\d+\s+\d+\s+[-+.\d]")
+_PINHOLE = re.compile(rb"\A\s*VERSION_\d+\s+PINHOLE\b")
+#: Names of the parameters of COLMAP's models, and whether the model is a fisheye's.
+_COLMAP_MODELS: dict[str, tuple[str, bool]] = {
+    "SIMPLE_PINHOLE": ("f cx cy", False),
+    "PINHOLE": ("fx fy cx cy", False),
+    "SIMPLE_RADIAL": ("f cx cy k1", False),
+    "RADIAL": ("f cx cy k1 k2", False),
+    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", False),
+    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", False),
+    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", True),
+    "RADIAL_FISHEYE": ("f cx cy k1 k2", True),
+    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", True),
+}
+#: Axes of the image of Ames Stereo Pipeline that are OpenCV's.
+_PINHOLE_AXES = {"u_direction": (1.0, 0.0, 0.0), "v_direction": (0.0, 1.0, 0.0), "w_direction": (0.0, 0.0, 1.0)}
+#: Names of which a CSM ISD (image support data in JSON) contains at least one.
+_ISD_NAMES = (
+    *(b'"name_model"', b'"m_modelName"', b'"isis_camera_version"', b'"name_sensor"', b"USGS_ASTRO"),
+    *(b'"image_lines"', b'"detector_sample_summing"', b'"center_ephemeris_time"', b'"body_rotation"'),
+)
+#: Names of which a CSM ISD (image support data in JSON) contains at least one.
+_ISD_NAMES = (
+    *(b'"name_model"', b'"m_modelName"', b'"isis_camera_version"', b'"name_sensor"', b"USGS_ASTRO"),
+    *(b'"image_lines"', b'"detector_sample_summing"', b'"center_ephemeris_time"', b'"body_rotation"'),
+)
+_ASSIGNMENT = re.compile(r"^\s*(?P<name>\w+)\s*=\s*(?P<value>.*?)\s*$")
+
+
+def is_xml(head: bytes) -> bool:
+    """Return whether the first bytes of a file are XML."""
+    return _XML_START.match(head) is not None
+
+
+def xml_root(head: bytes) -> str:
+    """Return the name of the first element in the first bytes of an XML file; empty if there is none."""
+    match = _XML_ROOT.search(_XML_PROLOGUE.sub(b"", head))
+    return "" if match is None else match["root"].decode()
+
+
+def is_colmap(head: bytes) -> bool:
+    """Return whether the first bytes are those of COLMAP's `cameras.txt`."""
+    return _COLMAP.match(head) is not None
+
+
+def is_pinhole(head: bytes) -> bool:
+    """Return whether the first bytes are those of a pinhole model of Ames Stereo Pipeline (`.tsai`)."""
+    return _PINHOLE.match(head) is not None
+
+
+def parse_xml(source: Source, allowed: str) -> ElementTree.Element:
+    """Parse an XML file. Raises CameraFileError; `allowed` describes the file."""
+    text = source.read_text()
+    if "<!ENTITY" in text:  # camera files do not need entities, and nested entities can fill the memory
+        raise source.error("label", "declares entities", f"{allowed}, which has none")
+    try:
+        return ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise source.error("label", f"cannot be parsed ({error})", f"{allowed}, which is XML") from error
+
+
+def read_opencv_xml(source: Source) -> Values:
+    """Read the values of OpenCV's XML. Raises CameraFileError."""
+    values: dict[str, Any] = {}
+    for element in parse_xml(source, CALIBRATION_FILES):
+        data, text = element.find("data"), (element.text or "").strip()
+        if data is not None:
+            values[element.tag] = {"data": (data.text or "").split()}
+        else:
+            values[element.tag] = int(text) if text.isdecimal() else text
+    return values
+
+
+def read_colmap(source: Source) -> list[tuple[str, Values]]:
+    """Read the cameras of COLMAP's `cameras.txt`, in order, with their identifiers. Raises CameraFileError."""
+    cameras: list[tuple[str, Values]] = []
+    for number, line in enumerate(source.read_text().splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        field = f"line {number}"
+        if len(words) < 4 or words[1] not in _COLMAP_MODELS:
+            model = words[1] if len(words) > 1 else ""
+            raise source.error(field, f"the camera model is {model!r}", ", ".join(_COLMAP_MODELS))
+        names, is_fisheye = _COLMAP_MODELS[words[1]]
+        if len(words) != 4 + len(names.split()) or not all(word.isdecimal() for word in words[2:4]):
+            raise source.error(field, f"has {len(words)} words", f"identifier, model, width, height, {names}")
+        numbers = _parse_numbers(source, field, words[4:])
+        terms = dict(zip(names.split(), numbers, strict=True))
+        order = "k1 k2 k3 k4" if is_fisheye else "k1 k2 p1 p2 k3 k4 k5 k6"
+        values = {
+            "camera_matrix": _matrix(
+                terms.get("fx", terms.get("f", 0.0)),
+                terms.get("fy", terms.get("f", 0.0)),
+                terms["cx"] - 0.5,
+                terms["cy"] - 0.5,
+            ),
+            "distortion_coefficients": [terms.get(name, 0.0) for name in order.split()],
+            "distortion_model": "equidistant" if is_fisheye else "rational_polynomial",
+            "image_width": int(words[2]),
+            "image_height": int(words[3]),
+        }
+        cameras.append((words[0], values))
+    return cameras
+
+
+def read_pinhole(source: Source, size: tuple[int, int] | None) -> Values:
+    """Read a pinhole model of Ames Stereo Pipeline with the lens models NULL and TSAI; its pose is ignored.
+
+    The lens model TSAI is OpenCV's. `size` is (columns, rows) of the image. Raises CameraFileError.
+    """
+    lines = source.read_text().splitlines()
+    terms: dict[str, str] = {}
+    lens = "NULL"
+    for line in lines[2:]:
+        match = _ASSIGNMENT.match(line)
+        if match is not None:
+            terms[match["name"]] = match["value"]
+        elif line.strip():
+            lens = line.strip()
+    if lens not in ("NULL", "TSAI"):
+        raise source.error("lens model", f"{lens!r}", "NULL or TSAI")
+    if size is None:
+        raise source.error("size", "missing: the file does not contain it", "size = [columns, rows]")
+    for name, axis in _PINHOLE_AXES.items():
+        if tuple(_parse_numbers(source, name, terms.get(name, "").split())) != axis:
+            raise source.error(name, f"{terms.get(name, 'missing')!r}", " ".join(f"{number:g}" for number in axis))
+
+    def read_number(name: str, default: str = "") -> float:
+        numbers = _parse_numbers(source, name, terms.get(name, default).split())
+        if len(numbers) != 1:
+            raise source.error(name, f"{terms.get(name, 'missing')!r}", "a number")
+        return numbers[0]
+
+    pitch = read_number("pitch")
+    if pitch <= 0.0:
+        raise source.error("pitch", f"{pitch:g}", "the size of a pixel, above 0")
+    coefficients = [read_number(name, "0") for name in ("k1", "k2", "p1", "p2", "k3")] if lens == "TSAI" else []
+    return {
+        "camera_matrix": _matrix(*(read_number(name) / pitch for name in ("fu", "fv", "cu", "cv"))),
+        "distortion_coefficients": coefficients,
+        "image_width": size[0],
+        "image_height": size[1],
+    }
+
+
+def foreign_format(head: bytes) -> str | None:
+    """Return the name of a known format that is not read; None for other files."""
+    if head.startswith(b"LBLSIZE="):
+        return "a VICAR file without a PDS label"
+    if is_xml(head):
+        root = xml_root(head)
+        names = {"document": "a Metashape project", "calibration": "a Metashape calibration", "isd": "a CSM ISD"}
+        return names.get(root)
+    is_isd = head.lstrip().startswith(b"{") and any(name in head for name in _ISD_NAMES)
+    return "a CSM ISD" if is_isd else None
+
+
+def refuse_foreign(source: Source, head: bytes) -> None:
+    """Raise CameraFileError for a known format that is not read; the message lists the supported ones."""
+    name = foreign_format(head)
+    if name is not None:
+        raise source.error("file", f"is {name}, which is not supported", FORMATS)
+
+
+def _matrix(fx: float, fy: float, cx: float, cy: float) -> list[list[float]]:
+    return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+
+
+def _parse_numbers(source: Source, field: str, words: list[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise source.error(field, str(error), "numbers") from error

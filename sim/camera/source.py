@@ -1,0 +1,84 @@
+"""Camera files: reading of their bytes, error messages, and creation of cameras from the vectors of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from marsyard.sim.camera.base import CameraModel, Number
+from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+from marsyard.sim.files import open_regular
+
+#: Maximum size of a camera file; some labels have several megabytes.
+MAX_BYTES = 1 << 23
+#: Calibrations in OpenCV's terms, for messages; and all camera files.
+CALIBRATION_FILES = (
+    "a calibration of OpenCV (camera_matrix, distortion_coefficients, image_width, image_height; YAML, JSON or XML), "
+    "ROS (the same and distortion_model), Kalibr (cam0: ...) or EuRoC (intrinsics, resolution, ...)"
+)
+FORMATS = (
+    f"a PDS3 or PDS4 label, a JPL text file (Model = CAHVOR, ...), {CALIBRATION_FILES}, COLMAP's cameras.txt, or a "
+    "pinhole model of Ames Stereo Pipeline (.tsai)"
+)
+#: Names of the models; each letter of a name is the name of one of the model's vectors.
+MODELS = ("CAHV", "CAHVOR", "CAHVORE")
+
+
+class CameraFileError(ValueError):
+    """A camera file that cannot be used. The message contains the file, the field and the allowed values."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Path of a camera file: reads its content and creates error messages."""
+
+    path: str
+
+    def error(self, field: str, fault: str, allowed: str) -> CameraFileError:
+        """Create the error for a field."""
+        return CameraFileError(f"{self.path}: {field}: {fault}; allowed: {allowed}")
+
+    def read_text(self) -> str:
+        """Read the whole file. Raises CameraFileError if it is unreadable, empty or larger than `MAX_BYTES`."""
+        contents = self.read_head(MAX_BYTES + 1)
+        if len(contents) > MAX_BYTES:
+            raise self.error("file", f"is larger than {MAX_BYTES >> 20} MiB", "a camera file or label, not an image")
+        return contents.decode("latin-1")
+
+    def read_head(self, count: int) -> bytes:
+        """Read at most the first `count` bytes. Raises CameraFileError if the file is unreadable or empty."""
+        try:
+            with open_regular(self.path) as file:
+                first_bytes = file.read(count)
+        except OSError as fault:
+            raise self.error("file", f"cannot be read ({fault.strerror})", "a readable camera file") from fault
+        if not first_bytes:
+            raise self.error("file", "is empty (0 bytes)", "a camera file")
+        return first_bytes
+
+
+def linearity_of_type(kind: Number | None, parameter: float | None, field: str, source: Source) -> float:
+    """Return CAHVORE's linearity: 1 for type 1 (perspective), 0 for type 2 (fish-eye), `parameter` for type 3."""
+    if kind in (1, 2):
+        return 1.0 if kind == 1 else 0.0
+    if kind != 3:
+        raise source.error(field, f"CAHVORE's type is {'missing' if kind is None else kind}", "type 1, 2 or 3")
+    if parameter is None:
+        raise source.error(field, "CAHVORE of type 3 has no parameter", "type 3 with its linearity, from -1 to 1")
+    return parameter
+
+
+def create_camera(
+    name: str, vectors: Mapping[str, Sequence[float]], size: tuple[int, int], linearity: float | None, source: Source
+) -> CameraModel:
+    """Create the camera of a model's name and its vectors by letter. Raises CameraFileError for impossible values."""
+    c, a, h, v, *lens = (np.array(vectors[letter], dtype=np.float64) for letter in name)
+    try:
+        if linearity is not None:
+            return Cahvore(c, a, h, v, lens[0], lens[1], lens[2], linearity=linearity, size=size)
+        return Cahvor(c, a, h, v, lens[0], lens[1], size) if lens else Cahv(c, a, h, v, size)
+    except ValueError as fault:
+        field, allowed = str(fault).partition(" ")[0].upper(), "a camera model of unit A and O and independent H, V, A"
+        raise source.error(field, str(fault), allowed) from fault
