@@ -5,6 +5,7 @@ The expected cameras are the model of the label in the rover's frame, moved with
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def assert_cameras_are_close(camera: CameraModel, expected: CameraModel) -> None
     ],
 )
 def test_models_are_returned_in_the_rover_frame(
-    tmp_path: Path, navcam: CameraModel, write_label, frame: str, frame_from_rover: RigidTransform
+    tmp_path: Path, navcam: CameraModel, write_label: Callable[..., Path], frame: str, frame_from_rover: RigidTransform
 ) -> None:
     path = write_label(tmp_path, navcam.transform(frame_from_rover), frame)
     assert_cameras_are_close(read_camera(path), navcam)
@@ -66,7 +67,9 @@ END_GROUP = LOCAL_LEVEL_COORDINATE_SYSTEM
 
 
 @pytest.mark.parametrize("write_label", [pds3_label, pds4_label])
-def test_rover_pose_in_the_mars_fixed_frame_is_used(tmp_path: Path, navcam: CameraModel, write_label) -> None:
+def test_rover_pose_in_the_mars_fixed_frame_is_used(
+    tmp_path: Path, navcam: CameraModel, write_label: Callable[..., Path]
+) -> None:
     """The model and the rover's pose are both in the Mars-fixed frame, whose vectors have a resolution of 1e-3 m."""
     mars_from_rover = RigidTransform.from_components(
         np.array([701403.2, 3145680.62, 1075894.36]), SITE_FROM_ROVER.rotation
@@ -94,7 +97,9 @@ def test_pose_in_another_site_is_not_used(tmp_path: Path, navcam: CameraModel) -
 
 
 @pytest.mark.parametrize("write_label", [pds3_label, pds4_label])
-def test_frames_without_transform_are_refused_by_name(tmp_path: Path, navcam: CameraModel, write_label) -> None:
+def test_frames_without_transform_are_refused_by_name(
+    tmp_path: Path, navcam: CameraModel, write_label: Callable[..., Path]
+) -> None:
     with pytest.raises(CameraFileError, match=r"RSM_HEAD_FRAME.* has no known transform.*allowed: ROVER, SITE"):
         read_cameras(write_label(tmp_path, navcam, "RSM_HEAD_FRAME"))
     with pytest.raises(CameraFileError, match=r"LOCAL_LEVEL_FRAME.* has no known transform"):

@@ -176,7 +176,7 @@ def _write_epoch_flight(folder: Path, kind: str) -> Path:
         case "ns":
             frame = frame.rename(columns={"time_s": "time_ns"}).assign(time_ns=nanoseconds)
         case "decimal":
-            frame["time_s"] = [Decimal(text) for text in seconds]
+            frame["time_s"] = pd.Series([Decimal(text) for text in seconds], dtype=object)
         case "timestamp":
             frame["time_s"] = pd.to_datetime(nanoseconds)
         case "us":
