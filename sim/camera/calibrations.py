@@ -1,11 +1,12 @@
 """Camera calibrations of other programs: OpenCV, ROS `camera_info`, Kalibr camera chains, EuRoC sensors.
 
 All files are YAML, or are converted to its values (`marsyard.sim.camera.calibration_files`): a camera matrix and
-OpenCV's distortion in OpenCV's axes, z forward, x right, y down; the centre of the upper left pixel is (0, 0), as in Marsyard.
-Each is converted to the nearest camera of the CAHV family (`from_opencv`, `from_opencv_fisheye`). The conversion is
-exact if only k1 and k2 are not zero. A residual above `MAX_RMS_PX` (RMS over the frame) or `MAX_PX` (at any pixel) is an
-error (docs/adr/0020). All cameras of a chain are in the axes of its first camera. The matrix of ROS describes the whole
-detector: its images are cropped to `roi`, then each block of `binning_x` x `binning_y` pixels becomes one pixel.
+OpenCV's distortion in OpenCV's axes, z forward, x right, y down; the centre of the upper left pixel is (0, 0), as in
+Marsyard. Each is converted to the nearest camera of the CAHV family (`from_opencv`, `from_opencv_fisheye`). The
+conversion is exact if only k1 and k2 are not zero. A residual above `MAX_RMS_PX` (RMS over the frame) or `MAX_PX` (at
+any pixel) is an error (docs/adr/0020). All cameras of a chain are in the axes of its first camera. The matrix of ROS
+describes the whole detector: its images are cropped to `roi`, then each block of `binning_x` x `binning_y` pixels
+becomes one pixel.
 
 OpenCV's pinhole model distorts about the direction z with k1, k2, k3 (radial) and p1, p2 (tangential), for a point
 (x, y) of the plane z = 1:
