@@ -40,9 +40,9 @@ from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 from marsyard.reports.stored import read_run
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.measured.image_files import 
+from marsyard.scenarios.measured.image_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.layout import VELOCITY as TASK
-from marsyard.scenarios.measured.layout import IngestError, read_counts, read_flat_field, read_ingest_file, read_table
+from marsyard.scenarios.measured.layout import IngestError, read_ingest_file, read_table
 from marsyard.scenarios.meshes import MeshFileError, read_mesh
 from marsyard.scenarios.offline import VELOCITY_FORMAT, read_answers
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
