@@ -109,7 +109,7 @@ def is_clear_of_boulders(scene: Pass, x: float, y: float) -> bool:
 @pytest.mark.slow
 @all_estimators
 def test_site_is_on_the_ground_and_clear_of_boulders(name: str, scene: Pass, measurements: LandingMeasurements) -> None:
-    # with a limit of 0.12 m, hda-plus finds no safe site: its windows of 0.34 m do not resolve the narrowest such hazard
+    # with a limit of 0.12 m, hda-plus finds no safe site: windows of 0.34 m do not resolve the narrowest such hazard
     options = replace(OPTIONS, max_roughness_m=0.25) if name == "hda-plus" else OPTIONS
     result = ESTIMATORS[name](options).estimate(measurements)
     assert result.outcome is SiteOutcome.SAFE_SITE
