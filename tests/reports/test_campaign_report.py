@@ -16,7 +16,7 @@ import pytest
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.store.record import describe_machine
-from marsyard.reports.campaign import write_report
+from marsyard.reports.campaign import SCHEMA, write_report
 from marsyard.reports.sections import script_hash
 from marsyard.sim.cache import hide_folders
 
@@ -126,7 +126,7 @@ RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
 def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
     text, page, report = _write_and_read(make_run(RUNS[kind](make_rows)))
     _check_page(text, page)
-    assert report["schema"] == 6
+    assert report["schema"] == SCHEMA
     assert report["verdict"] in text
     assert len(text) < 1_000_000
 
