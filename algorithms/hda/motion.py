@@ -257,9 +257,11 @@ def assess_motion(
         kernels.residuals(zero_matches, kernels.Motion(quaternion, translation, inverse_depths))
         for translation in translations
     )
-    residuals = np.hypot(*(with_translation - focal_px * second).T)
+    # points at infinity, or triangulated behind a camera, have no finite residual and are no inliers
+    with np.errstate(invalid="ignore"):
+        residuals = np.hypot(*(with_translation - focal_px * second).T)
     has_small_residual = residuals <= options.max_residual_px
-    shifts_px = np.hypot(*(with_translation - without_translation)[has_small_residual].T)
+    shifts_px = np.hypot(*(with_translation[has_small_residual] - without_translation[has_small_residual]).T)
     return Motion(
         second_from_first=second_from_first,
         depths=depths,
