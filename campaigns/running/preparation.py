@@ -26,6 +26,10 @@ from marsyard.scenarios.systems import systems
 from marsyard.sim.cache import cache_directory, cached_bytes, limit_bytes
 from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
+#: Note before the first compilation on a machine.
+COMPILATION_NOTE = (
+    "compiling numeric kernels once on this machine, about two minutes (to compile in advance: marsyard compile)"
+)
 #: Maximum number of trial cases; the first is excluded from the mean, since it loads code and terrains.
 _MAX_TRIALS = 9
 #: Seconds after which no further trial case is started.
@@ -151,7 +155,7 @@ def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], Non
     missing = [item for item in list_compilations(scenario) if not kernels_are_ready(item[0])]
     if not missing:
         return
-    note("compiling numeric kernels once on this machine, about two minutes (to compile in advance: marsyard compile)")
+    note(COMPILATION_NOTE)
     start_s, work = time.monotonic(), Work(partial(_compile_item, missing), range(len(missing)))
     errors = [result.error for result in chain.from_iterable(executor.run(work)) if result.error is not None]
     for error in errors:

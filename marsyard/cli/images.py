@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from importlib.metadata import version
@@ -143,9 +143,15 @@ class RenderedImage:
         return 1 if self.auto_exposure is None else int(2 ** (16 - self.auto_exposure.detector.parameters.bits))
 
 
-def render_images(request: ImageRequest, *, detector: bool = True, both: bool = True) -> list[RenderedImage]:
-    """Render the requested image. A stereo camera has two images; with `both` False, only the left one is rendered."""
+def render_images(
+    request: ImageRequest, *, detector: bool = True, both: bool = True, note: Callable[[str], None] = lambda _: None
+) -> list[RenderedImage]:
+    """Render the requested image. A stereo camera has two images; with `both` False, only the left one is rendered.
+
+    `note` is called at the start of each stage, with its name.
+    """
     preset, site = sensor.preset(request.camera), request.site_definition
+    note(f"terrain and rocks of {request.site}")
     ground = SiteGround.from_site(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
     cameras = preset.cameras()
     position = (request.east_m, request.north_m, request.altitude_m)
@@ -161,6 +167,7 @@ def render_images(request: ImageRequest, *, detector: bool = True, both: bool = 
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
     for number, camera in enumerate(rendered_cameras):
+        note(f"image {number + 1} of {len(rendered_cameras)}")
         frame = process_renderer(default_backend()).render(scene, rays[number], pose)
         frame = add_unresolved_rocks(frame, scene, ground.rocks, smallest_rad, rms_slope)
         exposure, counts = _expose(request, ground, camera, number, frame, sun) if detector else (None, None)
@@ -229,7 +236,7 @@ def truth_layers(image: RenderedImage) -> dict[str, Any]:
     # Render again without diffuse light: pixels with zero radiance are in shadow.
     direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
     direct_frame = process_renderer(default_backend()).render(
-        replace(scene, photometry=direct_light, edge_rays=1), frame.rays, frame.world_from_body
+        scene.with_photometry(direct_light).with_edge_rays(1), frame.rays, frame.world_from_body
     )
     names = np.append(scene.objects.names, [-2, -1])  # body indices -2 (sky) and -1 (ground)
     return {

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 #: Nadir image: maximum side length, pixels; colours (blue, green, red) of filled holes and of the outline of a DTM.
 MAX_PIXELS = 2048
 HOLE_COLOUR, OUTLINE_COLOUR = (40, 40, 220), (0, 200, 255)
+#: Name of the kernels of `marsyard render` in `marsyard.sim.kernel_cache`, next to the names of scenarios.
+RENDER_KERNELS = "render"
 
 app = typer.Typer(no_args_is_help=True, help="List sites and print statistics of their terrain.")
 
@@ -264,6 +266,7 @@ def render(arguments: RenderOptions) -> None:
     A stereo camera adds -left and -right to PREFIX.
     """
     from marsyard.cli.images import ImageRequest, check_files, render_images, write_image
+    from marsyard.sim.kernel_cache import mark_ready
 
     with report_image_errors(arguments.out):
         settings = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
@@ -273,11 +276,29 @@ def render(arguments: RenderOptions) -> None:
         settings |= {f"{name}_deg": getattr(arguments, name) for name in angles}
         request = ImageRequest.from_defaults(arguments.site, arguments.camera, **settings)
         check_files(arguments.out, arguments.camera, arguments.overwrite)
-        for image in render_images(request, detector=arguments.detector):
+        _note_compilation()
+        images = render_images(request, detector=arguments.detector, note=_print_progress)
+        _print_progress("ground truth and files")
+        for image in images:
             if image.filled is not None and image.filled.any():
                 fraction = f"{image.filled.mean():.1%} of the pixels{image.suffix and f' ({image.suffix[1:]})'}"
                 typer.echo(f"note: {fraction} show filled holes of the DTM (`filled` in the .npz)", err=True)
             typer.echo(", ".join(str(path) for path in write_image(image, request, arguments.out)))
+        mark_ready(RENDER_KERNELS)
+
+
+def _print_progress(text: str) -> None:
+    typer.echo(text, err=True)
+
+
+def _note_compilation() -> None:
+    """Print that the kernels are compiled first, unless this machine has rendered an image or a scenario before."""
+    from marsyard.campaigns.running.preparation import COMPILATION_NOTE
+    from marsyard.scenarios.systems import scenario_paths
+    from marsyard.sim.kernel_cache import kernels_are_ready
+
+    if not any(kernels_are_ready(name) for name in (RENDER_KERNELS, *scenario_paths())):
+        _print_progress(f"note: {COMPILATION_NOTE}")
 
 
 @contextmanager
@@ -304,5 +325,6 @@ def gallery(
     """Render each site with suitable cameras; write one page and a contact sheet. Takes about a minute."""
     from marsyard.cli.gallery import render_gallery
 
+    _note_compilation()
     with report_image_errors(out):
         typer.echo(render_gallery(out, overwrite, terrain or ()))

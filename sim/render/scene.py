@@ -130,8 +130,16 @@ class Scene:
 
     def with_edge_rays(self, edge_rays: int) -> Scene:
         """Return the scene with another number of rays at edges; all cached results are kept."""
-        scene = replace(self, edge_rays=edge_rays)
-        scene.__dict__.update(self.__dict__ | {"edge_rays": edge_rays})
+        return self._replace_and_keep_results(edge_rays=edge_rays)
+
+    def with_photometry(self, photometry: Photometry) -> Scene:
+        """Return the scene with another photometry under the same sun; all cached results are kept."""
+        return self._replace_and_keep_results(photometry=photometry)
+
+    def _replace_and_keep_results(self, **changes: Any) -> Scene:
+        """Return a changed scene with all cached results; the changes must not invalidate any."""
+        scene = replace(self, **changes)
+        scene.__dict__.update(self.__dict__ | changes)
         return scene
 
     def _keep_results(self, scene: Scene, *names: str) -> Scene:

@@ -13,8 +13,14 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.cli import app as cli
+from marsyard.cli import images
 from marsyard.cli.images import SUFFIXES
 from marsyard.sim.camera import read_cahvor
+from marsyard.sim.kernel_cache import mark_ready
+from marsyard.sim.render import Objects, Sun, scene
+from marsyard.sim.render.backend import RenderingError
+from marsyard.sim.render.kernels.casters import Casters
+from marsyard.sim.render.scene import casters_towards
 
 Command = Callable[..., tuple[int, str]]
 
@@ -135,7 +141,7 @@ def test_existing_files_are_kept(marsyard: Command, tmp_path: Path, suffix: str)
     assert existing.read_text() == "existing text"
 
 
-def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> None:
+def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera looks down at the centre of a DTM whose eastern quarter has no heights."""
     heights = 3.0 * np.add.outer(np.sin(np.arange(120) / 7.0), np.cos(np.arange(120) / 9.0))
     heights[:, 90:] = np.nan
@@ -145,9 +151,21 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> 
     status, message = marsyard(*command)
     assert status == 2
     assert "25.0% of its posts have no height; allowed: up to 5.0%" in message
+    calls: list[Sun] = []
+
+    def count_calls(objects: Objects, sun: Sun) -> Casters:
+        calls.append(sun)
+        return casters_towards(objects, sun)
+
+    monkeypatch.setattr(scene, "casters_towards", count_calls)
     status, message = marsyard(*command, "--max-holes", 0.3)
     assert status == 0, message
     assert "show filled holes of the DTM" in message
+    # image and truth layers have the same shadows
+    assert len(calls) == 1
+    # a line at the start of each stage
+    stages = [line for line in message.splitlines() if not line.startswith("note: ")]
+    assert stages == [f"terrain and rocks of {dtm}", "image 1 of 1", "ground truth and files"]
     with np.load(f"{prefix}.npz") as truth:
         is_filled, points = truth["filled"], truth["point_m"]
         assert is_filled.any()
@@ -159,3 +177,23 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path) -> 
     metadata = json.loads(Path(f"{prefix}.json").read_text())
     assert metadata["filled_fraction"] == pytest.approx(float(is_filled.mean()))
     assert metadata["cahvor"]["frame"].startswith("body")
+
+
+@pytest.mark.parametrize("compiled_by", [None, "render", "descent"])
+def test_first_compilation_is_noted(
+    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled_by: str | None
+) -> None:
+    """Without compiled kernels, the note precedes rendering, which is replaced here by an error."""
+
+    def fail(*_arguments: object, **_options: object) -> None:
+        raise RenderingError("stopped")
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
+    monkeypatch.setattr(images, "render_images", fail)
+    if compiled_by is not None:
+        mark_ready(compiled_by)
+    status, message = marsyard("render", "heli-benign", "--camera", "xc-55", "--out", tmp_path / "x")
+    assert status == 2
+    is_noted = message.startswith("note: compiling numeric kernels once on this machine")
+    assert is_noted == (compiled_by is None)
+    assert message.endswith("error: stopped\n")

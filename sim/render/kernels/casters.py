@@ -1,9 +1,11 @@
-"""Occlusion of the sun by triangles (shadow casters), with a two-level grid perpendicular to the sun's direction.
+"""Occlusion of the sun by triangles (shadow casters), with nested grids perpendicular to the sun's direction.
 
 All rays to the sun are parallel. Projected along the sun's direction, a ray is a point (u, v). The coordinate s of a
 triangle's plane and the barycentric weights are linear in u and v. The triangles of each body are listed in the cells
-of a grid over the body's projection. The bodies are listed in the cells of one grid over all bodies. A ray is tested
-only against the triangles of one cell of each body with a projection that contains the ray.
+of a grid over the body's projection. The bodies are listed in the cells of a coarse grid over all bodies, and those of
+each coarse cell again in the cells of a fine grid over them: most bodies may be in few coarse cells, such as the rocks
+around a camera in a scene with hills at a distance of kilometres. A ray is tested only against the triangles of one
+cell of each body with a projection that contains the ray.
 """
 
 from __future__ import annotations
@@ -17,23 +19,25 @@ from marsyard.sim.render.kernels.strips import rotate, unpack_matrix
 from marsyard.sim.render.kernels.structs import Flags, Longs
 from marsyard.sim.terrain.kernels import Array
 
-#: Grid over all bodies: (minimum u and v, cells per metre along u and v); cells along a side; start of each cell's list
-#: and the end of the last list; bodies listed in the cells.
-Grid = tuple[Array, Longs, Longs, Longs]
+#: Grids over all bodies: coarse grid (minimum u and v, cells per metre along u and v); cells along its side; one fine
+#: grid per coarse cell: rows of (minimum u and v, cells per metre along u and v, maximum s), and rows of (cells along a
+#: side, first cell); start of each fine cell's list and the end of the last list; bodies listed in the fine cells.
+SceneGrids = tuple[Array, Longs, Array, Longs, Longs, Longs]
 #: Grids of the bodies: one row of (minimum u and v, cells per metre along u and v, maximum s) per body; one row of
 #: (cells along a side, first cell) per body; start of each cell's list and the end of the last list; triangles listed
 #: in the cells; maximum s of each listed triangle.
 BodyGrids = tuple[Array, Longs, Longs, Longs, Array]
 #: Triangles prepared for one direction of the sun. Three linear functions (constant, slope along u, slope along v) of
 #: each triangle: barycentric weights of its second and third corner, and s of its plane. Axes: unit vectors u and v
-#: perpendicular to the sun's direction, and s along it. Grid over all bodies. Grids of the bodies.
-Casters = tuple[Array, Array, Grid, BodyGrids]
+#: perpendicular to the sun's direction, and s along it. Grids over all bodies. Grids of the bodies.
+Casters = tuple[Array, Array, SceneGrids, BodyGrids]
 #: Bounds: minimum u and v, maximum u, v and s.
 BoundsUVS = tuple[float, float, float, float, float]
 #: Row of a grid: minimum u and v, cells per metre along u and v, maximum s.
 GridRow = tuple[float, float, float, float, float]
-#: Average number of triangles per cell of a body's grid, and the maximum number of cells along a side.
-TRIANGLES_PER_CELL, MAX_CELLS = 4, 1024
+#: Average number of triangles per cell of a body's grid, and of bodies per cell of a fine grid; maximum number of cells
+#: along a side.
+TRIANGLES_PER_CELL, BODIES_PER_CELL, MAX_CELLS = 4, 4, 1024
 #: Margin of all bounds, metres; larger than rounding errors.
 SLACK_M = 1e-6
 #: Twice the projected area of a triangle, square metres, below which it is edge-on and casts no shadow.
@@ -174,16 +178,52 @@ def list_casters(triangles: Array, first_triangle: Longs, axes: Array) -> Caster
     max_s = np.empty(listed_triangles.size)
     for k in range(listed_triangles.size):
         max_s[k] = bounds[listed_triangles[k], 4]
-    # one grid over all bodies
+    return linear, axes, _list_bodies(body_bounds), (body_grids, layouts, triangle_starts, listed_triangles, max_s)
+
+
+@njit(cache=True)
+def _list_bodies(body_bounds: Array) -> SceneGrids:
+    """List the bodies in the cells of a coarse grid, and the bodies of each of these cells in a fine grid."""
+    bodies = body_bounds.shape[0]
     sides = np.array([_choose_side(float(bodies))])
-    scene_grid = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
+    coarse = np.array([[0.0, 0.0, 1.0, 1.0, 0.0]])
     if bodies > 0:
-        scene_grid[0] = _create_grid_row(_enclose_bounds(body_bounds, 0, bodies), sides[0])
-    body_starts, listed_bodies = _list_in_cells(
-        body_bounds, np.array([0, bodies]), scene_grid, sides, np.zeros(1, dtype=np.int64)
+        coarse[0] = _create_grid_row(_enclose_bounds(body_bounds, 0, bodies), sides[0])
+    coarse_starts, coarse_bodies = _list_in_cells(
+        body_bounds, np.array([0, bodies]), coarse, sides, np.zeros(1, dtype=np.int64)
     )
-    grid: Grid = (scene_grid[0, :4].copy(), sides, body_starts, listed_bodies)
-    return linear, axes, grid, (body_grids, layouts, triangle_starts, listed_triangles, max_s)
+    bounds = body_bounds[coarse_bodies]
+    fine_grids = np.empty((coarse_starts.size - 1, 5))
+    layouts = np.empty((coarse_starts.size - 1, 2), dtype=np.int64)
+    cells = 0
+    for cell in range(coarse_starts.size - 1):
+        first, end = coarse_starts[cell], coarse_starts[cell + 1]
+        mean_area = _clip_to_cell(bounds, first, end, coarse[0], cell % sides[0], cell // sides[0])
+        fine_side = 1
+        fine_grids[cell] = 0.0, 0.0, 1.0, 1.0, 0.0
+        if end > first:
+            enclosing = _enclose_bounds(bounds, first, end)
+            # cells smaller than the bodies would list each body many times
+            area = (enclosing[2] - enclosing[0]) * (enclosing[3] - enclosing[1])
+            fine_side = _choose_side(min((end - first) / BODIES_PER_CELL, area / mean_area))
+            fine_grids[cell] = _create_grid_row(enclosing, fine_side)
+        layouts[cell, 0], layouts[cell, 1] = fine_side, cells
+        cells += fine_side * fine_side
+    starts, rows = _list_in_cells(bounds, coarse_starts, fine_grids, layouts[:, 0].copy(), layouts[:, 1].copy())
+    return coarse[0, :4].copy(), sides, fine_grids, layouts, starts, coarse_bodies[rows]
+
+
+@njit(cache=True)
+def _clip_to_cell(bounds: Array, first: int, end: int, grid: Array, column: int, row: int) -> float:
+    """Clip rows of bounds in place to a cell of a grid, with a margin; return their mean area (0 without rows)."""
+    low_u, high_u = grid[0] + column / grid[2] - SLACK_M, grid[0] + (column + 1) / grid[2] + SLACK_M
+    low_v, high_v = grid[1] + row / grid[3] - SLACK_M, grid[1] + (row + 1) / grid[3] + SLACK_M
+    total_area = 0.0
+    for n in range(first, end):
+        bounds[n, 0], bounds[n, 2] = max(bounds[n, 0], low_u), min(bounds[n, 2], high_u)
+        bounds[n, 1], bounds[n, 3] = max(bounds[n, 1], low_v), min(bounds[n, 3], high_v)
+        total_area += (bounds[n, 2] - bounds[n, 0]) * (bounds[n, 3] - bounds[n, 1])
+    return total_area / max(end - first, 1)
 
 
 @njit(cache=True)
@@ -192,7 +232,7 @@ def find_occluded_positions(casters: Casters, x: Array, y: Array, z: Array, hidd
 
     All positions are tested in one call, because passing the arrays takes longer than testing most positions.
     """
-    linear, axes, (grid, sides, body_starts, listed_bodies), body_lists = casters
+    linear, axes, (grid, sides, fine_grids, fine_layouts, body_starts, listed_bodies), body_lists = casters
     body_grids, layouts, triangle_starts, listed_triangles, max_s = body_lists
     to_axes = unpack_matrix(axes)
     side = sides[0]
@@ -205,7 +245,13 @@ def find_occluded_positions(casters: Casters, x: Array, y: Array, z: Array, hidd
         # bounds have a margin: a ray on the border hits no triangle
         if not (0.0 <= column < side and 0.0 <= row < side):
             continue
-        cell = int(row) * side + int(column)
+        coarse_cell = int(row) * side + int(column)
+        fine_side = fine_layouts[coarse_cell, 0]
+        column = (u - fine_grids[coarse_cell, 0]) * fine_grids[coarse_cell, 2]
+        row = (v - fine_grids[coarse_cell, 1]) * fine_grids[coarse_cell, 3]
+        if not (0.0 <= column < fine_side and 0.0 <= row < fine_side):
+            continue
+        cell = fine_layouts[coarse_cell, 1] + int(row) * fine_side + int(column)
         k = body_starts[cell]
         while k < body_starts[cell + 1] and not hidden[position]:
             body = listed_bodies[k]

@@ -1,6 +1,8 @@
 """Tests of cast shadows against an independent ray cast: SciPy's B-spline for the ground, brute force for triangles."""
 
+import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,19 +118,27 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     np.testing.assert_allclose(sun_fraction, expected, atol=0.01)
 
 
-@pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
-def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
-    """The bodies overlap and consist of random triangles of many sizes and orientations."""
-    rng = np.random.default_rng(8)
-    centres = rng.uniform(-5.0, 5.0, (60, 1, 1, 3))
-    triangles = (centres + 10.0 ** rng.uniform(-1.5, 0.3, (60, 1, 1, 1)) * rng.normal(size=(60, 7, 3, 3))).reshape(
-        -1, 3
-    )
+def _random_bodies(rng: np.random.Generator, centres: np.ndarray, sizes: np.ndarray) -> Objects:
+    """Create one body of seven random triangles at each centre."""
+    triangles = (
+        centres[:, None, None] + sizes[:, None, None, None] * rng.normal(size=(len(centres), 7, 3, 3))
+    ).reshape(-1, 3)
     faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
-    body_ids = np.repeat(np.arange(60, dtype=np.int32), 7)
-    objects = Objects.of_mesh(triangles, np.zeros_like(triangles), faces, body_ids, ALBEDO)
+    body_ids = np.repeat(np.arange(len(centres), dtype=np.int32), 7)
+    return Objects.of_mesh(triangles, np.zeros_like(triangles), faces, body_ids, ALBEDO)
+
+
+@pytest.mark.parametrize("distant_m", [0.0, 40.0, 20_000.0])
+@pytest.mark.parametrize("elevation", [-0.2, 0.15, 1.0, np.pi / 2])
+def test_shaded_positions_equal_an_exhaustive_search(elevation: float, distant_m: float) -> None:
+    """The bodies overlap and consist of random triangles of many sizes and orientations; two may be distant."""
+    rng = np.random.default_rng(8)
+    centres = rng.uniform(-5.0, 5.0, (60, 3))
+    centres[-2:, :2] += ([distant_m, 0.3 * distant_m], [-distant_m, distant_m])
+    objects = _random_bodies(rng, centres, 10.0 ** rng.uniform(-1.5, 0.3, 60))
     sun = Sun(direction(0.7, elevation))
     positions = rng.uniform(-9.0, 9.0, (3000, 3))
+    positions[:100] += centres[-1]
     casters = casters_towards(objects, sun)
     result = np.empty(len(positions), dtype=np.bool_)
     find_occluded_positions(casters, *positions.T.copy(), result)
@@ -136,6 +146,48 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float) -> None:
     expected = np.isfinite(cast_triangles(objects, positions, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
     np.testing.assert_array_equal(result, expected)
+
+
+def test_distant_bodies_do_not_slow_down_shadows() -> None:
+    """Hills at kilometres may stand around a camera among thousands of rocks.
+
+    In a grid of 64 x 64 cells over 20 km nearly all 4,000 rocks within 20 m would be in one cell: 100 times as many
+    tests as without the hills.
+    """
+    rng = np.random.default_rng(3)
+    rocks = np.column_stack([rng.uniform(-20.0, 20.0, (4000, 2)), rng.uniform(0.0, 0.1, 4000)])
+    hills = np.array([[9000.0, 4000.0, 50.0], [-7000.0, -9000.0, 50.0]])
+    sun = Sun(direction(0.7, 0.6))
+    positions = np.column_stack([rng.uniform(-20.0, 20.0, (20_000, 2)), np.zeros(20_000)])
+    seconds = []
+    for centres in (rocks, np.concatenate([rocks, hills])):
+        casters = casters_towards(_random_bodies(rng, centres, np.full(len(centres), 0.05)), sun)
+        times = []
+        for _ in range(5):
+            start = time.thread_time()
+            find_occluded_positions(casters, *positions.T.copy(), np.empty(len(positions), dtype=np.bool_))
+            times.append(time.thread_time() - start)
+        seconds.append(min(times))
+    assert seconds[1] < 5.0 * seconds[0]
+
+
+def test_overlapping_bodies_are_listed_in_few_cells() -> None:
+    """Fine cells that are not smaller than the bodies: without this limit each body would be in 100 times as many."""
+    count = 400
+    objects = _random_bodies(np.random.default_rng(5), np.zeros((count, 3)), np.full(count, 1.0))
+    _grid, _sides, _fine_grids, _layouts, _starts, listed_bodies = casters_towards(objects, Sun(direction(0.7, 0.6)))[2]
+    # at most all bodies in all of the coarse cells (one per body), and each in a few fine cells there
+    assert len(listed_bodies) < 4 * count * count
+
+
+def test_another_photometry_keeps_the_shadows(terrain: Surface) -> None:
+    """Photometry and number of rays at edges do not change shadows, which are slow to compute."""
+    scene = Scene(terrain, (0.0, 0.0), Sun(direction(0.7, 0.6)), LAMBERT)
+    occluders = scene.occluders
+    changed = scene.with_photometry(replace(LAMBERT, sky_fraction=0.3)).with_edge_rays(1)
+    assert changed.occluders is occluders
+    assert (changed.photometry.sky_fraction, changed.edge_rays) == (0.3, 1)
+    assert scene.photometry == LAMBERT
 
 
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
