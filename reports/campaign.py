@@ -64,6 +64,8 @@ PAGE_FILE = "report.html"
 REPORT_JSON = "report.json"
 VERIFICATION_FILE = "verification.csv"
 JUNIT_FILE = "junit.xml"
+#: Layout of a page, which the dashboard depends on.
+_LAYOUT_FILES = tuple(Path(__file__).parent / "templates" / name for name in ("report.html.j2", "parts.html.j2"))
 #: Hash of page and data with the key of the user who wrote them; others' reports are written again for the dashboard.
 SIGNATURE_FILE = "report.signature"
 
@@ -128,9 +130,10 @@ def is_own_report(directory: Path, campaign: Path) -> bool:
 
 
 def _compute_signature(directory: Path, campaign: Path) -> str:
-    """Sign page and data of a report, the script that this version allows on pages, and the record and rows."""
+    """Sign page and data of a report, the script and the layout of this version's pages, and the record and rows."""
     files = (directory / PAGE_FILE, directory / REPORT_JSON, campaign / RECORD_FILE, campaign / TABLE_FILE)
-    return sign(explorer.read_script().encode(), *(path.read_bytes() if path.is_file() else b"" for path in files))
+    contents = [explorer.read_script().encode(), *map(Path.read_bytes, _LAYOUT_FILES)]
+    return sign(*contents, *(path.read_bytes() if path.is_file() else b"" for path in files))
 
 
 def section_makers() -> list[SectionMaker]:

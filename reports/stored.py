@@ -126,6 +126,15 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
     return StoredRun(directory, rows, all_rows, record, tuple(stored_cases))
 
 
+def read_cases(directory: Path, cases: Sequence[int]) -> dict[int, dict[str, str]]:
+    """Read the rows of some cases of a campaign's folder as texts, by case; cases without a row are missing."""
+    import pyarrow.parquet as pq
+
+    with report_damage(directory / TABLE_FILE, StoreError, "cannot be read"):
+        rows = pq.read_table(directory / TABLE_FILE, filters=[("case", "in", cases)]).to_pylist() if cases else []
+    return {row["case"]: {name: str(value) for name, value in row.items()} for row in rows}
+
+
 def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Read `frame` and `all_cases` of `StoredRun`; both are one table if there are at most `MAX_FULL_CASES` cases."""
     import pyarrow.parquet as pq

@@ -68,7 +68,7 @@ class Entry:
     - evidence: kind of evidence of the run (`marsyard.campaigns.definition.evidence`)
     - tested: algorithms with versions, options and source hashes: those under test first, then those only compared
     - study: main result of a study; None for an ordinary campaign
-    - showcases, worst: numbers of the cases with stored products, and of the cases with the largest errors
+    - worst: numbers of the cases with the largest errors, the largest first
     """
 
     slug: str
@@ -88,7 +88,6 @@ class Entry:
     verdict: str
     sentence: str
     requirements: tuple[RequirementVerdict, ...]
-    showcases: tuple[int, ...]
     worst: tuple[str, ...]
     outcomes: Mapping[str, int]
     study: Study | None = None
@@ -176,7 +175,6 @@ def _read_entry(path: Path, pages: Path) -> Entry:
         verdict=str(report.get("verdict") or ""),
         sentence=str(report.get("sentence") or ""),
         requirements=tuple(_read_verdict(table(verdict)) for verdict in report.get("verdicts") or ()),
-        showcases=tuple(int(case) for case in report.get("showcases") or ()),
         worst=tuple(str(case) for case in report.get("worst_cases") or ()),
         outcomes={str(key): int(value) for key, value in table(report.get("outcomes")).items()},
         study=Study(*(str(study.get(name)) for name in ("kind", "requirement", "sentence"))) if study else None,

@@ -1,8 +1,8 @@
 """Static site of the dashboard: an index of requirements and campaigns, and a page for each campaign and stored case.
 
 All pages are in the site's folder and need no other files. The reports of campaigns are copied into it, if this user's
-installation wrote them, or are written again.
-Pages of unchanged campaigns are not written again.
+installation wrote them, or are written again. The other pages of a campaign repeat parts of its report, so that no case
+is evaluated or drawn twice. Pages of unchanged campaigns are not written again.
 """
 
 from __future__ import annotations
@@ -17,18 +17,14 @@ from marsyard.campaigns.definition.requirements import SharedRequirement, shippe
 from marsyard.reports.campaign import PAGE_FILE, REPORT_JSON, VERIFICATION_FILE, page_environment, write_atomic
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
-from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.dashboard.excerpts import case_file, read_excerpts
 from marsyard.reports.multiplicity import multiplicity_text
-from marsyard.reports.presentation import ShowcaseView, showcase_view
-from marsyard.reports.requirement_cases import CaseFinder
-from marsyard.reports.sections import embed_json, replay_command, script_hash
-from marsyard.reports.stored import StoredRun
+from marsyard.reports.sections import embed_json, script_hash
+from marsyard.reports.stored import read_cases
 from marsyard.reports.traceability import algorithm_cells, verification_csv
-from marsyard.reports.wording import percent
+from marsyard.reports.wording import NOTHING, percent
 
 INDEX = "index.html"
-#: Maximum number of cases with a page for each campaign.
-_MAX_CASES = 24
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 #: Functions that the templates call to format numbers and verdicts.
 _FORMATTERS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_text, "percent": percent}
@@ -93,57 +89,31 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
     if page.is_file() and page.stat().st_mtime > (entry.report / REPORT_JSON).stat().st_mtime:
         return
     folder.mkdir(parents=True, exist_ok=True)
+    report = (entry.report / PAGE_FILE).read_text(encoding="utf-8")
     if entry.report != folder:
-        write_atomic(folder / PAGE_FILE, (entry.report / PAGE_FILE).read_text(encoding="utf-8"))
-    evaluation = evaluate_run(entry.directory)
-    finder = CaseFinder(evaluation.run, evaluation.verdicts)
-    cases = _write_cases(folder, entry, evaluation.run, finder)
-    links = {int(case["case"]): case["file"] for case in cases}
-    lists = finder.requirement_cases()
-    text = _render(
-        "dashboard_campaign.html.j2",
-        entry=entry,
-        cases=cases,
-        lists=lists,
-        links=links,
-        multiplicity=multiplicity_text(entry.requirements),
-        **_FORMATTERS,
-    )
-    write_atomic(page, text)
-
-
-def _write_cases(folder: Path, entry: Entry, run: StoredRun, finder: CaseFinder) -> list[dict[str, str]]:
-    """Write a page for each stored case and return the links to these pages: violations, then the largest errors."""
-    notable = finder.notable_cases(_MAX_CASES)
-    order = {case: rank for rank, case in enumerate(notable)}
-    cases = sorted(entry.showcases, key=lambda case: (order.get(case, len(order)), _rank_among_worst(entry, case)))[
-        :_MAX_CASES
+        write_atomic(folder / PAGE_FILE, report)
+    excerpts = read_excerpts(report)
+    rows = read_cases(entry.directory, list(excerpts.cases))
+    for case, content in excerpts.cases.items():
+        row = rows.get(case, {})
+        outcome = row.get("outcome", NOTHING)
+        text = _render("dashboard_case.html.j2", entry=entry, case=case, outcome=outcome, content=content, row=row)
+        write_atomic(folder / case_file(case), text)
+    cases = [
+        {"case": case, "file": case_file(case), "outcome": rows.get(case, {}).get("outcome", NOTHING)}
+        | {"rank": _describe_rank(entry, case)}
+        for case in excerpts.cases
     ]
-    views: dict[int, ShowcaseView] = {case: view for case in cases if (view := showcase_view(run, case)) is not None}
-    files, links = {case: f"case-{case}.html" for case in views}, []
-    for case, showcase in views.items():
-        row = run.all_cases[run.all_cases["case"] == case] if "case" in run.all_cases else run.all_cases[:0]
-        values = {str(name): str(value) for name, value in row.iloc[0].items()} if len(row) else {}
-        command = replay_command(run, str(case))
-        page = _render(
-            "dashboard_case.html.j2",
-            entry=entry,
-            showcase=showcase,
-            values=values,
-            command=command,
-            summary=finder.summary(case),
-            links=files,
-        )
-        write_atomic(folder / files[case], page)
-        index = _rank_among_worst(entry, case)
-        rank = "" if index == len(entry.worst) else ("the largest error" if index == 0 else "among the largest errors")
-        links.append({"case": str(case), "outcome": showcase.outcome, "file": files[case], "rank": rank})
-    return links
+    multiplicity = multiplicity_text(entry.requirements)
+    context = {"entry": entry, "cases": cases, "lists": excerpts.lists, "multiplicity": multiplicity}
+    write_atomic(page, _render("dashboard_campaign.html.j2", **context, **_FORMATTERS))
 
 
-def _rank_among_worst(entry: Entry, case: int) -> int:
-    """Return the rank (from 0) of a case by its error; the number of ranked cases if the case has no rank."""
-    return entry.worst.index(str(case)) if str(case) in entry.worst else len(entry.worst)
+def _describe_rank(entry: Entry, case: int) -> str:
+    """Describe the rank of a case by its error; empty if the case is not among the largest errors."""
+    if str(case) not in entry.worst:
+        return ""
+    return "the largest error" if entry.worst[0] == str(case) else "among the largest errors"
 
 
 def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
