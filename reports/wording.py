@@ -26,27 +26,40 @@ _POPULATIONS = {"all": "all cases", "completed": "completed cases", "valid": "va
 
 def requirement_text(requirement: Any) -> str:
     """Describe the criterion of a requirement (of a campaign) or of a `Verdict` in words."""
-    metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
-    condition = _read_notes()["metrics"].get(metric, _to_words(metric if requirement.bound is None else name))
-    if requirement.bound is not None and not math.isnan(requirement.bound):
-        factor_text = "" if requirement.scale == 1.0 else f"{requirement.scale:g} × "
-        magnitude = condition if unit == "s" else f"|{condition}|"
-        condition = f"{factor_text}{magnitude} ≤ {requirement.bound:g} {unit}".rstrip()
     confidence = f"{format_fraction(requirement.confidence)} confidence"
     by_rate = requirement.decide_by == "estimate"
-    decision = f"evaluated by observed rate; bounds at {confidence}" if by_rate else f"at {confidence}"
+    decision = f"evaluated by the observed rate, with bounds at {confidence}" if by_rate else f"at {confidence}"
     population = population_text(requirement.population)
-    return f"{condition} in at least {format_fraction(requirement.probability)} of {population}, {decision}"
+    return f"{_metric_text(requirement)} in at least {format_fraction(requirement.probability)} of {population}, {decision}"
+
+
+def _metric_text(requirement: Any) -> str:
+    """Describe when a case meets a requirement; columns of other packages are quoted by name."""
+    metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
+    words = _read_notes()["metrics"].get(metric)
+    if requirement.bound is None or math.isnan(requirement.bound):
+        return words or f"'{metric}' is true"
+    quantity = words or f"the magnitude of '{_to_words(name)}'"
+    factor = "" if requirement.scale == 1.0 else f"{requirement.scale:g} times "
+    return f"{factor}{quantity} is at most {requirement.bound:g} {unit}".rstrip()
 
 
 def population_text(population: str) -> str:
-    """Describe a population: ``valid answers``, ``cases with feasible overlap``."""
-    parts = population.split(" and ")
+    """Describe a population: ``valid answers``, ``cases with feasible overlap``; other packages' columns by name."""
+    phrases, parts = _read_notes()["populations"], population.split(" and ")
+    if len(parts) > 1 and population in phrases:
+        return phrases[population]
     base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
-    phrases = _read_notes()["populations"]
     flags = [part for part in parts if part and part not in _POPULATIONS]
-    texts = [phrases.get(flag, f"with {_to_words(flag.removeprefix('with_'))}") for flag in flags]
-    return f"{base} {', '.join(texts)}" if texts else base
+    text = " ".join([base, _enumerate([phrases[flag] for flag in flags if flag in phrases])]).rstrip()
+    unknown = [f"'{flag}'" for flag in flags if flag not in phrases]
+    return f"{text} for which {_enumerate(unknown)} {'is' if len(unknown) == 1 else 'are'} true" if unknown else text
+
+
+def _enumerate(texts: Sequence[str]) -> str:
+    """Join texts: ``a``, ``a and b``, ``a, b, and c``."""
+    head, last = texts[:-1], "".join(texts[-1:])
+    return f"{', '.join(head)}{',' if len(head) > 1 else ''} and {last}" if head else last
 
 
 def number(value: float) -> str:

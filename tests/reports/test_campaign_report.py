@@ -176,7 +176,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
     text, _, report = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
     assert ".status-met-by-rate { --status: var(--rate)" in text
-    assert "evaluated by observed rate; bounds at" in text
+    assert "evaluated by the observed rate, with bounds at" in text
     diamond_path = "M12 1L23 12 12 23 1 12z"
     assert diamond_path in text.split("<span>MET BY RATE</span>")[0].rsplit("<svg", 1)[1]
     assert (report["verdict"], report["exit_code"]) == ("MET BY RATE", 3)

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.rates import fraction_of
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
@@ -33,6 +34,7 @@ from marsyard.reports.wording import (
     primary_metric,
     requirement_text,
 )
+from marsyard.scenarios.systems import catalogue
 
 REQUIREMENTS = Path(__file__).parents[2] / "scenarios" / "requirements.toml"
 
@@ -158,10 +160,12 @@ def test_requirement_texts_describe_metric_and_population() -> None:
         )
         for name, entry in entries.items()
     }
-    assert texts["VTT-POS"].startswith(
-        "|position error| ≤ 0.03 m in at least 99 % of valid answers at selectable targets"
+    assert texts["VTT-POS"] == (
+        "the position error is at most 0.03 m in at least 99 % of valid answers for selectable targets, "
+        "at 90 % confidence"
     )
     assert texts["HDA-SAFE"].startswith("the reported site is safe in at least 99 % of cases with a reported site")
+    assert "cases with a selectable target and a rover that is not stuck, at 90 %" in texts["VTT-TRACK"]
     times = {
         "id": "TIME",
         "metric": "tracking_time_s + motion_time_s + structure_time_s + hazards_time_s",
@@ -171,6 +175,35 @@ def test_requirement_texts_describe_metric_and_population() -> None:
         "confidence": 0.9,
     }
     scaled = requirement_text(Requirement.model_validate(times))
-    assert scaled.startswith("60 × run time of all stages ≤ 2 s in at least 95 %")
-    assert population_text("valid and selectable and navcam") == "valid answers at selectable targets, with the navcam"
-    assert population_text("in_the_dark") == "cases with in the dark"
+    assert scaled.startswith("60 times the run time of all stages is at most 2 s in at least 95 % of all cases")
+    by_rate = Requirement.model_validate({**times, "metric": "my_error_m", "decide_by": "estimate"})
+    assert requirement_text(by_rate) == (
+        "60 times the magnitude of 'my error' is at most 2 m in at least 95 % of all cases, "
+        "evaluated by the observed rate, with bounds at 90 % confidence"
+    )
+
+
+@pytest.mark.parametrize(
+    ("population", "text"),
+    [
+        ("valid and selectable and navcam", "valid answers with the navcam for selectable targets"),
+        ("fault_free and navcam and clear_sky", "cases without a fault, with the navcam, and without clouds"),
+        ("in_the_dark", "cases for which 'in_the_dark' is true"),
+        ("valid and navcam and wet and cold", "valid answers with the navcam for which 'wet' and 'cold' are true"),
+    ],
+)
+def test_populations_are_described_in_words(population: str, text: str) -> None:
+    assert population_text(population) == text
+
+
+@pytest.mark.parametrize("campaign", sorted(catalogue()))
+def test_criteria_of_the_catalogue_are_written_by_hand(campaign: str) -> None:
+    """No text of a requirement contains the name of a column, or a series of phrases that start with "with"."""
+    for requirement in load_campaign(campaign).configuration.requirements:
+        text = requirement_text(requirement)
+        # without an entry in `templates/notes.toml`, the name of the column is quoted; 'no safe site' is an answer
+        assert "'" not in text.replace("'no safe site'", "").replace("rover's", "").replace("lander's", ""), text
+        assert not set("_|≤") & set(text), text
+        population = population_text(requirement.population)
+        assert population.startswith(("all cases", "cases ", "completed cases", "valid answers"))
+        assert population.count(" with ") <= 1 + population.count(" and with "), text
