@@ -199,7 +199,7 @@ def page_context(
         context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": content_hash}
     return context | {
         "error_figures": sections.error_figures(random_run.frame, random_run.all_cases, metric, bound),
-        "driver_figures": sections.driver_figures(random_run.frame, metric, bound),
+        "driver_figures": sections.driver_figures(random_run.frame, metric, bound, random_run.driver_columns(metric)),
         "statistics": statistics_grid(random_run.all_cases, metric),
         "worst": sections.worst_cases(random_run, metric, cases_with_images),
         "unanswered": sections.unanswered_cases(random_run, metric, cases_with_images),

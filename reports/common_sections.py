@@ -167,7 +167,7 @@ def drivers_section(subject: Subject) -> Section | None:
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
         responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
-    columns = driver_columns(frame, metric, MAX_CONDITIONS)
+    columns = driver_columns(frame, metric, MAX_CONDITIONS, subject.run.conditions)
     ranked_drivers = {
         name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
     }

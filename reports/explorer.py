@@ -16,7 +16,7 @@ from markupsafe import Markup
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.sections import replay_command
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.wording import axis_columns, driver_columns, is_varying_number, label, numbers
+from marsyard.reports.wording import axis_columns, is_varying_number, label, numbers
 
 #: Maximum number of points of the explorer, without violations, and of violations. Maximum number of notable cases of
 #: each kind: largest errors, no answer, crashed.
@@ -45,7 +45,7 @@ def explorer_data(
     """
     frame, all_cases = run.frame, run.all_cases
     components = axis_columns(metric, [str(name) for name in frame.columns])[:2]
-    drivers = driver_columns(frame, metric)
+    drivers = run.driver_columns(metric)
     first = [*components, metric, *drivers]
     explored = [
         str(name) for name in frame.columns if name not in _NOT_EXPLORED and is_varying_number(frame, str(name))

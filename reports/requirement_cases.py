@@ -23,7 +23,7 @@ from marsyard.reports.presentation import Cause, system_presentation, thumbnail,
 from marsyard.reports.section import Grid, build_grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import NOTHING, count, driver_columns, label, number, numbers, percent, split_unit
+from marsyard.reports.wording import NOTHING, count, label, number, numbers, percent, split_unit
 
 #: Maximum number of violations, and of the cases nearest to the limit, that are listed for a requirement.
 MAX_VIOLATIONS, MAX_NEAREST = 9, 3
@@ -31,8 +31,6 @@ MAX_VIOLATIONS, MAX_NEAREST = 9, 3
 MAX_DRIVERS, MAX_SIMILAR = 12, 3
 #: A driver is unusual outside the central fraction of 95 % of the campaign's values.
 _USUAL = 0.95
-#: Minimum number of cases for percentiles.
-_MIN_CASES = 20
 
 
 @dataclass(frozen=True)
@@ -96,13 +94,17 @@ class CaseDriver:
 
 @dataclass(frozen=True)
 class CaseSummary:
-    """Summary of a case: results by requirement, conditions, previous and next violation, and similar violations."""
+    """Summary of a case: results by requirement, conditions, previous and next violation, and similar violations.
+
+    cases: number of cases of the percentiles
+    """
 
     statuses: Sequence[CaseStatus]
     drivers: Sequence[CaseDriver]
     previous: int | None
     following: int | None
     similar: Sequence[int]
+    cases: int
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ class CaseFinder:
             and (margins := compute_margins(self._frame, verdict, margin_columns[name])) is not None
         ]
         metric = next((item.verdict.metric for item in self._evaluated if math.isfinite(item.verdict.bound)), "")
-        self._drivers = driver_columns(run.frame, metric, MAX_DRIVERS) if "case" in self._frame else []
+        self._drivers = run.driver_columns(metric, MAX_DRIVERS) if "case" in self._frame else []
         values_by_driver = {column: numbers(run.frame, column) for column in self._drivers}
         self._ordered_values = {name: np.sort(values[np.isfinite(values)]) for name, values in values_by_driver.items()}
         is_violation = np.zeros(len(self._frame), dtype=np.bool_)
@@ -198,7 +200,8 @@ class CaseFinder:
         earlier = [other for other in self.violating_cases if other < case]
         later = [other for other in self.violating_cases if other > case]
         previous, following = (earlier[-1] if earlier else None), (later[0] if later else None)
-        return CaseSummary(statuses, self._case_drivers(row), previous, following, self._similar_violations(row))
+        similar = self._similar_violations(row)
+        return CaseSummary(statuses, self._case_drivers(row), previous, following, similar, len(self._run.frame))
 
     def _list_cases(self, item: _Evaluated) -> RequirementCases:
         violations = item.violations
@@ -247,10 +250,10 @@ class CaseFinder:
         return f"{words} {number(abs(value))} {unit}, limit {verdict.bound:g} {unit}".replace(" ,", ",").rstrip()
 
     def _percentile(self, column: str, row: int) -> float:
-        """Return the percentile of a case's value among all cases; NaN without a value, or for too few cases."""
+        """Return the percentile of a case's value among all cases; NaN without a value."""
         ordered = self._ordered_values[column]
         value = to_float(self._frame[column].iloc[row]) if column in self._frame else math.nan
-        if ordered.size < _MIN_CASES or math.isnan(value):
+        if not ordered.size or math.isnan(value):
             return math.nan
         # mid-rank, so that a frequent value is not extreme
         below, up_to = (np.searchsorted(ordered, value, side) for side in ("left", "right"))

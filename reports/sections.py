@@ -39,7 +39,6 @@ from marsyard.reports.wording import (
     axis_columns,
     coefficient,
     count,
-    driver_columns,
     format_fraction,
     label,
     number,
@@ -143,7 +142,7 @@ def crashed_rows(run: StoredRun) -> CaseTable:
 
 
 def _condition_columns(run: StoredRun, metric: str) -> list[str]:
-    return ["terrain", *driver_columns(run.frame, metric, max_columns=3)]
+    return ["terrain", *run.driver_columns(metric, max_columns=3)]
 
 
 def _case_table(
@@ -328,10 +327,10 @@ def error_figures(frame: pd.DataFrame, all_cases: pd.DataFrame, metric: str, bou
     return _svg_figures(entries)
 
 
-def driver_figures(frame: pd.DataFrame, metric: str, bound: float | None) -> list[SvgFigure]:
-    """Draw a metric against each of its drivers, with rank correlations."""
+def driver_figures(frame: pd.DataFrame, metric: str, bound: float | None, columns: Sequence[str]) -> list[SvgFigure]:
+    """Draw a metric against the conditions `columns`, with rank correlations."""
     entries, magnitude, groups = [], np.abs(numbers(frame, metric)), terrain_groups(frame)
-    for index, column in enumerate(driver_columns(frame, metric)):
+    for index, column in enumerate(columns):
         driver = estimate_driver(numbers(frame, column), magnitude, groups, CONFIDENCE)
         sentences = [] if driver is None else [f"Rank correlation {rank_text(driver)}."]
         n_beyond = figures.count_beyond_axis(frame, metric, column, bound)

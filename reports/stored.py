@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
+from marsyard.scenarios.systems import row_columns
 from marsyard.sim.files import report_damage
 
 #: Maximum number of cases of which all columns are read. In a larger campaign, all columns are read only for the first
@@ -67,6 +69,15 @@ class StoredRun:
             if isinstance(stored_requirements, list | tuple)
             else []
         )
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names or patterns of the columns that the scenario declares as conditions; empty if unknown."""
+        return _read_conditions(self.record)
+
+    def driver_columns(self, metric: str, max_columns: int = 6) -> list[str]:
+        """Select conditions that may affect a metric; see `marsyard.reports.wording.driver_columns`."""
+        return driver_columns(self.frame, metric, max_columns, self.conditions)
 
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
@@ -131,7 +142,8 @@ def read_cases(directory: Path, cases: Sequence[int]) -> dict[int, dict[str, str
     import pyarrow.parquet as pq
 
     with report_damage(directory / TABLE_FILE, StoreError, "cannot be read"):
-        rows = pq.read_table(directory / TABLE_FILE, filters=[("case", "in", cases)]).to_pylist() if cases else []
+        has_cases = bool(cases) and "case" in pq.read_schema(directory / TABLE_FILE).names
+        rows = pq.read_table(directory / TABLE_FILE, filters=[("case", "in", cases)]).to_pylist() if has_cases else []
     return {row["case"]: {name: str(value) for name, value in row.items()} for row in rows}
 
 
@@ -159,11 +171,19 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         )
     metric = primary_metric(first_rows, requirements)
     if metric is not None:
-        columns.update(
-            [metric, *axis_columns(metric, stored_names), *driver_columns(first_rows, metric, max_columns=3)]
-        )
+        drivers = driver_columns(first_rows, metric, max_columns=3, conditions=_read_conditions(record))
+        columns.update([metric, *axis_columns(metric, stored_names), *drivers])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if name in columns])
     return _sort_rows(first_rows), _sort_rows(all_cases)
+
+
+def _read_conditions(record: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the conditions that the scenario of a record declares; empty if they are unknown."""
+    scenario = record.get("scenario") or table(record.get("configuration")).get("scenario")
+    with suppress(ValueError):  # an invalid file of another package
+        columns = row_columns(str(scenario or ""))
+        return () if columns is None else columns.conditions
+    return ()
 
 
 def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:

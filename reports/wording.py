@@ -6,6 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,8 @@ def requirement_text(requirement: Any) -> str:
     confidence = f"{format_fraction(requirement.confidence)} confidence"
     by_rate = requirement.decide_by == "estimate"
     decision = f"evaluated by the observed rate, with bounds at {confidence}" if by_rate else f"at {confidence}"
-    population = population_text(requirement.population)
-    return f"{_metric_text(requirement)} in at least {format_fraction(requirement.probability)} of {population}, {decision}"
+    cases = f"{format_fraction(requirement.probability)} of {population_text(requirement.population)}"
+    return f"{_metric_text(requirement)} in at least {cases}, {decision}"
 
 
 def _metric_text(requirement: Any) -> str:
@@ -155,7 +156,7 @@ _UNITS = {
     "_k": "K",
 }  # fmt: skip
 _AXES = ("x", "y", "z")
-#: Pattern of columns that describe the run or the results, not the conditions of the case.
+#: Pattern of columns that describe the run or the results, for scenarios that do not declare their conditions.
 _EXCLUDED_COLUMNS = re.compile(
     r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
     r"|^firing_|^touchdown_|^site_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
@@ -220,15 +221,18 @@ def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
     return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
 
 
-def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> list[str]:
-    """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation."""
+def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6, conditions: Sequence[str] = ()) -> list[str]:
+    """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation.
+
+    conditions: names or patterns of the scenario's conditions; empty if unknown
+    """
     names = [str(name) for name in frame.columns]
     excluded_names = {metric, *axis_columns(metric, names), "terrain"}
     candidates = [
         name
         for name in names
         if name not in excluded_names
-        and not _EXCLUDED_COLUMNS.search(name)
+        and _is_condition(name, conditions)
         and _is_number(frame, name)
         and frame[name].nunique() > 1
     ]
@@ -239,6 +243,13 @@ def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6) -> li
         key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
     )
     return [*preferred_names, *others][:max_columns]
+
+
+def _is_condition(name: str, conditions: Sequence[str]) -> bool:
+    """Whether a column matches one of the patterns; without patterns, whether its name does not look like a result."""
+    if conditions:
+        return any(fnmatchcase(name, pattern) for pattern in conditions)
+    return not _EXCLUDED_COLUMNS.search(name)
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:

@@ -262,6 +262,8 @@ class RowColumns:
     - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth, and the
       definition of each; a list in the file has empty definitions
     - configured: boolean columns that the configuration of a case determines, such as its camera or its driving mode
+    - conditions: names or patterns of the numbers that describe the conditions of a case, not results of the algorithm;
+      empty if unknown
     """
 
     flags: tuple[str, ...]
@@ -269,6 +271,7 @@ class RowColumns:
     named_flags: str = ""
     from_truth: Mapping[str, str] = field(default_factory=dict)
     configured: tuple[str, ...] = ()
+    conditions: tuple[str, ...] = ()
 
     def has_flag(self, name: str) -> bool:
         """Return whether a boolean column may have this name."""
@@ -296,6 +299,7 @@ def row_columns(scenario: str) -> RowColumns | None:
             columns.get("named_flags", ""),
             dict(from_truth) if isinstance(from_truth, Mapping) else dict.fromkeys(from_truth, ""),
             tuple(columns.get("configured", ())),
+            tuple(columns.get("conditions", ())),
         )
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise ValueError(f"{system.columns}: invalid columns: {type(error).__name__}: {error}") from error

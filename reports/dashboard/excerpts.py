@@ -1,7 +1,8 @@
 """Parts of a report page that the dashboard's pages of a campaign and of its cases repeat.
 
-The report must be one that this user's installation wrote (`marsyard.reports.campaign.is_own_report`): the parts are not
-escaped again. Values from a campaign are escaped in the report, so they cannot contain the limits of a part.
+The report must be one that this user's installation wrote (`marsyard.reports.campaign.is_own_report`), because the
+parts are not escaped again. Values from a campaign are escaped in the report, so they cannot contain the limits of a
+part.
 """
 
 from __future__ import annotations

@@ -270,6 +270,21 @@ def test_report_sends_no_network_requests(campaigns: Path, open_page: OpenPage) 
     assert [url for url in log.requests if not url.startswith("data:")] == [_report_path(campaigns).resolve().as_uri()]
 
 
+@pytest.mark.parametrize("width", [1280, 820, 360])
+def test_percentiles_of_a_case_are_not_cut_off(campaigns: Path, open_page: OpenPage, width: int) -> None:
+    page, _ = open_page(next((campaigns / "site").rglob("case-3.html")), width=width)
+    # the longest name of a condition must wrap instead of moving the percentiles out of the section
+    page.locator(".case-summary tbody th").evaluate_all(
+        "cells => { for (const cell of cells) cell.textContent = 'maximum '.repeat(12) }"
+    )
+    section = page.locator("#main section").first.bounding_box()
+    assert section is not None
+    for cell in page.locator(".case-summary tbody td:last-child").all():
+        box = cell.bounding_box()
+        assert box is not None
+        assert box["x"] + box["width"] <= section["x"] + section["width"]
+
+
 # Layout depends on the width, contrast on the scheme: two of the four combinations cover both.
 @pytest.mark.parametrize(
     ("page_kind", "width", "scheme"),

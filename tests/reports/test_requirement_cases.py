@@ -24,6 +24,8 @@ from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation, gallery_cases, thumbnail
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder, compute_margins
 from marsyard.reports.vtt.presentation import VTT
+from marsyard.reports.wording import label
+from tests.reports.hda import synthetic_landing
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
@@ -140,6 +142,41 @@ def test_summary_has_results_percentiles_and_neighbours(
     assert 30 not in summary.similar
     assert set(summary.similar) <= set(cases)
     assert finder.summary(1000) is None
+
+
+def test_conditions_of_a_landing_contain_no_results(make_run: MakeRun) -> None:
+    frame = synthetic_landing.landing_frame(30).assign(answered=True)
+    rng = np.random.default_rng(1)
+    results = ["footprints_roughness_below_1_unflagged", "gross_hazards_unflagged", "tracks", "points", "inliers"]
+    conditions = ["sun_elevation_deg", "pose_tilt_error_deg", "rocks_abundance"]
+    frame = frame.assign(**{name: rng.random(len(frame)) for name in (*results, *conditions)})
+    evaluation = evaluate_run(make_run(frame, [AVAILABLE], configuration={"scenario": "landing"}, scenario="landing"))
+    summary = CaseFinder(evaluation.run, evaluation.verdicts).summary(0)
+    assert summary is not None
+    assert {driver.name for driver in summary.drivers} >= {label(name) for name in conditions}
+    results += [str(name) for name in frame if str(name).startswith(("footprints", "gross"))]
+    assert not {driver.name for driver in summary.drivers} & {label(name) for name in results}
+    # the other sections and the explorer use the same selection
+    assert set(evaluation.run.driver_columns("", 1000)) <= {name for name in frame if name not in results}
+
+
+def test_percentiles_exist_in_runs_of_few_cases(make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]) -> None:
+    frame = make_rows(8)
+    frame["off_nadir_max_deg"] = [3.0, 1.0, 2.0, 7.0, 4.0, 5.0, 6.0, 8.0]
+    finder = _make_finder(make_run, frame, velocity)
+    summaries = [finder.summary(case) for case in range(8)]
+    texts = [
+        next(driver.percentile_text for driver in summary.drivers if driver.name == label("off_nadir_max_deg"))
+        for summary in summaries
+        if summary is not None
+    ]
+    # mid-ranks of 8 values: (rank - 0.5) / 8
+    assert texts == ["31", "6", "19", "81", "44", "56", "69", "94"]
+    assert {summary.cases for summary in summaries if summary is not None} == {8}
+    # no value of so few cases is outside of the central 95 %
+    assert not [
+        listed for entry in finder.requirement_cases() for listed in entry.nearest if "cases)" in listed.sentence
+    ]
 
 
 def test_similar_violations_have_the_nearest_conditions(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fnmatch
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,6 +29,7 @@ from marsyard.scenarios.systems import (
     row_columns,
     scenario,
     scenario_names,
+    scenario_paths,
     scenario_source,
     systems,
     template_paths,
@@ -92,6 +95,23 @@ def test_built_in_systems_are_complete() -> None:
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
 
+@pytest.mark.parametrize("name", sorted(scenario_paths()))
+def test_conditions_are_columns_and_no_results(name: str) -> None:
+    columns = row_columns(name)
+    assert columns is not None
+    assert columns.conditions
+    # a pattern is a column or matches one
+    assert [
+        pattern for pattern in columns.conditions if not fnmatch.filter([*columns.numbers, *columns.flags], pattern)
+    ] == []
+    conditions = {number for pattern in columns.conditions for number in fnmatch.filter(columns.numbers, pattern)}
+    results = re.compile(
+        r"estimat|footprint|touchdown|^site_|^position_error|^velocity_error|^firing|inliers|tracks|tracked|matche[sd]"
+        r"|^elevation_|_safe$|_unflagged$|_time_s$|residual|nees|_sd_|^lost|^false|^updates$|^update_"
+    )
+    assert [column for column in conditions if results.search(column)] == []
+
+
 def test_system_of_another_package_is_registered(install: Install) -> None:
     files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'limits.toml', columns=HERE / 'columns.toml'"
     requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
@@ -109,6 +129,7 @@ def test_system_of_another_package_is_registered(install: Install) -> None:
     columns = row_columns("mine-case")
     assert columns is not None
     assert columns.has_number("metres")
+    assert columns.conditions == ()
     campaigns = json.loads(CliRunner().invoke(app, ["list", "--json"]).stdout)
     assert "mine-one" in [entry["name"] for entry in campaigns]
 

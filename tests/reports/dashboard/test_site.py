@@ -13,10 +13,12 @@ from typing import Any
 
 import pandas as pd
 import pytest
+from markupsafe import escape
 
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
+from marsyard.reports import campaign
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.entries import (
     RequirementVerdict,
@@ -27,7 +29,9 @@ from marsyard.reports.dashboard.entries import (
     requirement_rows,
     sparkline,
 )
+from marsyard.reports.dashboard.excerpts import read_excerpts
 from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sections import script_hash
 
 Rows = Callable[..., pd.DataFrame]
@@ -94,6 +98,54 @@ def test_links_have_targets_in_the_site(
             assert target.is_relative_to(site.resolve())
             assert target.is_file(), link
     assert (next(site.glob("c/*")) / "report.html").is_file()
+
+
+def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
+    make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A campaign costs neither an evaluation nor a figure: both are parts of the report that this user has written."""
+    directory = make_run(make_rows(24, error_scale=4.0)[MIN_COLUMNS], products=dimes_products)
+    report = write_report(directory).read_text(encoding="utf-8")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise AssertionError("evaluated or drawn again")
+
+    for name in ("marsyard.reports.dashboard.entries.evaluate_run", "matplotlib.figure.Figure.savefig"):
+        monkeypatch.setattr(name, fail)
+    monkeypatch.setattr(CaseFinder, "__init__", fail)
+    assert write_site(tmp_path / "site", [directory]).campaigns == 1
+    (folder,) = (tmp_path / "site" / "c").iterdir()
+    case, index = ((folder / name).read_text(encoding="utf-8") for name in ("case-3.html", "index.html"))
+    assert (folder / "report.html").read_text(encoding="utf-8") == report
+    figures = report.partition('<article id="case-3"')[2].partition("</article>")[0].count("<svg")
+    assert case.count("<svg") == figures > 0
+    outcome = make_rows(24, error_scale=4.0)["outcome"][3]
+    assert f"<h1>Case 3: {outcome}</h1>" in case
+    assert '<th scope="row">velocity_error_m_s</th>' in case
+    assert f"marsyard replay {directory} 3" in case
+    assert 'href="case-3.html"' in index
+    assert report.count('class="violation"') == index.count('class="violation"') > 0
+
+
+def test_reports_of_another_layout_are_written_again(
+    make_rows: Rows, make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directory = make_run(make_rows(6)[MIN_COLUMNS])
+    write_report(directory)
+    layout = tmp_path / "parts.html.j2"
+    layout.write_text("layout of another version", encoding="utf-8")
+    monkeypatch.setattr(campaign, "_LAYOUT_FILES", (layout,))
+    assert not campaign.is_own_report(directory, directory)
+    write_site(tmp_path / "site", [directory])
+    assert campaign.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
+
+
+def test_values_of_a_campaign_cannot_end_a_part_of_its_report() -> None:
+    value = escape('</article><article id="case-9" aria-label="x"><script>')
+    report = f'<article class="lists">{value}<a href="#case-2">Case 2</a></article>'
+    excerpts = read_excerpts(f'{report}<article id="case-2" aria-label="Case 2">{value}</article>')
+    assert excerpts.lists == f'{value}<a href="case-2.html">Case 2</a>'
+    assert excerpts.cases == {2: value}
 
 
 def test_security_policy_contains_the_hash_of_the_script(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
