@@ -67,7 +67,7 @@ class DriftParameters(Parameters):
     ] = 1.0
     change_k: Annotated[
         float, Field(ge=-100.0, le=100.0, description="temperature change after a long time, K; 0: no drift")
-    ] = -22.0
+    ] = -19.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the cooling, s (assumed)")] = 300.0
 
 
@@ -113,9 +113,13 @@ class ElevationParameters(Parameters):
 
 
 class ImageParameters(Parameters):
-    """Times of the images: the paper takes 20 images in less than 2 min (III.D.2)."""
+    """Times of the images: the paper takes 20 images in less than 2 min (III.D.2).
 
-    interval_s: Annotated[Positive, Field(le=60.0, description="time between images, s (assumed)")] = 2.0
+    The detector reads out an image in 1.36 s. At 2 s, 3 % of the flights contain fewer triples of Kelso run 3 than
+    the paper; at 1.5 s, none of 1,000.
+    """
+
+    interval_s: Annotated[Positive, Field(le=60.0, description="time between images, s (assumed)")] = 1.5
     clock: Annotated[ClockParameters, Field(description="time tag errors (assumed)")] = ClockParameters(
         offset_sd_s=0.0005, jitter_sd_s=0.0005
     )

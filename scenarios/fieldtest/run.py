@@ -82,13 +82,11 @@ class Triple:
     image_indices: tuple[int, int, int]
 
 
-def draw_triples(
-    run: RunParameters, images: ImageMeasurements, parameters: TripleParameters, rng: np.random.Generator
-) -> tuple[Triple, ...]:
-    """Draw the triples of a run: for each category the specified number out of all candidates.
+def find_triples(images: ImageMeasurements, parameters: TripleParameters) -> dict[Category, Int64[np.ndarray, "n 3"]]:
+    """Find all triples of a run's images: for each category the indices of the images, one row per triple.
 
     A short-time triple consists of consecutive images of one pass. Triples of the other categories have decreasing
-    altitudes, as in a landing. Raises ValueError if there are too few candidates.
+    altitudes, as in a landing.
     """
     # pairs that overlap and whose distance DIMES can measure over the virtual interval
     min_altitude = np.minimum(images.altitude_m[:, None], images.altitude_m)
@@ -110,13 +108,23 @@ def draw_triples(
         dtype=np.int64,
     ).reshape(-1, 3)
     same_direction = (np.diff(images.direction[descending], axis=1) == 0).all(axis=1)
-    candidates = {
-        Category.SHORT_TIME: (consecutive[:, None] + np.arange(3), run.short_time),
-        Category.SAME_DIRECTION: (descending[same_direction], run.same_direction),
-        Category.OPPOSITE_DIRECTION: (descending[~same_direction], run.opposite_direction),
+    return {
+        Category.SHORT_TIME: consecutive[:, None] + np.arange(3),
+        Category.SAME_DIRECTION: descending[same_direction],
+        Category.OPPOSITE_DIRECTION: descending[~same_direction],
     }
+
+
+def draw_triples(
+    run: RunParameters, images: ImageMeasurements, parameters: TripleParameters, rng: np.random.Generator
+) -> tuple[Triple, ...]:
+    """Draw the triples of a run: for each category the specified number out of all of its triples.
+
+    Raises ValueError if there are too few.
+    """
+    counts = (run.short_time, run.same_direction, run.opposite_direction)
     triples = []
-    for category, (indices, count) in candidates.items():
+    for (category, indices), count in zip(find_triples(images, parameters).items(), counts, strict=True):
         if len(indices) < count:
             raise ValueError(f"{run.name}: {count} triples '{category}' are requested, but only {len(indices)} exist")
         for first, second, third in indices[rng.choice(len(indices), count, replace=False)].tolist():

@@ -1,9 +1,10 @@
 """Helicopter flight in climbing passes along a line, with a camera on a gimbal (field test paper, III.C).
 
 The flight begins and ends with a slow pass over surveyed targets. Between these the helicopter flies passes along a
-line in alternating directions; it climbs on the passes and turns at constant height between them. The gimbal is
-mounted on a stabilised platform, which is level and has a constant azimuth or rotates with the helicopter. The gimbal
-tilts the camera along and across the line, and swings it on some passes.
+line in alternating directions. It climbs on the passes, each at a rate of its own, and turns at constant height between
+them. The last pass ends at the maximum height; the helicopter flies on to the end of the line without images. The
+gimbal is mounted on a stabilised platform, which is level and has a constant azimuth or rotates with the helicopter.
+The gimbal tilts the camera along and across the line, and swings it on some passes.
 
 Every coordinate is a piecewise quintic polynomial, or such a polynomial times a sine. It is twice continuously
 differentiable: velocity, rates and specific force are exact derivatives of position and attitude.
@@ -31,6 +32,8 @@ Angle = Annotated[float, Field(ge=0.0, le=45.0)]
 
 #: Number of points within a pass at which the speed is drawn.
 _SPEED_POINTS = 4
+#: Minimum duration of a turn: a reversal of 30 m/s in this time takes up to 4.5 m/s2, a bank angle of 25 deg.
+_MIN_TURN_S = 20.0
 #: Time between the points at which distance from the line, pointing and swing are drawn.
 _POINT_SPACING_S = 15.0
 
@@ -38,19 +41,24 @@ _POINT_SPACING_S = 15.0
 class HelicopterParameters(Parameters):
     """Parameters of a flight. Values are from the field test paper (III.C, III.D) unless marked as assumed.
 
-    With a climb of 1 m/s, passes of 100 s and turns of 60 s, ten passes climb from 1000 m to 2000 m in 27 min. The
-    paper reports a climb of 1 to 2 m/s, about 30 min of images, and about 40 min between the passes over the targets.
+    Each pass has a rate of climb from a uniform distribution. The number of passes follows: the last pass ends at the
+    maximum height. The turns have equal durations, and share the time of the collection that the passes leave. With the
+    defaults, nine to twelve passes take about 11 of the 30 min. The paper reports a climb of 1 to 2 m/s, images for
+    about 30 min, and about 40 min between the passes over the targets.
     """
 
-    passes: Annotated[int, bounded_field(1, 100, "passes along the line")] = 10
-    pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass (assumed)")] = 100.0
-    turn_s: Annotated[Positive, Field(le=1000.0, description="duration of a turn (assumed)")] = 60.0
+    pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass (assumed)")] = 70.0
+    collection_s: Annotated[
+        Positive, Field(description="time from the start of the first to the end of the last pass")
+    ] = 1800.0
     speed_m_s: Annotated[Positive, Field(le=100.0, description="mean speed along a pass")] = 30.0
     speed_change_m_s: Annotated[float, bounded_field(0.0, 10.0, "RMS change of speed within a pass (assumed)")] = 1.0
     lowest_m: Annotated[Positive, Field(description="initial height of the first pass above the line's ground")] = (
         1000.0
     )
-    climb_m_s: Annotated[float, bounded_field(0.0, 10.0, "rate of climb on a pass")] = 1.0
+    highest_m: Annotated[Positive, Field(description="height above the line's ground that ends the last pass")] = 2000.0
+    min_climb_m_s: Annotated[float, bounded_field(0.1, 10.0, "minimum rate of climb on a pass")] = 1.0
+    max_climb_m_s: Annotated[float, bounded_field(0.1, 10.0, "maximum rate of climb on a pass")] = 2.0
     wander_m: Annotated[float, bounded_field(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
     pointing_deg: Annotated[
         Angle, Field(description="RMS tilt along and across the line (assumed: flights reach the maximum)")
@@ -67,18 +75,36 @@ class HelicopterParameters(Parameters):
     fly_over_m_s: Annotated[Positive, Field(description="speed of the passes over the targets (assumed)")] = 3.0
     fly_over_s: Annotated[Positive, Field(le=120.0, description="duration of a pass over the targets")] = 90.0
     between_s: Annotated[Positive, Field(description="time between the passes over the targets")] = 2400.0
-    approach_s: Annotated[Positive, Field(description="time from the targets to the first pass (assumed)")] = 350.0
+    approach_s: Annotated[Positive, Field(description="time from the targets to the first pass (assumed)")] = 200.0
     vibration: Annotated[VibrationParameters, Field(description="platform vibration at the blades' rate (assumed)")] = (
         VibrationParameters(rate_hz=13.0, acceleration_m_s2=1.0, angle_deg=0.005)
     )
 
     @model_validator(mode="after")
-    def _check_times(self) -> HelicopterParameters:
-        collection_s = self.passes * self.pass_s + (self.passes - 1) * self.turn_s
-        if self.between_s - self.fly_over_s - self.approach_s - collection_s <= 0.0:
+    def _check_climb(self) -> HelicopterParameters:
+        if self.max_climb_m_s < self.min_climb_m_s:
             raise ValueError(
-                f"passes and turns of {collection_s} s do not fit into the {self.between_s} s between the passes "
-                "over the targets"
+                f"max_climb_m_s is {self.max_climb_m_s}; allowed: at least min_climb_m_s, {self.min_climb_m_s}"
+            )
+        if self.highest_m <= self.lowest_m:
+            raise ValueError(f"highest_m is {self.highest_m}; allowed: more than lowest_m, {self.lowest_m}")
+        return self
+
+    @model_validator(mode="after")
+    def _check_times(self) -> HelicopterParameters:
+        max_passes_s = (self.highest_m - self.lowest_m) / self.min_climb_m_s
+        min_collection_s = max_passes_s + _MIN_TURN_S * max(np.ceil(max_passes_s / self.pass_s) - 1.0, 0.0)
+        if self.collection_s < min_collection_s:
+            raise ValueError(
+                f"collection_s is {self.collection_s}; allowed: at least {min_collection_s:.6g}, the time of passes "
+                f"at min_climb_m_s with turns of {_MIN_TURN_S:.0f} s"
+            )
+        # after the last image the helicopter flies at most another pass to the end of the line
+        flight_s = self.fly_over_s + self.approach_s + self.collection_s + self.pass_s
+        if flight_s >= self.between_s:
+            raise ValueError(
+                f"a pass over the targets, the approach, the collection and the rest of its last pass, {flight_s} s, "
+                f"do not fit into the {self.between_s} s between the passes over the targets"
             )
         return self
 
@@ -90,12 +116,24 @@ class HelicopterParameters(Parameters):
 
 @dataclass(frozen=True)
 class FlightPass:
-    """A pass along the line: its number, start and end, and its direction, +1 or -1 along the line."""
+    """A pass along the line.
+
+    - number, direction: number from 0, and direction of flight, +1 or -1 along the line
+    - start_s, end_s: start and end; the last pass ends at the maximum height
+    - start_m, climb_m_s: initial height above the line's ground, and rate of climb
+    """
 
     number: int
+    direction: int
     start_s: float
     end_s: float
-    direction: int
+    start_m: float
+    climb_m_s: float
+
+    @property
+    def end_m(self) -> float:
+        """Final height above the line's ground."""
+        return self.start_m + self.climb_m_s * (self.end_s - self.start_s)
 
 
 @dataclass(frozen=True)
@@ -175,9 +213,7 @@ def draw_helicopter_flight(
 ) -> HelicopterFlight:
     """Draw a flight along a line whose middle is above `origin_m`, a point of the ground."""
     half_s = 0.5 * p.fly_over_s
-    first_pass_s = half_s + p.approach_s
-    starts = [first_pass_s + number * (p.pass_s + p.turn_s) for number in range(p.passes)]
-    passes = tuple(FlightPass(k, start, start + p.pass_s, 1 - 2 * (k % 2)) for k, start in enumerate(starts))
+    passes = _draw_passes(p, half_s + p.approach_s, rng)
     fly_overs = ((-half_s, half_s), (p.between_s - half_s, p.between_s + half_s))
     times = np.arange(fly_overs[0][0], fly_overs[1][1] + _POINT_SPACING_S, _POINT_SPACING_S)
     # points of the curves: (time, value, rate) or (time, value). Height and platform angle are constant over the
@@ -186,17 +222,17 @@ def draw_helicopter_flight(
     positions = [point for start, end in fly_overs for point in ((start, -half_m, speed), (end, half_m, speed))]
     heights = [(time, p.fly_over_m, 0.0) for times_s in fly_overs for time in times_s]
     angles = [(time, 0.0) for times_s in fly_overs for time in times_s]
-    climb_m = p.climb_m_s * p.pass_s
     fraction = np.linspace(0.0, 1.0, _SPEED_POINTS + 2)
     for flight_pass in passes:
         changes = p.speed_change_m_s * rng.standard_normal(fraction.size)
         changes[[0, -1]] = 0.0
         distances = flight_pass.direction * p.length_m * (fraction - 0.5)
         speeds = flight_pass.direction * (p.speed_m_s + changes)
-        pass_times = flight_pass.start_s + fraction * (flight_pass.end_s - flight_pass.start_s)
+        # also on the last pass, which ends before the end of the line
+        pass_times = flight_pass.start_s + fraction * p.pass_s
         positions += list(zip(pass_times.tolist(), distances.tolist(), speeds.tolist(), strict=True))
-        height = p.lowest_m + flight_pass.number * climb_m
-        heights += [(flight_pass.start_s, height, p.climb_m_s), (flight_pass.end_s, height + climb_m, p.climb_m_s)]
+        heights += [(flight_pass.start_s, flight_pass.start_m, flight_pass.climb_m_s)]
+        heights += [(flight_pass.end_s, flight_pass.end_m, flight_pass.climb_m_s)]
         angle = np.pi if flight_pass.direction < 0 and p.turns_with_flight else 0.0
         angles += [(flight_pass.start_s, angle), (flight_pass.end_s, angle)]
     tilt_along, tilt_across = _draw_tilts(p, passes, times, rng)
@@ -214,6 +250,23 @@ def draw_helicopter_flight(
         gravity_m_s2=gravity_m_s2,
         vibration=Vibration.draw(p.vibration, rng),
     )
+
+
+def _draw_passes(p: HelicopterParameters, start_s: float, rng: np.random.Generator) -> tuple[FlightPass, ...]:
+    """Draw the passes, in alternating directions, from a start time until the helicopter reaches the maximum height."""
+    climbs_m_s, heights_m = [], [p.lowest_m]
+    while heights_m[-1] < p.highest_m:
+        climbs_m_s.append(float(rng.uniform(p.min_climb_m_s, p.max_climb_m_s)))
+        heights_m.append(heights_m[-1] + climbs_m_s[-1] * p.pass_s)
+    heights_m[-1] = p.highest_m
+    durations_s = np.diff(heights_m) / climbs_m_s
+    turn_s = (p.collection_s - durations_s.sum()) / max(len(climbs_m_s) - 1, 1)
+    passes = []
+    for number, (climb_m_s, duration_s) in enumerate(zip(climbs_m_s, durations_s.tolist(), strict=True)):
+        end_s = start_s + duration_s
+        passes.append(FlightPass(number, 1 - 2 * (number % 2), start_s, end_s, heights_m[number], climb_m_s))
+        start_s = end_s + turn_s
+    return tuple(passes)
 
 
 def _draw_tilts(

@@ -29,7 +29,7 @@ from marsyard.scenarios.fieldtest.imaging import (
     take_image,
 )
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, TargetParameters
-from marsyard.scenarios.fieldtest.run import Category, Run, simulate_elevation_model, simulate_run
+from marsyard.scenarios.fieldtest.run import Category, Run, find_triples, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
 from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
 from marsyard.scenarios.parts import ScoredFlight
@@ -298,6 +298,16 @@ def test_first_cases_contain_the_runs_in_proportion_to_their_triples() -> None:
     assert len(order) == len(set(order)) == N_PAPER_TRIPLES
     expected_fraction = parameters.runs[3].triples / N_PAPER_TRIPLES
     assert sum(number == 3 for number, _ in order[:200]) / 200 == pytest.approx(expected_fraction, abs=0.03)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_flight_contains_the_number_of_triples_of_the_paper(seed: int) -> None:
+    """Run 3 of Kelso has the most triples. An image every 2 s or passes of 100 s leave too few in some flights."""
+    parameters = make_parameters()
+    run = simulate_run(RunKey(parameters, 3, seed, "test"))
+    counts = {category: len(triples) for category, triples in find_triples(run.images, parameters.triples).items()}
+    requested = {Category.SHORT_TIME: 251, Category.SAME_DIRECTION: 306, Category.OPPOSITE_DIRECTION: 286}
+    assert all(counts[category] > 1.2 * count for category, count in requested.items()), counts
 
 
 @pytest.mark.slow

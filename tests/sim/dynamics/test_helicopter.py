@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -40,12 +42,73 @@ def test_heights_speed_and_tilt_match_the_paper() -> None:
     heights = motion.positions_m[:, 2] - ORIGIN[2]
     assert abs(heights.min() - 1000.0) < 1.0
     assert abs(heights.max() - 2000.0) < 1.0
-    assert np.all(np.abs(motion.velocities_m_s[:, 2] - 1.0) < 0.03)  # climb rate (paper: "1 to 2 m/s") plus vibration
+    climbs = np.array([leg.climb_m_s for leg in flight.passes])
+    assert np.all((climbs >= 1.0) & (climbs <= 2.0))  # "1 to 2 m/s vertical"
+    pass_numbers = np.concatenate([np.full(np.arange(p.start_s, p.end_s, 0.1).size, p.number) for p in flight.passes])
+    # vibration: 1 m/s2 RMS of three axes at 13 Hz, 0.012 m/s
+    assert np.all(np.abs(motion.velocities_m_s[:, 2] - climbs[pass_numbers]) < 0.03)
     speed = np.hypot(*motion.velocities_m_s[:, :2].T)
     assert abs(speed.mean() - 30.0) < 0.5
     tilt = np.degrees(np.arccos(motion.attitudes.as_matrix()[:, 2, 2]))
     assert 20.0 < tilt.max() < 45.0
     assert 25.0 < np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max() < 61.0
+
+
+def test_rates_of_climb_are_uniform() -> None:
+    """Between 1 and 2 m/s: mean 1.5, standard deviation 1 / sqrt(12). Tolerances: four standard errors of 400 passes.
+
+    The maximum height does not select the rates of the first five passes: they climb by at most 5 x 70 s x 2 m/s, or
+    700 m.
+    """
+    rates = np.array(
+        [
+            flight_pass.climb_m_s
+            for seed in range(80)
+            for flight_pass in draw_helicopter_flight(
+                HelicopterParameters(), ORIGIN, 0.3, 9.8, np.random.default_rng(seed)
+            ).passes[:5]
+        ]
+    )
+    assert rates.min() >= 1.0
+    assert rates.max() <= 2.0
+    assert rates.mean() == pytest.approx(1.5, abs=4.0 * np.sqrt(1.0 / 12.0 / 400))
+    # the variance of the variance of a uniform distribution of width 1 is 1/180 for each sample
+    assert rates.var() == pytest.approx(1.0 / 12.0, abs=4.0 * np.sqrt(1.0 / 180.0 / 400))
+
+
+def test_run_ends_at_the_maximum_height() -> None:
+    """Paper, III.C and III.D.4: from 1000 m to 2000 m, images for about 30 min, about 40 min between the targets."""
+    for seed in range(20):
+        flight = draw_helicopter_flight(HelicopterParameters(), ORIGIN, 0.3, 9.8, np.random.default_rng(seed))
+        passes = flight.passes
+        assert passes[0].start_m == 1000.0
+        for before, after in pairwise(passes):
+            assert before.end_s - before.start_s == pytest.approx(70.0)
+            # turns at constant height
+            assert after.start_m == pytest.approx(before.end_m)
+            assert after.start_s - before.end_s == pytest.approx(passes[1].start_s - passes[0].end_s)
+        assert passes[-1].start_m < 2000.0
+        assert passes[-1].end_m == pytest.approx(2000.0)
+        assert passes[-1].end_s - passes[0].start_s == pytest.approx(1800.0)
+
+
+def test_number_of_passes_follows_from_the_climb() -> None:
+    """1000 m at 1.5 m/s: nine passes of 105 m in 70 s, and one of 55 m in 36.7 s."""
+    passes = make_flight(min_climb_m_s=1.5, max_climb_m_s=1.5).passes
+    assert [leg.start_m for leg in passes] == pytest.approx([1000.0 + 105.0 * number for number in range(10)])
+    assert passes[-1].end_s - passes[-1].start_s == pytest.approx(55.0 / 1.5)
+    # a multiple of the climb of a pass: the last pass is complete
+    passes = make_flight(min_climb_m_s=2.0, max_climb_m_s=2.0, highest_m=1700.0).passes
+    assert [leg.end_s - leg.start_s for leg in passes] == pytest.approx([70.0] * 5)
+    assert len(make_flight(highest_m=1050.0).passes) == 1
+
+
+def test_helicopter_completes_the_line_after_the_last_image() -> None:
+    flight = make_flight(min_climb_m_s=1.5, max_climb_m_s=1.5)
+    start_s = flight.passes[-1].start_s
+    along = (flight.state(start_s + 70.0).position_m - ORIGIN) @ [np.sin(np.radians(70.0)), np.cos(np.radians(70.0)), 0]
+    # half the line of 70 s at 30 m/s; the distance from the line has no component along it
+    assert along == pytest.approx(flight.passes[-1].direction * 1050.0, abs=1.0)
 
 
 def test_passes_alternate_along_one_line() -> None:
@@ -67,7 +130,16 @@ def test_targets_are_overflown_40_minutes_apart() -> None:
 
 
 def test_inconsistent_parameters_are_rejected() -> None:
-    with pytest.raises(ValueError, match="do not fit into"):
-        HelicopterParameters(passes=20)
+    with pytest.raises(ValueError, match=r"max_climb_m_s is 0\.5; allowed: at least min_climb_m_s, 1\.0"):
+        HelicopterParameters(max_climb_m_s=0.5)
+    with pytest.raises(ValueError, match=r"highest_m is 900\.0; allowed: more than lowest_m, 1000\.0"):
+        HelicopterParameters(highest_m=900.0)
+    # 1000 s of passes at 1 m/s, and 14 turns of 20 s between 15 passes of at most 70 s
+    with pytest.raises(ValueError, match=r"collection_s is 1279\.0; allowed: at least 1280,"):
+        HelicopterParameters(collection_s=1279.0)
+    assert len(make_flight(collection_s=1280.0, min_climb_m_s=1.0, max_climb_m_s=1.0).passes) == 15
+    # 90 + 200 + 2040 + 70 = 2400 s
+    with pytest.raises(ValueError, match=r"2400\.0 s, do not fit into the 2400\.0 s between"):
+        HelicopterParameters(collection_s=2040.0)
     with pytest.raises(ValueError, match="outside of the motion"):
         make_flight().state(3000.0)
