@@ -36,7 +36,8 @@ from pydantic import BaseModel
 from benchmarks.engine import BusyScenario, Stopwatch
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
-from marsyard.campaigns.execution.workers import MAX_BATCH, ExecutorConfig, batch_duration_s
+from marsyard.campaigns.execution.batches import MAX_BATCH, batch_duration_s
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
@@ -141,7 +142,7 @@ def _cost_per_case(address: str, scheduler: psutil.Process, batch: int, counts: 
             retain=Retain(showcase="none", products="none"),
         )
         start_scheduler_s, start_s = sum(scheduler.cpu_times()[:2]), time.process_time()
-        with TemporaryDirectory() as folder, patch("marsyard.campaigns.execution.workers.MAX_BATCH", batch):
+        with TemporaryDirectory() as folder, patch("marsyard.campaigns.execution.batches.MAX_BATCH", batch):
             campaign = Campaign(configuration, WideScenario())
             run_campaign(campaign, Path(folder) / "run", ExecutorConfig(cluster=address), Stopwatch(()))
         costs.append((sum(scheduler.cpu_times()[:2]) - start_scheduler_s, time.process_time() - start_s))
@@ -172,7 +173,7 @@ def _start(kind: str, *options: str) -> subprocess.Popen[bytes]:
 
 
 def batch_size(case_s: float, threads: int) -> int:
-    """Return the number of cases of a batch, as `marsyard.campaigns.execution.workers.Batches` selects it."""
+    """Return the number of cases of a batch, as `marsyard.campaigns.execution.batches.Batches` selects it."""
     return max(1, min(int(batch_duration_s(threads) / case_s), MAX_BATCH))
 
 

@@ -54,13 +54,16 @@ def configuration_text(configuration: CampaignConfiguration) -> str:
 @lru_cache(maxsize=1)
 def _load_campaign(configuration: str) -> Campaign:
     """Create the campaign of a configuration text; the result is cached because loading is slow."""
-    worker_process.start_clock(grace_s=worker_process.LOADING_S)
     campaign_configuration = CampaignConfiguration.model_validate_json(configuration)
     selected_scenario = scenario(campaign_configuration.scenario)
     worker_process.limit_threads()
     worker_process.accept_process_state()
-    worker_process.start_clock()
     return Campaign(campaign_configuration, selected_scenario)
+
+
+def create_loader(configuration: CampaignConfiguration) -> Callable[[], object]:
+    """Return the function that loads a campaign in a worker (`Work.load`)."""
+    return partial(_load_campaign, configuration_text(configuration))
 
 
 def run_case(configuration: str, selection: ProductSelection, points: Mapping[int, Point], case: int) -> CompletedCase:
@@ -128,7 +131,7 @@ def run_cases(
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), selection, dict(points))
     note_counts: Counter[str] = Counter()
     limits = work_limits(configuration.limits, configuration.limits.case_time_s)
-    for results in executor.run(Work(task, cases, limits, total)):
+    for results in executor.run(Work(task, cases, limits, total, create_loader(configuration))):
         completed_cases = []
         for task_result in results:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}

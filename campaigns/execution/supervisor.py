@@ -131,3 +131,11 @@ def find_marked_processes(mark: str) -> list[int]:
             if pattern in (process / "environ").read_bytes():
                 processes.append(int(process.name))
     return processes
+
+
+def is_stopped(process: int) -> bool:
+    """Whether a process is stopped by a signal or a debugger (states T and t of Linux); False if it has ended."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] in "Tt"
+    except (OSError, IndexError):
+        return False

@@ -25,14 +25,12 @@ from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervis
 Result = TypeVar("Result")
 #: Linux's `oom_score_adj` of a worker (at most 1000): if memory runs out, workers are killed before their parent.
 _OOM_SCORE = 800
-#: Seconds for loading a campaign's code, in addition to the time limit of the case.
-LOADING_S = 300.0
 #: Maximum duration, seconds, of a group of items after which the process state is checked once; a check takes 0.1 ms.
 _MAX_GROUP_DURATION_S = 0.005
 #: Exit status of a worker after an item closed file descriptors that the worker needs.
 FILES_CLOSED = 97
-#: Layout of the status board: item (`_NO_ITEM` between items), and its start time in seconds (monotonic clock).
-_BOARD_LAYOUT = struct.Struct("=qd")
+#: Layout of the status board: item, or `_NO_ITEM` between items.
+_BOARD_LAYOUT = struct.Struct("=q")
 _NO_ITEM = -1
 
 
@@ -76,12 +74,14 @@ class Work(Generic[Result]):
 
     - task: a pure, picklable function of the item; limits: limits of the task for one item
     - items: iterator that is advanced only when workers need items; total: number of items, if known
+    - load: loads the code of the task once in each worker, without time limits of items; its errors are ignored
     """
 
     task: Callable[[int], Result]
     items: Iterable[int]
     limits: WorkLimits = WorkLimits()
     total: int | None = None
+    load: Callable[[], object] | None = None
 
 
 class Executor(Protocol):
@@ -113,7 +113,7 @@ class BatchResult(Generic[Result]):
 class StatusBoard:
     """Shared memory with the status of a worker, which its parent can read even if the worker hangs or has died.
 
-    The status is the item that the worker runs (None between items), and the start time of the item (monotonic).
+    The status is the item that the worker runs, None between items.
     """
 
     def __init__(self, path: Path) -> None:
@@ -123,20 +123,20 @@ class StatusBoard:
     @staticmethod
     def create(path: Path) -> StatusBoard:
         """Create the board of an idle worker."""
-        path.write_bytes(_BOARD_LAYOUT.pack(_NO_ITEM, math.inf))
+        path.write_bytes(_BOARD_LAYOUT.pack(_NO_ITEM))
         return StatusBoard(path)
 
-    def write(self, item: int | None, since_s: float) -> None:
+    def write(self, item: int | None) -> None:
         """Publish the worker's status."""
-        self._bytes[:] = _BOARD_LAYOUT.pack(_NO_ITEM if item is None else item, since_s)
+        self._bytes[:] = _BOARD_LAYOUT.pack(_NO_ITEM if item is None else item)
 
-    def read(self) -> tuple[int | None, float]:
+    def read(self) -> int | None:
         """Read the worker's status; read until two readings agree, because the worker may be writing."""
         first = bytes(self._bytes)
         while (second := bytes(self._bytes)) != first:
             first = second
-        item, since_s = _BOARD_LAYOUT.unpack(first)
-        return None if item == _NO_ITEM else item, since_s
+        (item,) = _BOARD_LAYOUT.unpack(first)
+        return None if item == _NO_ITEM else int(item)
 
     def close(self) -> None:
         """Release the memory."""
@@ -195,7 +195,21 @@ def start_worker(parent: int, folder: str) -> None:
     _context = _WorkerContext(
         StatusBoard(Path(folder, "board")), trace, output, Path(folder, "note"), process_state.list_open_files()
     )
-    _context.board.write(None, math.inf)
+    _context.board.write(None)
+
+
+def load_task(_task: Callable[[int], object], load: Callable[[], object] | None, item: int) -> None:
+    """Load the code of a task in this worker; a death of the process is attributed to `item`, the first item.
+
+    Python imports the modules of the task when it unpickles the arguments.
+    """
+    if load is None:
+        return
+    if _context is not None:
+        _context.board.write(item)
+    load()
+    if _context is not None:
+        _context.board.write(None)
 
 
 def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResult[Result]:
@@ -223,7 +237,7 @@ def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResul
             return BatchResult(time.perf_counter() - start_s, results, (), items[index + 1 :], must_replace)
         group, checked_s = [], time.perf_counter()
     if _context is not None:
-        _context.board.write(None, math.inf)
+        _context.board.write(None)
     return BatchResult(time.perf_counter() - start_s, results)
 
 
@@ -254,7 +268,7 @@ def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:
         if os.fstat(_context.output).st_size > 0:
             os.ftruncate(_context.output, 0)
         previous_item, _context.item, _context.crashed = _context.item, item, False
-    start_clock()
+        _context.board.write(item)
     try:
         result = TaskResult(item, task(item), None)
     except Exception as error:
@@ -267,12 +281,6 @@ def request_fresh_worker() -> None:
     """Request a fresh process for the next item, because the current item crashed and may have damaged the process."""
     if _context is not None:
         _context.crashed = True
-
-
-def start_clock(grace_s: float = 0.0) -> None:
-    """Start the timer of the current item now, or after `grace_s` seconds."""
-    if _context is not None:
-        _context.board.write(_context.item, time.monotonic() + grace_s)
 
 
 def record_note(text: str) -> None:

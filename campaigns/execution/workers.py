@@ -2,13 +2,13 @@
 
 Each worker is a loky executor (of joblib) with one process, which runs batches of cases. If a worker dies, its executor
 identifies the batch, and its status board (shared memory) identifies the case. The parent checks each worker about
-twenty times per second, and terminates a worker whose case exceeds a limit.
+twenty times per second, and terminates a worker whose case exceeds a limit
+(`marsyard.campaigns.execution.monitoring`).
 """
 
 from __future__ import annotations
 
 import fcntl
-import itertools
 import math
 import os
 import re
@@ -16,43 +16,25 @@ import shutil
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from marsyard.algorithms.processes import descendants, used_memory
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
-from marsyard.campaigns.execution import supervisor, worker_process
-from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, find_marked_processes, kill
-from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work, WorkLimits, run_batch
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, CampaignError
+from marsyard.campaigns.execution.batches import Batches
+from marsyard.campaigns.execution.monitoring import POLL_INTERVAL_S, MonitoredWorker
+from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work
 
 Result = TypeVar("Result")
 
-_THREAD_VARIABLES = (
-    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),
-    *("VECLIB_MAXIMUM_THREADS", "OPENCV_FOR_THREADS_NUM", "LP_NUM_THREADS"),
-)
-#: Set before a worker loads any library: one thread each, reproducible order of sets, and assertions enabled (pyrender
-#: calls GL inside assertions, which `python -O` removes).
-_WORKER_ENVIRONMENT = dict.fromkeys(_THREAD_VARIABLES, "1") | {"PYTHONHASHSEED": "0", "PYTHONOPTIMIZE": ""}
-#: Seconds between two checks of a worker.
-_POLL_INTERVAL_S = 0.05
-#: Maximum bytes of the stored output of a dead process, and of a task's note.
-_MAX_OUTPUT, _MAX_NOTE = 2000, 1_000_000
-#: Maximum seconds for a worker to write its stack trace.
-_DUMP_S = 0.3
-#: Maximum seconds for a worker to end after all work, and for its supervisor to kill all descendants.
-_EXIT_S, _KILLING_S = 5.0, 2.0
-#: Environment variable by which the descendants of a worker are found, even if their supervisor has ended.
-_MARK = "MARSYARD_WORKER"
-#: Number of attempts before a crash or lack of memory is attributed to the task; the last attempt is in a fresh worker.
-#: An earlier task may have damaged the worker or used its memory, or an external process may have killed the worker.
+#: Number of attempts before a crash or lack of memory, or a time limit exceeded by a suspended process, is attributed
+#: to the task; the last attempt is in a fresh worker. An earlier task may have damaged the worker or used its memory,
+#: or an external process may have killed or stopped the worker.
 _MAX_ATTEMPTS = 2
 #: Maximum number of consecutive deaths of each worker before it starts a task, and the pause after the first, s; each
 #: pause is twice as long as the previous one, because a lack of memory or processes on the machine can be temporary.
@@ -68,203 +50,6 @@ _MEMORY_FRACTION = 0.8
 def available_cores() -> int:
     """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-
-
-#: Minimum target duration of a batch, s: a worker that dies loses at most one batch.
-_BATCH_S = 1.0
-#: Time that sending a batch takes, s, and the maximum fraction of its time that the program spends with this.
-_SENDING_S, _MAX_SENDING = 0.005, 0.5
-#: Maximum number of items in a batch.
-MAX_BATCH = 1000
-#: Weight of the latest batch in the exponential mean of the time per item.
-_LATEST_WEIGHT = 0.3
-
-
-def batch_duration_s(workers: int) -> float:
-    """Return the target duration of a batch: longer for many workers, so that sending batches is not the bottleneck."""
-    return max(_BATCH_S, _SENDING_S / _MAX_SENDING * workers)
-
-
-class Batches:
-    """Batches of items, sized by the measured time per item.
-
-    - items: iterator that is advanced only when a batch is requested
-    - total: number of items, if known; the last batches are then small, so that all workers end together
-    - workers: number of workers that run the batches
-    """
-
-    def __init__(self, items: Iterable[int], total: int | None, workers: int) -> None:
-        self._source = iter(items)
-        self._remaining = math.inf if total is None else total
-        self.workers = workers
-        self._size = 1
-        self._item_s = math.nan
-
-    def next(self) -> list[int]:
-        """Return the next batch; empty if no items remain."""
-        size = max(1, int(min(self._size, self._remaining / (2 * self.workers))))
-        batch = list(itertools.islice(self._source, size))
-        self._remaining -= len(batch)
-        return batch
-
-    def record_time(self, items: int, seconds: float) -> None:
-        """Update the time per item from a finished batch; a batch is at most twice as large as the previous one."""
-        latest, mean = seconds / items, self._item_s
-        self._item_s = latest if math.isnan(mean) else mean + _LATEST_WEIGHT * (latest - mean)
-        target_size = MAX_BATCH if self._item_s <= 0.0 else int(batch_duration_s(self.workers) / self._item_s)
-        self._size = max(1, min(target_size, 2 * self._size, MAX_BATCH))
-
-
-class MonitoredWorker:
-    """One worker process, which is monitored, and replaced when it dies.
-
-    Signals are sent only to the process that loky started: the worker's supervisor, which ends after its descendants.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir()
-        self._parent_folder = folder
-        self._generation = 0
-        self._start()
-
-    def _start(self) -> None:
-        """Prepare a new process with a new folder; loky starts the process with the first batch."""
-        self._generation += 1
-        self._folder = self._parent_folder / str(self._generation)
-        (self._folder / "tmp").mkdir(parents=True)
-        self._mark = f"{_MARK}={self._folder}"
-        self._board = worker_process.StatusBoard.create(self._folder / "board")
-        self._termination: tuple[int, WorkerExitError] | None = None
-        self._checked_s = -math.inf
-        self._process: Any = None
-        self._executor: Any = ProcessPoolExecutor(
-            max_workers=1,
-            initializer=worker_process.start_worker,
-            initargs=(os.getpid(), str(self._folder)),
-            env={**_WORKER_ENVIRONMENT, _MARK: str(self._folder), "TMPDIR": str(self._folder / "tmp")},
-        )
-
-    def submit(self, task: Callable[[int], Result], batch: Sequence[int]) -> Future[BatchResult[Result]]:
-        """Submit a batch; start a fresh process if the last one died while idle."""
-        try:
-            future: Future[Any] = self._executor.submit(run_batch, task, batch)
-        except BrokenProcessPool:
-            self.replace()
-            future = self._executor.submit(run_batch, task, batch)
-        if self._process is None:
-            self._process = next(iter(list(self._executor._processes.values())), None)
-        return future
-
-    def enforce_limits(self, limits: WorkLimits, memory_bytes: float) -> None:
-        """Terminate the process if its task exceeds a limit."""
-        now = time.monotonic()
-        if self._termination is not None or now - self._checked_s < _POLL_INTERVAL_S:
-            return
-        self._checked_s = now
-        if not self._is_alive():
-            # descendants without a supervisor keep loky's pipe open, so loky waits for their end: kill them
-            kill(find_marked_processes(self._mark))
-            return
-        item, since_s = self._board.read()
-        if item is None:
-            return
-        output = self._folder / "output"
-        if now - since_s > limits.time_s:
-            self._terminate(item, TIMED_OUT, f"took longer than its limit of {limits.time_s:g} s")
-        elif used_memory(descendants(self._process.pid), memory_bytes) > memory_bytes:
-            limit = "its default limit" if limits.memory_bytes is None else f"its limit of {memory_bytes / 1e9:g} GB"
-            self._terminate(item, OUT_OF_MEMORY, f"used more memory than {limit}")
-        elif output.exists() and output.stat().st_size > limits.output_bytes:
-            self._terminate(item, TOO_MUCH_OUTPUT, f"wrote more than its limit of {limits.output_bytes / 1e6:g} MB")
-
-    def _terminate(self, item: int, outcome: str, reason: str) -> None:
-        """Request the stack trace of the process, then kill the process."""
-        trace = self._folder / "trace"
-        self._signal(DUMP_SIGNAL)
-        deadline = time.monotonic() + _DUMP_S
-        while not (trace.exists() and trace.stat().st_size > 0) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        self._termination = (item, WorkerExitError(outcome, reason, self._last_trace(with_output=False)))
-        self._kill()
-
-    def _is_alive(self) -> bool:
-        return self._process is not None and self._process.is_alive()
-
-    def _signal(self, number: int) -> None:
-        """Send a signal to the supervisor; its process id cannot be reused until loky has registered its end."""
-        if self._is_alive():
-            with suppress(ProcessLookupError):
-                os.kill(self._process.pid, number)
-
-    def _kill(self) -> None:
-        self._signal(END_SIGNAL)
-        if self._process is None or self._wait_for_end(_KILLING_S):
-            return
-        # the supervisor was stopped or is busy, so its processes are killed directly
-        kill([*descendants(self._process.pid), self._process.pid, *find_marked_processes(self._mark)])
-
-    def _wait_for_end(self, max_seconds: float) -> bool:
-        """Wait for the end of the process; return whether it has ended."""
-        deadline = time.monotonic() + max_seconds
-        while self._is_alive() and time.monotonic() < deadline:
-            time.sleep(0.005)
-        return not self._is_alive()
-
-    def handle_death(self, error: BaseException) -> tuple[int | None, WorkerExitError]:
-        """Identify the item of the dead process (may be None) and the cause of death; prepare a new process."""
-        item: int | None
-        if self._termination is not None:
-            item, cause = self._termination
-        else:
-            # loky's message contains the exit status: ``SIGABRT(-6)``
-            exit_codes = re.findall(r"([A-Z]+)\((-?\d+)\)", str(error))
-            status = ", ".join(f"{name} ({code})" for name, code in exit_codes) or "exit status unknown"
-            reason = f"the worker process died: {status}"
-            if status == f"EXIT ({worker_process.FILES_CLOSED})":
-                reason = "the case closed or replaced the worker's file descriptors"
-            item, cause = (self._board.read()[0], WorkerExitError(CRASHED, reason, self._last_trace(with_output=True)))
-        self._kill()
-        note = self._folder / "note"
-        cause.note = note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
-        self.replace()
-        return item, cause
-
-    def _last_trace(self, *, with_output: bool) -> str:
-        """Return the fatal error, the stack of the failed thread, and the last output of the process."""
-        trace, output = (self._folder / name for name in ("trace", "output"))
-        text = trace.read_text(errors="replace") if trace.exists() else ""
-        parts = [part.strip() for part in text.split("\n\n") if part.strip()]
-        stacks = [part for part in parts if "(most recent call first)" in part.partition("\n")[0]]
-        stacks.sort(key=lambda part: not part.startswith("Current thread"))
-        lines = [parts[0]] if parts and parts[0].startswith("Fatal") else []
-        lines += stacks[:1]
-        if with_output and output.exists():
-            tail = output.read_bytes()[-_MAX_OUTPUT:].decode(errors="replace").strip()
-            lines += [f"Its output:\n{tail}"] if tail else []
-        return "\n".join(lines)
-
-    def replace(self) -> None:
-        """Kill the process, if it is running, and prepare a new one."""
-        self._kill()
-        self._executor.shutdown(wait=False)
-        self._board.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
-        self._start()
-
-    def stop(self, *, kill: bool) -> None:
-        """End the process and wait for its end; kill it now if `kill` is set, otherwise after some seconds."""
-        manager = self._executor._executor_manager_thread
-        if kill:
-            self._kill()
-        self._executor.shutdown(wait=False)
-        if not self._wait_for_end(_EXIT_S):
-            self._kill()
-        if manager is not None:
-            manager.join(_KILLING_S)
-            if manager.is_alive():
-                supervisor.kill(find_marked_processes(self._mark))
-                manager.join(_KILLING_S)
-        self._board.close()
 
 
 class LocalExecutor(AbstractContextManager["LocalExecutor"]):
@@ -308,7 +93,7 @@ class _WorkProgress:
 
     def __init__(self, work: Work[Any], memory_bytes: float, workers: Sequence[MonitoredWorker]) -> None:
         self._work = work
-        self._batches = Batches(work.items, work.total, len(workers))
+        self._batches = Batches(work.items, work.total, len(workers), work.limits.time_s)
         self._memory_bytes = memory_bytes
         self._idle = deque(workers)
         self._retries: deque[list[int]] = deque()
@@ -326,12 +111,12 @@ class _WorkProgress:
             if not self._running:
                 if not self._pausing or not self._retries:
                     return
-                time.sleep(_POLL_INTERVAL_S)
+                time.sleep(POLL_INTERVAL_S)
                 continue
-            futures, _ = wait(self._running, timeout=_POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
+            futures, _ = wait(self._running, timeout=POLL_INTERVAL_S, return_when=FIRST_COMPLETED)
             results = [result for future in futures for result in self._collect(future)]
             for worker, _ in self._running.values():
-                worker.enforce_limits(self._work.limits, self._memory_bytes)
+                worker.enforce_limits(self._work.limits, self._memory_bytes, self._batches.max_duration_s)
             if results:
                 # submit before the caller stores the results, so that no worker waits
                 self._submit_batches()
@@ -349,7 +134,7 @@ class _WorkProgress:
             self._submit(self._idle.popleft(), batch)
 
     def _submit(self, worker: MonitoredWorker, batch: Sequence[int]) -> None:
-        self._running[worker.submit(self._work.task, batch)] = (worker, batch)
+        self._running[worker.submit(self._work, batch)] = (worker, batch)
 
     def _collect(self, future: Future[Any]) -> list[TaskResult[Any]]:
         """Return the results of a finished batch, and arrange its unfinished items to run again."""
@@ -357,12 +142,16 @@ class _WorkProgress:
         error = future.exception()
         if isinstance(error, BrokenProcessPool):
             return self._handle_worker_crash(worker, batch, error)
-        if error is None:
+        if worker.is_loading:
+            self._submit(worker, batch)
+            return []
+        is_ambiguous = worker.is_ambiguous(self._work.limits)
+        if error is None and not is_ambiguous:
             self._deaths_at_start[worker] = 0
             return self._handle_batch_result(worker, future.result())
         self._idle.append(worker)
-        if len(batch) > 1:
-            # one of its results cannot be pickled
+        if is_ambiguous or len(batch) > 1:
+            # one of its items may have exceeded the time limit, or one of its results cannot be pickled
             self._retries.extend([item] for item in batch)
             return []
         return [TaskResult(batch[0], None, error if isinstance(error, Exception) else RuntimeError(repr(error)))]
@@ -397,8 +186,9 @@ class _WorkProgress:
         self, worker: MonitoredWorker, batch: Sequence[int], error: BaseException
     ) -> list[TaskResult[Any]]:
         """Identify the task that ended the worker; run the other tasks of its batch again."""
-        item, exit_error = worker.handle_death(error)
-        if item is None or item not in batch:
+        death = worker.handle_death(error)
+        item, exit_error = death.item, death.error
+        if item is None:
             self._deaths_at_start[worker] = deaths = self._deaths_at_start[worker] + 1
             if min(self._deaths_at_start.values()) >= _MAX_START_DEATHS:
                 reason = f"{exit_error}\n{exit_error.trace}".strip()
@@ -408,9 +198,16 @@ class _WorkProgress:
             return []
         self._deaths_at_start[worker] = 0
         index = batch.index(item)
+        if exit_error.outcome == TIMED_OUT and len(batch) > 1:
+            # the time of an item is measured only if it runs alone
+            self._retries.extend([started] for started in batch[: index + 1])
+            self._retries.extend([list(batch[index + 1 :])] if batch[index + 1 :] else [])
+            self._idle.append(worker)
+            return []
         self._retries.extend(list(part) for part in (batch[:index], batch[index + 1 :]) if part)
         attempt = self._attempts.pop(item, 1)
-        if exit_error.outcome in (CRASHED, OUT_OF_MEMORY) and attempt < _MAX_ATTEMPTS:
+        is_uncertain = exit_error.outcome in (CRASHED, OUT_OF_MEMORY) or death.was_suspended
+        if is_uncertain and attempt < _MAX_ATTEMPTS:
             self._attempts[item] = attempt + 1
             self._submit(worker, [item])
             return []

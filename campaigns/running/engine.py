@@ -18,7 +18,14 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, L
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
-from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
+from marsyard.campaigns.execution.cases import (
+    CompletedCase,
+    configuration_text,
+    create_loader,
+    prepare_input,
+    run_cases,
+    work_limits,
+)
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.running.preparation import compile_kernels, plan_inputs
@@ -278,7 +285,8 @@ def prepare_inputs(
     observer.begin("preparing", len(inputs))
     task = partial(prepare_input, configuration_text(configuration))
     limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
-    for result in itertools.chain.from_iterable(executor.run(Work(task, inputs, limits, len(inputs)))):
+    work = Work(task, inputs, limits, len(inputs), create_loader(configuration))
+    for result in itertools.chain.from_iterable(executor.run(work)):
         if result.error is not None:
             error = f"{type(result.error).__name__}: {result.error}"
             observer.note(f"shared input {result.item} could not be prepared: {error}")

@@ -17,7 +17,14 @@ from itertools import chain
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError
-from marsyard.campaigns.execution.cases import CompletedCase, configuration_text, prepare_input, run_cases, work_limits
+from marsyard.campaigns.execution.cases import (
+    CompletedCase,
+    configuration_text,
+    create_loader,
+    prepare_input,
+    run_cases,
+    work_limits,
+)
 from marsyard.campaigns.execution.worker_process import Executor, Work
 from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
 from marsyard.campaigns.store.products import ALL_PRODUCTS
@@ -252,6 +259,6 @@ def _build_inputs(campaign: Campaign, executor: Executor, plan: InputPlan, case:
     for number in missing:
         start_s = time.monotonic()
         limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
-        list(executor.run(Work(task, [number], limits)))
+        list(executor.run(Work(task, [number], limits, load=create_loader(configuration))))
         times.append(time.monotonic() - start_s)
     return times

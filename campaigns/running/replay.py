@@ -14,14 +14,7 @@ from marsyard.campaigns.definition.configuration import CampaignConfiguration, k
 from marsyard.campaigns.definition.identity import Identity, create_identity
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, ConfigurationError, Problem, WorkerExitError
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.worker_process import (
-    LOADING_S,
-    Executor,
-    Work,
-    WorkLimits,
-    accept_process_state,
-    start_clock,
-)
+from marsyard.campaigns.execution.worker_process import Executor, Work, WorkLimits, accept_process_state
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
@@ -163,7 +156,9 @@ def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
         for number, (name, requirement) in enumerate(suite.check_names(subject)):
-            ((result,),) = workers.run(Work(partial(_run_check, subject), [number], limits))
+            ((result,),) = workers.run(
+                Work(partial(suite.run_check, subject), [number], limits, load=partial(_load_subject, subject))
+            )
             finding, error = result.result, result.error
             if finding is None and isinstance(error, WorkerExitError):
                 frames = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
@@ -183,10 +178,7 @@ def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
                 return
 
 
-def _run_check(subject: suite.Subject, number: int) -> suite.Finding:
-    """Run one check in a worker; the clock starts after loading and compilation."""
-    start_clock(grace_s=LOADING_S)
+def _load_subject(subject: suite.Subject) -> None:
+    """Load and compile the subject of conformance checks in a worker."""
     subject.prepare()
     accept_process_state()
-    start_clock()
-    return suite.run_check(subject, number)

@@ -166,7 +166,7 @@ def test_signal_to_supervisor_ends_only_the_case(signal_number: int, tmp_path: P
 
 
 def overwrite_board(item: int) -> int:
-    """Write the integer 1 into all fields of the status board (shared memory: item and start time of the worker)."""
+    """Write the integer 1 into all fields of the status board (shared memory: item of the worker)."""
     assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:] = struct.pack("=q", 1) * (len(board) // 8)
