@@ -20,8 +20,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.key import sign
 from marsyard.campaigns.store.lock import replace_file
-from marsyard.campaigns.store.origin import sign
 from marsyard.reports import common_sections, explorer, sections
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences, read_budget

@@ -12,8 +12,10 @@ from typing import Any
 import pandas as pd
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
+from marsyard.campaigns.store.table import check_table
 from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
 from marsyard.scenarios.systems import row_columns
 from marsyard.sim.files import report_damage
@@ -37,6 +39,7 @@ class StoredRun:
     - record: contents of `campaign.json`; empty if the file cannot be read
     - showcases: numbers of the cases with stored products: first the case that the report shows, then the others in
       increasing order
+    - unverified: reason why the rows have no chain of hashes; empty if they were verified
     """
 
     directory: Path
@@ -44,6 +47,7 @@ class StoredRun:
     all_cases: pd.DataFrame
     record: Mapping[str, Any]
     showcases: tuple[int, ...]
+    unverified: str = ""
 
     @property
     def is_truncated(self) -> bool:
@@ -109,14 +113,18 @@ class StoredRun:
 
 
 def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> StoredRun:
-    """Read a campaign's folder; `requirements` replace the campaign's requirements.
+    """Read a campaign's folder, and verify its rows; `requirements` replace the campaign's requirements.
 
-    Raises StoreError without rows, or if the folder contains a symbolic link.
+    Raises StoreError without rows, if rows were changed after they were stored, or if the folder contains a symbolic
+    link.
     """
     path = directory / TABLE_FILE
     if not path.is_file():
         raise StoreError(f"{directory} contains no {TABLE_FILE}; a report needs the rows of a campaign")
     reject_links(directory)
+    unverified = check_rows(directory)
+    if not unverified:
+        check_table(directory)
     try:
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
     except (OSError, ValueError):
@@ -134,7 +142,7 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
         case_folders = []
     stored_cases = sorted(int(name) for name in case_folders if name.isascii() and name.isdigit())
     stored_cases.sort(key=lambda case: case != record.get("showcase"))
-    return StoredRun(directory, rows, all_rows, record, tuple(stored_cases))
+    return StoredRun(directory, rows, all_rows, record, tuple(stored_cases), unverified)
 
 
 def read_cases(directory: Path, cases: Sequence[int]) -> dict[int, dict[str, str]]:

@@ -35,10 +35,17 @@ from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
 from marsyard.campaigns.store.lock import folder_lock
-from marsyard.campaigns.store.origin import describe_origin
+from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductStore, create_product_selection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
-from marsyard.campaigns.store.table import TABLE_FILE, find_showcase, find_worst_cases, numeric_metrics, write_table
+from marsyard.campaigns.store.table import (
+    TABLE_FILE,
+    find_showcase,
+    find_worst_cases,
+    is_current,
+    numeric_metrics,
+    write_table,
+)
 from marsyard.scenarios.systems import RowColumns, row_columns
 
 
@@ -204,12 +211,15 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
     if previous.inputs is None and identity.inputs:
         files = ", ".join(identity.inputs)
         observer.note(f"no hash is stored for these files, so earlier changes are unknown: {files}")
+    check_rows(directory)
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         if store.about.get("identity") != stored["identity"]["configuration"] and not stored["changes"]:
             raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
         count = store.count()
         retries = store.list_cases_with_outcomes(RETRYABLE[word] for word in retry)
-        is_complete = stored["state"] in ("finished", SHARD_STATE) and (directory / TABLE_FILE).is_file()
+        table = directory / TABLE_FILE
+        has_table = table.is_file() and is_current(table, store)
+        is_complete = stored["state"] in ("finished", SHARD_STATE) and has_table
         if not retries and is_complete and not _list_missing_cases(run, store):
             observer.note(f"the campaign is finished: all {count} cases have rows; nothing is run")
             return

@@ -19,7 +19,7 @@ from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.origin import check_origin
+from marsyard.campaigns.store.origin import check_origin, check_rows
 from marsyard.campaigns.store.products import ALL_PRODUCTS, REPLAYED_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
@@ -63,6 +63,7 @@ def replay(directory: Path, case: int) -> Replay:
     if not 0 <= case < configuration.total_cases:
         raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.total_cases - 1}")
     load_stored_campaign(directory, configuration)
+    check_rows(directory)
     stored = stored_row(directory, case)
     identity = record.read(directory).get("identity")
     changed = Identity.read(identity).differences(create_identity(configuration)) if identity else []

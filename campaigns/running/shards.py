@@ -17,6 +17,7 @@ from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.products import CASES_FOLDER
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store, readable_store
 from marsyard.sim.files import report_damage
@@ -88,6 +89,8 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
     if missing:
         text = f"{len(missing)} of {first['cases']} cases are missing, the first is case {missing[0]}"
         raise CampaignError(f"{text}: give the folders of all shards")
+    for directory in directories:
+        check_rows(directory)
     record.claim_folder(target)
     with folder_lock(target):
         create_store(target / ROWS_FILE, {"identity": identity.configuration})

@@ -1,26 +1,23 @@
 """Origin of a campaign's folder: whether this user's installation created it.
 
 A folder can name code of its author: a custom scenario, algorithm or part. Commands that run cases execute it only if
-the record contains a hash with the key of this user, or after `adopt` (option ``--trust``).
+the record contains a hash with the key of this user, or after `adopt` (option ``--trust``). The rows of a folder that
+this user created must also be signed by this user.
 """
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import json
-import os
-import secrets
-import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.definition.identity import custom_sources, hash_sources, list_algorithms, list_parts
-from marsyard.campaigns.errors import CampaignError, report_write_errors
+from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
+from marsyard.campaigns.store.key import is_signature, sign
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, StoreVersionError, readable_store
 from marsyard.scenarios.imports import search_current_folder
 from marsyard.scenarios.offline import is_offline
 
@@ -36,14 +33,34 @@ def describe_origin(configuration: CampaignConfiguration) -> dict[str, Any]:
 
 def check_origin(directory: Path, configuration: CampaignConfiguration) -> None:
     """Raise CampaignError if a folder that was created elsewhere names code; nothing is executed."""
-    # only a custom scenario knows which of its parameters name code
-    names = [configuration.scenario] if ":" in configuration.scenario else _list_names(configuration)
-    signature = str(_read_origin(directory).get("signature"))
-    if names and not hmac.compare_digest(signature.encode(), _sign(configuration).encode()):
+    names = _list_code(configuration)
+    if names and not _is_own(directory, configuration):
         raise CampaignError(
             f"{directory} was created or changed elsewhere, and this command would execute code that it names: "
             f"{', '.join(names)}. Nothing was executed. If you trust this code: --trust"
         )
+
+
+def check_rows(directory: Path) -> str:
+    """Verify the rows of a campaign; return the reason if they have no chain of hashes, otherwise an empty text.
+
+    Raises StoreError if a row was changed after it was stored, or rows of a folder of this user are not signed by it.
+    """
+    path = directory / ROWS_FILE
+    if not path.exists():
+        return f"{directory} has no {ROWS_FILE}"
+    try:
+        with readable_store(path) as store:
+            store.verify()
+            is_signed = store.is_signed
+    except StoreVersionError as error:
+        return f"{path} has version {error.version}, without a chain of hashes"
+    if not is_signed and _is_own_folder(directory):
+        raise StoreError(
+            f"{path} was written by another user or program than {record.RECORD_FILE}, which you created: its rows may "
+            f"not be those of its cases. If you trust them: marsyard report {directory} --trust"
+        )
+    return ""
 
 
 def adopt(directory: Path) -> None:
@@ -52,11 +69,33 @@ def adopt(directory: Path) -> None:
     recorded = origin.get("code")
     names = dict(recorded) if isinstance(recorded, dict) else {}
     changed = [name for name, digest in _hash_code(list(names)).items() if digest != names[name]]
-    if changed or not names:
+    if changed or not names.keys() >= set(_list_code(configuration)):
         raise CampaignError(
             f"--trust: the code here is not the code that {directory} recorded: {', '.join(changed) or 'none'}"
         )
+    if (directory / ROWS_FILE).exists():
+        with RowStore(directory / ROWS_FILE) as store:
+            store.verify()
+            store.sign()
     record.update(directory, {"origin": {**origin, "signature": _sign(configuration)}})
+
+
+def _list_code(configuration: CampaignConfiguration) -> list[str]:
+    """List all code that a configuration names; only a custom scenario knows which of its parameters name code."""
+    return [configuration.scenario] if ":" in configuration.scenario else _list_names(configuration)
+
+
+def _is_own_folder(directory: Path) -> bool:
+    """Whether this user created a folder; False if its record is damaged."""
+    try:
+        return _is_own(directory, record.stored_configuration(directory))
+    except StoreError:
+        return False
+
+
+def _is_own(directory: Path, configuration: CampaignConfiguration) -> bool:
+    """Whether this user created or adopted a folder with a configuration."""
+    return is_signature(str(_read_origin(directory).get("signature")), _signed_content(configuration))
 
 
 def _list_names(configuration: CampaignConfiguration) -> list[str]:
@@ -77,26 +116,9 @@ def _read_origin(directory: Path) -> dict[str, Any]:
 
 
 def _sign(configuration: CampaignConfiguration) -> str:
-    """Compute the hash of everything in a configuration that can name code, with the key of this user."""
-    contents = configuration.model_dump(mode="json", include=_KEYS)
-    return sign(json.dumps(contents, sort_keys=True).encode())
+    return sign(_signed_content(configuration))
 
 
-def sign(*contents: bytes) -> str:
-    """Compute a hash of contents with the key of this user. Raises StoreError if the key cannot be created or read."""
-    digests = b"".join(hashlib.sha256(content).digest() for content in contents)
-    return hmac.new(_read_key(), digests, hashlib.sha256).hexdigest()
-
-
-def _read_key() -> bytes:
-    """Return the key of this user; it is created at its first use."""
-    path = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "marsyard" / "origin.key"
-    with report_write_errors(path):
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            with tempfile.NamedTemporaryFile(dir=path.parent) as file:
-                file.write(secrets.token_bytes(32))
-                file.flush()
-                with suppress(FileExistsError):  # another process has created it
-                    os.link(file.name, path)
-        return path.read_bytes()
+def _signed_content(configuration: CampaignConfiguration) -> bytes:
+    """Return everything in a configuration that can name code."""
+    return json.dumps(configuration.model_dump(mode="json", include=_KEYS), sort_keys=True).encode()

@@ -3,6 +3,8 @@
 The Parquet table can always be created again from this file. A row is a JSON list of values. Rows with the same columns
 have the same layout, and the column names are stored once for each layout.
 
+A chain of hashes (`marsyard.campaigns.store.chain`) shows whether rows were changed after they were stored.
+
 The journal is a write-ahead log with `synchronous = FULL`. A committed transaction is not lost if the program is
 killed, nor at a power failure if the disk executes `fsync` correctly. Each batch (about one second of work) needs one
 `fsync`, which takes some milliseconds.
@@ -22,12 +24,13 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError
+from marsyard.campaigns.store import chain
 from marsyard.campaigns.store.lock import replace_file
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
 #: Version of the tables below, stored as `PRAGMA user_version`.
-STORE_VERSION = 2
+STORE_VERSION = 3
 #: Identifier of the file type (`PRAGMA application_id`): "Mars".
 _APPLICATION_ID = int.from_bytes(b"Mars", "big")
 #: SQL of an empty store. The journal mode DELETE leaves no second file when the new store is renamed.
@@ -38,10 +41,12 @@ PRAGMA user_version = {STORE_VERSION};
 BEGIN;
 CREATE TABLE about (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE layouts (layout INTEGER PRIMARY KEY, names TEXT NOT NULL UNIQUE);
-CREATE TABLE kinds (name TEXT NOT NULL, kind TEXT NOT NULL, PRIMARY KEY (name, kind));
+CREATE TABLE kinds (name TEXT NOT NULL, kind TEXT NOT NULL, position INTEGER NOT NULL, PRIMARY KEY (name, kind));
 CREATE TABLE cases (
-    case_number INTEGER PRIMARY KEY, outcome TEXT NOT NULL, layout INTEGER NOT NULL, row TEXT NOT NULL
+    case_number INTEGER PRIMARY KEY, position INTEGER NOT NULL, outcome TEXT NOT NULL, layout INTEGER NOT NULL,
+    row TEXT NOT NULL
 );
+{chain.CHAIN_TABLES}
 COMMIT;
 """
 
@@ -52,8 +57,17 @@ def create_store(path: Path, about: Mapping[str, str]) -> None:
         with replace_file(path) as partial, closing(sqlite3.connect(partial, isolation_level=None)) as connection:
             connection.executescript(_TABLES)
             connection.executemany("INSERT INTO about VALUES (?, ?)", about.items())
+            chain.write_seal(connection, chain.ROWS, chain.first_head(about).hex())
     except (sqlite3.Error, OSError) as error:
         raise StoreError(f"{path} cannot be written: {error}") from error
+
+
+class StoreVersionError(StoreError):
+    """A store of another version of Marsyard; `version` is that of the store."""
+
+    def __init__(self, path: Path, version: int) -> None:
+        super().__init__(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
+        self.version = version
 
 
 class RowStore(AbstractContextManager["RowStore"]):
@@ -81,27 +95,31 @@ class RowStore(AbstractContextManager["RowStore"]):
             if application != _APPLICATION_ID:
                 raise StoreError(f"{path} is damaged, or is not a store of this version: wrong application id")
             if version != STORE_VERSION:
-                raise StoreError(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
+                raise StoreVersionError(path, version)
             problems = [text for (text,) in execute("PRAGMA quick_check(1)")] if thorough else ["ok"]
             if problems != ["ok"]:
                 raise StoreError(f"{path} is damaged: {' '.join(problems)}; nothing was written to it")
             execute("PRAGMA journal_mode = WAL")
             execute("PRAGMA synchronous = FULL")
-            self._layouts: dict[tuple[str, ...], int] = {}
-            for text, layout in execute("SELECT names, layout FROM layouts"):
-                try:
-                    names = json.loads(text)
-                except (ValueError, TypeError):
-                    names = None
-                if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-                    raise StoreError(f"{path} is damaged: layout {layout} is not a list of column names")
-                self._layouts[tuple(names)] = layout
-            self._kinds = set(execute("SELECT name, kind FROM kinds"))
+            self._load_columns()
         except BaseException as error:
             self._connection.close()
             if isinstance(error, sqlite3.Error):
                 raise self._store_error(error) from error
             raise
+
+    def _load_columns(self) -> None:
+        """Read the layouts, and the types of each column's values."""
+        self._layouts: dict[tuple[str, ...], int] = {}
+        for text, layout in self._connection.execute("SELECT names, layout FROM layouts"):
+            try:
+                names = json.loads(text)
+            except (ValueError, TypeError):
+                names = None
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise StoreError(f"{self._path} is damaged: layout {layout} is not a list of column names")
+            self._layouts[tuple(names)] = layout
+        self._kinds = set(self._connection.execute("SELECT name, kind FROM kinds"))
 
     def _store_error(self, error: sqlite3.Error) -> StoreError:
         """Create the error for the user, with a remedy if the disk is full."""
@@ -128,26 +146,93 @@ class RowStore(AbstractContextManager["RowStore"]):
 
         Raises StoreError on failure; none of the rows is then stored.
         """
+        with self._transaction():
+            position, head = self._last_entry()
+            for row in rows:
+                position += 1
+                head = self._add_row(row, position, head)
+            chain.write_seal(self._connection, chain.ROWS, head.hex())
+
+    def _last_entry(self) -> tuple[int, bytes]:
+        """Return position and head of the last entry of the chain; 0 and the first head of an empty store."""
+        last = next(self._query("SELECT position, head FROM chain ORDER BY position DESC LIMIT 1"), None)
+        return (0, chain.first_head(self.about)) if last is None else last
+
+    def _add_row(self, row: Row, position: int, head: bytes) -> bytes:
+        """Store a row and its entry of the chain; return the new head."""
+        execute, names = self._connection.execute, tuple(row)
+        names_text = json.dumps(names)
+        if names not in self._layouts:
+            self._layouts[names] = len(self._layouts) + 1
+            execute("INSERT INTO layouts VALUES (?, ?)", (self._layouts[names], names_text))
+        new_kinds = {(name, classify_value(value)) for name, value in row.items()} - self._kinds
+        self._kinds |= new_kinds
+        for kind in new_kinds:
+            execute("INSERT INTO kinds VALUES (?, ?, ?)", (*kind, position))
+        case, outcome, text = row["case"], row["outcome"], json.dumps(list(row.values()))
+        row_hash = chain.hash_row(int(case), str(outcome).encode(), names_text.encode(), text.encode())
+        head = chain.next_head(head, row_hash, new_kinds)
+        entry = case, position, outcome, self._layouts[names], text
+        execute("INSERT OR REPLACE INTO cases VALUES (?, ?, ?, ?, ?)", entry)
+        execute("INSERT INTO chain VALUES (?, ?, ?, ?)", (position, case, row_hash, head))
+        return head
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """Execute the statements inside the context in one transaction, or none of them after an exception."""
         execute = self._connection.execute
         try:
             execute("BEGIN IMMEDIATE")
             try:
-                for row in rows:
-                    names = tuple(row)
-                    if names not in self._layouts:
-                        execute("INSERT INTO layouts VALUES (?, ?)", (len(self._layouts), json.dumps(names)))
-                        self._layouts[names] = len(self._layouts)
-                    for kind in ((name, classify_value(value)) for name, value in row.items()):
-                        if kind not in self._kinds:
-                            execute("INSERT INTO kinds VALUES (?, ?)", kind)
-                            self._kinds.add(kind)
-                    entry = row["case"], row["outcome"], self._layouts[names], json.dumps(list(row.values()))
-                    execute("INSERT OR REPLACE INTO cases VALUES (?, ?, ?, ?)", entry)
+                yield
                 execute("COMMIT")
             except BaseException:
                 if self._connection.in_transaction:
                     execute("ROLLBACK")
+                self._load_columns()
                 raise
+        except sqlite3.Error as error:
+            raise self._store_error(error) from error
+
+    def verify(self) -> None:
+        """Verify the chain of all rows. Raises StoreError for the first row that disagrees."""
+        try:
+            self._connection.execute("BEGIN")  # rows that a running campaign adds meanwhile are not read
+            try:
+                problem = chain.find_broken_link(self._connection, self.about)
+            finally:
+                self._connection.execute("COMMIT")
+        except sqlite3.Error as error:
+            raise self._store_error(error) from error
+        if problem:
+            raise StoreError(f"{self._path}: {problem}; its rows are not those that the campaign stored")
+
+    @property
+    def is_signed(self) -> bool:
+        """Whether this user's installation stored the last rows."""
+        return self._seals().get(chain.ROWS, ("", False))[1]
+
+    def sign(self) -> None:
+        """Sign the last head and the table, which this user trusts although another one stored them."""
+        seals = self._seals()
+        with self._transaction():
+            for name, (digest, _) in seals.items():
+                chain.write_seal(self._connection, name, digest)
+
+    @property
+    def table_digest(self) -> str | None:
+        """SHA-256 of the table's file that was written from the rows; None without one, or if another user wrote it."""
+        digest, is_own = self._seals().get(chain.TABLE, (None, False))
+        return digest if is_own or not self.is_signed else None
+
+    def record_table(self, digest: str) -> None:
+        """Record the SHA-256 of the table's file that was written from the rows."""
+        with self._transaction():
+            chain.write_seal(self._connection, chain.TABLE, digest)
+
+    def _seals(self) -> dict[str, tuple[str, bool]]:
+        try:
+            return chain.read_seals(self._connection)
         except sqlite3.Error as error:
             raise self._store_error(error) from error
 

@@ -7,6 +7,7 @@ different columns. The module also selects the showcase of a report and the case
 from __future__ import annotations
 
 import gc
+import hashlib
 import itertools
 import math
 import os
@@ -20,6 +21,7 @@ import numpy as np
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.lock import replace_file
+from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.record import stored_configuration
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
 from marsyard.sim.files import report_damage
@@ -30,7 +32,7 @@ _GROUP_ROWS = 50_000
 
 
 def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ()) -> None:
-    """Write the rows of a store as a Parquet table in the order of the cases, atomically.
+    """Write the rows of a store as a Parquet table in the order of the cases, atomically, and record its SHA-256.
 
     The columns of the engine come before and after those of the scenario. Missing numbers are NaN, other missing values
     are null. The table always contains the numeric columns `metric_columns`.
@@ -65,10 +67,28 @@ def write_table(path: Path, store: RowStore, metric_columns: Sequence[str] = ())
             writer.close()
             with partial.open("rb") as file:
                 os.fsync(file.fileno())
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+        store.record_table(digest)
     except OSError as error:
         raise StoreError(f"{path} cannot be written: {error.strerror or error}") from error
     except (TypeError, ValueError) as error:
         raise StoreError(f"{path} cannot be written: {ROWS_FILE} is damaged: a row cannot be read: {error}") from error
+
+
+def is_current(path: Path, store: RowStore) -> bool:
+    """Whether a file is the table that was last written from the rows of a store."""
+    with report_damage(path, StoreError, "cannot be read"), path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() == store.table_digest
+
+
+def check_table(directory: Path) -> None:
+    """Raise StoreError if the table of a campaign is not the one that was written from its rows."""
+    with readable_store(directory / ROWS_FILE) as store:
+        if not is_current(directory / TABLE_FILE, store):
+            raise StoreError(
+                f"{directory / TABLE_FILE} was changed, or was not completely written: to write it again from "
+                f"{ROWS_FILE}: marsyard resume {directory}"
+            )
 
 
 def _transpose(
@@ -128,13 +148,14 @@ def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
 
 
 def refresh_table(directory: Path) -> None:
-    """Write the table of an unfinished campaign from its current rows.
+    """Verify the rows of a campaign, and write its table from them.
 
-    Raises StoreError if the store is unreadable or the table is not writable.
+    Raises StoreError if a row was changed after it was stored, or the table is not writable.
     """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
         return  # an earlier version, without a row store, has already written the table of the interrupted campaign
     requirements = stored_configuration(directory).requirements
+    check_rows(directory)
     with RowStore(directory / ROWS_FILE) as store:
         write_table(directory / TABLE_FILE, store, numeric_metrics(requirements))
 

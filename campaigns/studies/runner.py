@@ -31,7 +31,7 @@ from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.lock import folder_lock
-from marsyard.campaigns.store.origin import describe_origin
+from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
@@ -245,6 +245,7 @@ def continue_study(
             configuration = configuration.model_copy(update={"appended": blocks})
         campaign = load_stored_campaign(directory, configuration)
         check_identity(campaign, directory)
+        check_rows(directory)
         stored = record.read(directory)
         description = record.describe_session("resume", session.executor.describe(), int(stored["cases_finished"]))
         changes: dict[str, Any] = {"state": "running", "finished_utc": None}

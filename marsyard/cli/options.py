@@ -100,7 +100,8 @@ TrustOption = Annotated[
     bool,
     Option(
         "--trust",
-        help="Execute code that a folder names which was created elsewhere; it must be the code that it recorded.",
+        help="Accept a folder that was created or changed elsewhere: its rows, and the code that it names. The code is "
+        "executed; it must be the recorded code.",
     ),
 ]
 

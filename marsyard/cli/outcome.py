@@ -79,6 +79,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
         lines.append(multiplicity)
     if not any(verdict.withheld_status for verdict in verdicts):
         lines.append(f"evidence: {evaluation.evidence.text}")
+    if run.unverified:
+        lines.append(f"rows: not verified, since {run.unverified}")
     lines.append(f"report: {page}")
     if not is_finished:
         state = "killed" if stored["state"] == "running" else stored["state"]

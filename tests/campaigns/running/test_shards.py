@@ -16,7 +16,7 @@ from marsyard.campaigns.running.engine import finish_campaign, resume_campaign, 
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.running.shards import Shard, merge_shards
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.rows import ROWS_FILE, RowStore
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, read_case_rows, write_campaign
 
@@ -72,7 +72,10 @@ def test_interrupted_shard_is_resumed_within_its_cases(
     copy = tmp_path / "shard"
     shutil.copytree(shards[1], copy)
     with RowStore(copy / ROWS_FILE) as store:
-        store._connection.execute("DELETE FROM cases WHERE case_number = 4")
+        rows, about = [store.row(case) for case in (3, 5)], store.about
+    create_store(copy / ROWS_FILE, about)
+    with RowStore(copy / ROWS_FILE) as store:
+        store.add(row for row in rows if row is not None)
     record.update(copy, {"state": "interrupted"})
     with pytest.raises(CampaignError, match="is not finished"):
         merge_shards([copy], tmp_path / "merged")
@@ -95,6 +98,15 @@ def test_incomplete_or_different_shards_are_rejected(
         with pytest.raises(CampaignError, match=message):
             merge_shards(directories, tmp_path / "merged")
         assert not (tmp_path / "merged").exists()
+
+
+def test_changed_shard_is_rejected(shards: list[Path], tmp_path: Path) -> None:
+    copies = [shutil.copytree(shard, tmp_path / shard.name) for shard in shards]
+    with RowStore(copies[2] / ROWS_FILE) as store:
+        store._connection.execute("UPDATE cases SET outcome = 'CRASHED' WHERE case_number = 7")
+    with pytest.raises(CampaignError, match=r"shard-3/cases\.sqlite: the row of case 7 was changed"):
+        merge_shards(copies, tmp_path / "merged")
+    assert not (tmp_path / "merged").exists()
 
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "2", "a/b", "1/0"])

@@ -140,7 +140,7 @@ def test_store_of_another_version_is_rejected(tmp_path: Path) -> None:
     connection = sqlite3.connect(tmp_path / "cases.sqlite")
     connection.execute("PRAGMA user_version = 99")
     connection.close()
-    with pytest.raises(StoreError, match="has version 99; this version of Marsyard reads 2"):
+    with pytest.raises(StoreError, match="has version 99; this version of Marsyard reads 3"):
         RowStore(tmp_path / "cases.sqlite")
 
 
