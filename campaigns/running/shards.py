@@ -16,7 +16,7 @@ from typing import Any
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.lock import create_folder
 from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.products import CASES_FOLDER
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store, readable_store
@@ -61,8 +61,10 @@ def read_shard(stored: dict[str, Any]) -> Shard | None:
 def merge_shards(directories: Sequence[Path], target: Path) -> None:
     """Create a campaign from the rows and products of all its shards; its table and report are not written yet.
 
+    The folder of the campaign appears when it is complete: an interrupted merge leaves nothing that a new one rejects.
     Raises CampaignError, and changes nothing, if a folder is no finished shard, the shards are of different campaigns,
-    programs or versions, or cases are missing or contained twice.
+    programs or versions, cases are missing or contained twice, rows were changed after they were stored, or the folder
+    of the campaign is not empty or the current folder.
     """
     records = [record.read(directory) for directory in directories]
     first = records[0]
@@ -89,20 +91,21 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
     if missing:
         text = f"{len(missing)} of {first['cases']} cases are missing, the first is case {missing[0]}"
         raise CampaignError(f"{text}: give the folders of all shards")
+    if target.resolve() == Path.cwd() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
+        raise StoreError(f"{target} exists and is not an empty folder; choose another folder with --out")
     for directory in directories:
         check_rows(directory)
-    record.claim_folder(target)
-    with folder_lock(target):
-        create_store(target / ROWS_FILE, {"identity": identity.configuration})
-        with RowStore(target / ROWS_FILE) as store:
+    with create_folder(target) as folder:
+        create_store(folder / ROWS_FILE, {"identity": identity.configuration})
+        with RowStore(folder / ROWS_FILE) as store:
             for directory in directories:
                 _copy_rows(directory, store)
         for directory in directories:
-            _copy_products(directory, target)
+            _copy_products(directory, folder)
         sessions = [session for stored in records for session in stored["sessions"]]
         started = min(stored["started_utc"] for stored in records)
         updates = {"sessions": sessions, "started_utc": started, "state": "interrupted", "merged": len(directories)}
-        record.write(target, {**{key: value for key, value in first.items() if key != SHARD_KEY}, **updates})
+        record.write(folder, {**{key: value for key, value in first.items() if key != SHARD_KEY}, **updates})
 
 
 def _copy_rows(directory: Path, store: RowStore) -> None:

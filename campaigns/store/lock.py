@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import glob
 import hashlib
 import os
 import platform
@@ -16,7 +17,7 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
@@ -161,7 +162,36 @@ def replace_file(path: Path) -> Iterator[Path]:
 
 def _remove_abandoned(directory: Path) -> None:
     """Remove temporary files and folders of dead processes of this machine from a campaign's folder and its cases."""
-    for path in (*directory.glob("*.partial"), *directory.glob("cases/*/*.partial")):
+    remove_abandoned((*directory.glob("*.partial"), *directory.glob("cases/*/*.partial")))
+
+
+def remove_abandoned(paths: Iterable[Path]) -> None:
+    """Remove those temporary files and folders (`partial_suffix`) whose processes, on this machine, have ended."""
+    for path in paths:
         match = _PARTIAL.search(path.name)
         if match is not None and match[1] == _machine() and not _exists(int(match[2])):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+
+
+@contextmanager
+def create_folder(directory: Path) -> Iterator[Path]:
+    """Yield a temporary folder that becomes the folder `directory` at the end; after an exception it is removed.
+
+    Raises StoreError if `directory` exists and is not empty, or cannot be written.
+    """
+    directory = directory.resolve()
+    temporary = directory.with_name(f".{directory.name}{partial_suffix()}")
+    with report_write_errors(directory):
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        remove_abandoned(directory.parent.glob(f".{glob.escape(directory.name)}.*.partial"))
+        temporary.mkdir()
+    try:
+        yield temporary
+        try:
+            temporary.rename(directory)  # succeeds if `directory` is missing or empty
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
+            raise StoreError(f"{directory} is not an empty folder; choose another folder with --out") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import shutil
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -107,6 +110,59 @@ def test_changed_shard_is_rejected(shards: list[Path], tmp_path: Path) -> None:
     with pytest.raises(CampaignError, match=r"shard-3/cases\.sqlite: the row of case 7 was changed"):
         merge_shards(copies, tmp_path / "merged")
     assert not (tmp_path / "merged").exists()
+
+
+#: Events of Python's audit hook that write.
+WRITING_EVENTS = ("open", "os.rename", "os.mkdir", "os.rmdir", "os.remove", "sqlite3.connect", "shutil.copyfile")
+
+
+def merge_until_killed(shards: Sequence[Path], target: Path, step: int) -> bool:
+    """Merge shards in a process that ends, as if it was killed, before a step of writing; return whether it ended."""
+    child = os.fork()
+    if child == 0:
+        steps = itertools.count()
+
+        def end_at_step(event: str, arguments: tuple[object, ...]) -> None:
+            is_step = event in WRITING_EVENTS and str(target.parent) in " ".join(map(str, arguments))
+            if is_step and next(steps) == step:
+                os._exit(9)
+
+        sys.addaudithook(end_at_step)
+        merge_shards(shards, target)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+
+
+def test_killed_merge_is_repeated(shards: list[Path], tmp_path: Path) -> None:
+    """A merge is killed before each of its steps of writing; the next merge then succeeds."""
+    folder, step = tmp_path / "merged", 0
+    folder.mkdir()
+    target = folder / "all"
+    while merge_until_killed(shards, target, step):
+        assert not target.exists() or record.read(target)["state"] == "interrupted", step
+        if not target.exists():
+            merge_shards(shards, target)
+        with RowStore(target / ROWS_FILE, thorough=True) as store:
+            store.verify()
+            assert store.count() == 12
+        assert sorted(path.name for path in folder.iterdir()) == ["all"], step
+        products = {path.name for shard in shards for path in shard.glob("cases/*")}
+        assert {path.name for path in (target / "cases").iterdir()} == products
+        shutil.rmtree(target)
+        step += 1
+    # each writes at least once: folder, store, products, record, final name
+    assert step >= 5
+    assert record.read(target)["state"] == "interrupted"
+
+
+def test_merge_into_a_used_folder_is_rejected(shards: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "empty").mkdir()
+    for target in (tmp_path, tmp_path / "notes.txt"):
+        with pytest.raises(CampaignError, match="exists and is not an empty folder"):
+            merge_shards(shards, target)
+    merge_shards(shards, tmp_path / "empty")
+    assert record.read(tmp_path / "empty")["cases"] == 12
 
 
 @pytest.mark.parametrize("text", ["0/4", "5/4", "2", "a/b", "1/0"])
