@@ -31,15 +31,17 @@ class AlgorithmError(Exception):
 
     - fault: Reason
     - stderr: End of the algorithm's standard error
+    - trace: Traceback of an exception in the algorithm's own process
     """
 
-    def __init__(self, fault: Fault, message: str, stderr: str = "") -> None:
+    def __init__(self, fault: Fault, message: str, stderr: str = "", trace: str = "") -> None:
         super().__init__(message)
         self.fault = fault
         self.stderr = stderr
+        self.trace = trace
 
-    def __reduce__(self) -> tuple[type[AlgorithmError], tuple[Fault, str, str]]:
-        return type(self), (self.fault, str(self), self.stderr)
+    def __reduce__(self) -> tuple[type[AlgorithmError], tuple[Fault, str, str, str]]:
+        return type(self), (self.fault, str(self), self.stderr, self.trace)
 
 
 def bad_answer(message: str) -> AlgorithmError:

@@ -1,11 +1,66 @@
-"""Child processes and memory use, read from Linux's /proc to enforce memory limits; empty or zero on other systems."""
+"""Processes and their limits: child processes and memory from Linux's /proc (empty or zero elsewhere), and clocks."""
 
 from __future__ import annotations
 
+import ctypes
+import os
 import re
-from collections.abc import Sequence
+import signal
+import sys
+import time
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
+
+#: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
+_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+#: Maximum time between two readings of an `AwakeClock` that is counted, s.
+_MAX_STEP_S = 1.0
+
+
+class AwakeClock:
+    """Clock that counts only the time during which this process reads it at least once a second.
+
+    If this process is suspended, together with the process that it monitors, the time of the suspension is not counted.
+    """
+
+    def __init__(self) -> None:
+        self._elapsed_s, self._last_s = 0.0, time.monotonic()
+
+    def elapsed_s(self) -> float:
+        """Return the counted time since the creation of the clock."""
+        now_s = time.monotonic()
+        self._elapsed_s += min(now_s - self._last_s, _MAX_STEP_S)
+        self._last_s = now_s
+        return self._elapsed_s
+
+
+def processor_time_s(process: int) -> float:
+    """Return the processor time of all threads of another process. Raises OSError if it has ended."""
+    # Linux: clock identifier of a process, see `clock_getcpuclockid` and CPUCLOCK_SCHED
+    return time.clock_gettime((~process << 3) | 2)
+
+
+def adopt_orphans() -> None:
+    """Make this process the parent of every orphaned descendant, in any session."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def end_with_parent(parent: int, signal_number: int) -> None:
+    """Request a signal at the parent's end; end this process now if the parent has already ended."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal_number)
+        if os.getppid() != parent:
+            os._exit(1)
+
+
+def kill(processes: Iterable[int]) -> None:
+    """Kill single processes, except process 1; numbers below 1, which mean process groups, are ignored."""
+    for process in processes:
+        if process > 1:
+            with suppress(ProcessLookupError, PermissionError):
+                os.kill(process, signal.SIGKILL)
 
 
 def children(process: int) -> list[int]:

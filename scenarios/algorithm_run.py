@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -22,8 +21,10 @@ from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
 from marsyard.scenarios.estimators import Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
+from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.sim.parameters import Parameters
 
+Algorithm = TypeVar("Algorithm")
 Answer = TypeVar("Answer")
 Inputs = TypeVar("Inputs")
 
@@ -116,16 +117,16 @@ def _walk_values(value: Any, excluded: tuple[str, ...] = ()) -> Iterator[Any]:
 
 def run_algorithm(call: Callable[[], object], check: Callable[[object], Answer]) -> AlgorithmRun[Answer]:
     """Run an algorithm and validate its answer; all exceptions become failures of the algorithm."""
-    start_s = time.process_time()
+    start_s = algorithm_time_s()
     try:
         raw_answer = call()
-        elapsed_s = time.process_time() - start_s
+        elapsed_s = algorithm_time_s() - start_s
         answer = check(raw_answer)
     except Exception as error:
-        row: dict[str, Scalar] = {"estimation_time_s": time.process_time() - start_s}
+        row: dict[str, Scalar] = {"estimation_time_s": algorithm_time_s() - start_s}
         if isinstance(error, AlgorithmError):
             row |= {STDERR: error.stderr} if error.stderr else {}
-            return AlgorithmRun(None, Failure(error.fault.name, str(error), ""), row)
+            return AlgorithmRun(None, Failure(error.fault.name, str(error), error.trace), row)
         fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
         return AlgorithmRun(None, Failure(fault.name, describe_error(error), traceback.format_exc()), row)
     row = {"estimation_time_s": answer_time_s(answer, elapsed_s)}
@@ -135,17 +136,33 @@ def run_algorithm(call: Callable[[], object], check: Callable[[object], Answer])
     return AlgorithmRun(answer, None, row)
 
 
-def run_algorithm_on_copy(
-    call: Callable[[Inputs], object], check: Callable[[object], Answer], measurements: Inputs
+def run_on_measurements(
+    create: Callable[[], Algorithm],
+    call: Callable[[Algorithm, Inputs], object],
+    check: Callable[[object], Answer],
+    measurements: Inputs,
 ) -> AlgorithmRun[Answer]:
-    """Run an algorithm on a separate copy of the measurements, which it must not change; see `run_algorithm`."""
-    input_copy = InputCopy(measurements)
+    """Create an algorithm, call it with the measurements and validate its answer; see `run_algorithm`.
+
+    An algorithm in this process receives a copy of the measurements, which it must not change. One in a process of its
+    own cannot change them.
+    """
+    input_copy: InputCopy[Inputs] | None = None
+
+    def create_and_call() -> object:
+        nonlocal input_copy
+        algorithm = create()
+        if is_remote(algorithm):
+            return call(algorithm, measurements)
+        input_copy = InputCopy(measurements)
+        return call(algorithm, input_copy.inputs)
 
     def check_inputs_and_answer(answer: object) -> Answer:
-        input_copy.check()
+        if input_copy is not None:
+            input_copy.check()
         return check(answer)
 
-    return run_algorithm(lambda: call(input_copy.inputs), check_inputs_and_answer)
+    return run_algorithm(create_and_call, check_inputs_and_answer)
 
 
 def answer_time_s(answer: object, processor_s: float) -> float:
@@ -189,7 +206,7 @@ class AlgorithmSelection(Parameters):
     compared: Annotated[
         tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
     ] = ()
-    executable: Annotated[ExecutableLimits, Field(description="limits of an algorithm that is an external program")] = (
+    executable: Annotated[ExecutableLimits, Field(description="limits and isolation of custom algorithms")] = (
         ExecutableLimits()
     )
 

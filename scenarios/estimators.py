@@ -15,7 +15,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -31,10 +31,25 @@ from marsyard.algorithms.dimes import options as dimes_options
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions
 from marsyard.algorithms.hda import options as hda_options
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
-from marsyard.algorithms.interface import SiteEstimator, TargetTracker, VelocityEstimator
+from marsyard.algorithms.interface import (
+    MastAim,
+    PixelBox,
+    SiteEstimate,
+    SiteEstimator,
+    SiteOutcome,
+    TargetLoss,
+    TargetTracker,
+    TargetUpdate,
+    TrackingState,
+    VelocityEstimate,
+    VelocityEstimator,
+    VelocityOutcome,
+)
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.algorithms.vtt import options as vtt_options
 from marsyard.scenarios.imports import import_object, source_files
+from marsyard.scenarios.isolation.host import construct, reset
+from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, describe
 from marsyard.scenarios.offline import (
     SITE_FORMAT,
     VELOCITY_FORMAT,
@@ -84,6 +99,7 @@ class Task(Generic[Algorithm, Options]):
     - name: name on the command line and in the exchange with programs
     - what: noun for an algorithm of the task in messages, such as "velocity estimator"
     - methods: required methods of an algorithm
+    - answers: data classes and enumerations of its answers
     - shipped: functions that create Marsyard's algorithms from the options of the published algorithm
     - options: class of the options of the published algorithm
     - executable: function that wraps an external program; None if programs are not accepted
@@ -98,6 +114,7 @@ class Task(Generic[Algorithm, Options]):
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     options: type[Options]
+    answers: tuple[type, ...] = ()
     executable: Callable[[exchange.Command, exchange.ExecutableLimits], Algorithm] | None = None
     offline: AnswerFormat[Any] | None = None
     streamed: Callable[[Any], Algorithm] | None = None
@@ -119,12 +136,12 @@ class Task(Generic[Algorithm, Options]):
             if file is not None:
                 read_answers(file, answer_format)
             return
-        factory = self._import(spec)
-        methods = STREAM_METHODS if self._is_stream(factory) else self.methods
-        missing = [method for method in methods if not hasattr(factory, method)]
-        if not callable(factory):
-            raise ValueError(f"'{spec}' is not a valid {self.what}: {type(factory).__name__}, not a class or function")
-        if missing and isinstance(factory, type):
+        factory = describe_custom(spec, self.shipped)
+        methods = STREAM_METHODS if self._is_stream(factory.members) else self.methods
+        missing = [method for method in methods if method not in factory.members]
+        if not factory.is_callable:
+            raise ValueError(f"'{spec}' is not a valid {self.what}: {factory.kind}, not a class or function")
+        if missing and factory.is_class:
             raise ValueError(f"'{spec}' is not a valid {self.what}: missing members: {', '.join(missing)}")
 
     def make(self, spec: str, options: Options, limits: exchange.ExecutableLimits, case: int = 0) -> Algorithm:
@@ -139,8 +156,13 @@ class Task(Generic[Algorithm, Options]):
         command = exchange.parse_command(spec)
         if command is not None and self.executable is not None:
             return self.executable(command, limits)
-        algorithm = self._import(spec)()
-        if self.streamed is not None and self._is_stream(algorithm):
+        path = custom_path(spec, self.shipped)
+        if limits.isolated:
+            algorithm: Any = RemoteAlgorithm(path, limits, {item.__qualname__: item for item in self.answers})
+        else:
+            algorithm = construct(_import(path), limits.device)
+            reset(algorithm)
+        if self.streamed is not None and self._is_stream(dir(algorithm)):
             return self.streamed(algorithm)
         return cast(Algorithm, algorithm)
 
@@ -153,15 +175,13 @@ class Task(Generic[Algorithm, Options]):
             return command.stream
         if is_offline(spec):
             return True
-        factory = self._import(spec)
-        return self._is_stream(factory) if isinstance(factory, type) else None
+        factory = describe_custom(spec, self.shipped)
+        return self._is_stream(factory.members) if factory.is_class else None
 
-    def _is_stream(self, algorithm: object) -> bool:
-        """Return whether a class or object receives images one by one; methods may be missing."""
-        is_complete = all(hasattr(algorithm, method) for method in STREAM_METHODS)
-        is_partial = hasattr(algorithm, "process_image") and not any(
-            hasattr(algorithm, method) for method in self.methods
-        )
+    def _is_stream(self, members: Container[str]) -> bool:
+        """Return whether an algorithm with these members receives images one by one; methods may be missing."""
+        is_complete = all(method in members for method in STREAM_METHODS)
+        is_partial = "process_image" in members and not any(method in members for method in self.methods)
         return self.streamed is not None and (is_complete or is_partial)
 
     def _answer_format(self, spec: str) -> AnswerFormat[Any]:
@@ -169,31 +189,51 @@ class Task(Generic[Algorithm, Options]):
             raise ValueError(f"'{spec}': a {self.what} cannot run offline: each answer determines the next image")
         return self.offline
 
-    def _import(self, spec: str) -> Any:
-        """Import the class or function of an installed algorithm's name, or of an import path."""
-        if ":" in spec:
-            try:
-                return import_object(spec)
-            except ImportError as error:
-                raise ValueError(f"cannot import algorithm '{spec}': {error}") from error
-        if spec not in list_installed():
-            allowed = [*self.shipped, *list_installed()]
-            matches = difflib.get_close_matches(spec, allowed, n=1)
-            hint = f" (did you mean '{matches[0]}'?)" if matches else ""
-            custom = "a custom one as 'module:Class' or 'exec:./program'"
-            raise ValueError(f"unknown algorithm '{spec}'{hint}; allowed: {', '.join(allowed)}, or {custom}")
-        try:
-            return list_installed()[spec].load()
-        except (ImportError, AttributeError) as error:
-            raise ValueError(
-                f"algorithm '{spec}' cannot be loaded from {list_installed()[spec].value}: {error}"
-            ) from error
+
+def custom_path(spec: str, shipped: Collection[str] = ()) -> str:
+    """Return the import path of a custom algorithm: of an entry point, or the given one.
+
+    Raises ValueError, with the allowed names in the message, if there is no algorithm of this name.
+    """
+    if ":" in spec:
+        return spec
+    if spec in list_installed():
+        return list_installed()[spec].value
+    allowed = [*shipped, *list_installed()]
+    matches = difflib.get_close_matches(spec, allowed, n=1)
+    hint = f" (did you mean '{matches[0]}'?)" if matches else ""
+    custom = "a custom one as 'module:Class' or 'exec:./program'"
+    raise ValueError(f"unknown algorithm '{spec}'{hint}; allowed: {', '.join(allowed)}, or {custom}")
+
+
+def describe_custom(spec: str, shipped: Collection[str] = ()) -> Description:
+    """Describe a custom algorithm, imported in a process of its own. Raises ValueError if it cannot be imported."""
+    path = custom_path(spec, shipped)
+    try:
+        return describe(path)
+    except ImportError as error:
+        raise ValueError(_import_problem(spec, path, error)) from error
+
+
+def _import(path: str) -> Any:
+    """Import a custom algorithm in this process. Raises ValueError with the reason."""
+    try:
+        return import_object(path)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"cannot import algorithm '{path}': {error}") from error
+
+
+def _import_problem(spec: str, path: str, error: Exception) -> str:
+    if spec == path:
+        return f"cannot import algorithm '{spec}': {error}"
+    return f"algorithm '{spec}' cannot be loaded from {path}: {error}"
 
 
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     name="velocity",
     what="velocity estimator",
     methods=("estimate",),
+    answers=(VelocityEstimate, VelocityOutcome),
     shipped={
         **configurations("dimes", DimesEstimator, dimes_options.IMPROVEMENTS),
         "phase-correlation": lambda _: PhaseCorrelationEstimator(),
@@ -214,6 +254,7 @@ TRACKING: Task[TargetTracker, VttOptions] = Task(
     name="tracking",
     what="target tracker",
     methods=("designate", "aim", "update", "clear", "state"),
+    answers=(MastAim, PixelBox, TargetUpdate, TargetLoss, TrackingState),
     shipped={
         **configurations("vtt", VisualTargetTracker, vtt_options.IMPROVEMENTS),
         # the paper's baseline: without scale and roll
@@ -230,6 +271,7 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     name="landing",
     what="estimator of landing sites",
     methods=("estimate",),
+    answers=(SiteEstimate, SiteOutcome),
     shipped={
         **configurations("hda", HdaEstimator, hda_options.IMPROVEMENTS),
         # the baselines replace stages of the improved algorithm

@@ -55,6 +55,22 @@ def source_files(path: str) -> Iterator[tuple[str, Path]]:
         yield origin.name, origin
 
 
+def source_root(path: str) -> tuple[Path, ...]:
+    """Return the folder of the package, or the file, that contains ``module:name``; empty if it is not found."""
+    module = path.rpartition(":")[0]
+    if module.endswith(SUFFIX):
+        return (Path(module),)
+    search_current_folder()
+    try:
+        spec = importlib.util.find_spec(module.split(".")[0])
+    except (ImportError, ValueError):
+        return ()
+    if spec is None:
+        return ()
+    folders = spec.submodule_search_locations
+    return tuple(map(Path, folders)) if folders else (Path(spec.origin),) if spec.origin else ()
+
+
 def relative_to(base: Path, paths: Iterable[Path]) -> Iterator[tuple[str, Path]]:
     """Yield files with their names relative to a folder."""
     for path in paths:

@@ -15,7 +15,7 @@ from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span
 from marsyard.algorithms.dimes import DimesDetails, dimes_products
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
-from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.sim.measurements import DescentMeasurements
@@ -42,9 +42,8 @@ def run_estimator(
     """
     tags = measurements.tags_s
 
-    def estimate(inputs: DescentMeasurements) -> object:
+    def estimate(estimator: VelocityEstimator, inputs: DescentMeasurements) -> object:
         nonlocal tags
-        estimator = create_estimator()
         if isinstance(estimator, StreamedEstimator | CaseExporter | RecordedAnswer):
             return estimator.estimate(inputs)
         if triple is None:
@@ -53,7 +52,9 @@ def run_estimator(
         tags = triple_inputs.tags_s
         return estimator.estimate(triple_inputs)
 
-    return run_algorithm_on_copy(estimate, lambda answer: check_and_set_span(answer, tags), measurements)
+    return run_on_measurements(
+        create_estimator, estimate, lambda answer: check_and_set_span(answer, tags), measurements
+    )
 
 
 def check_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:

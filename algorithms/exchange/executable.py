@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from scipy.spatial.transform import RigidTransform
@@ -148,7 +149,7 @@ class ExecutableTargetTracker:
         self._session = Session(command, limits)
         self._mast: MastCalibration | None = None
         self._mast_count = 0
-        self._folder = self._session.folder  # replaced by the folder of the mast's files
+        self._folder: Path | None = None  # of the mast's files
 
     @property
     def state(self) -> interface.TrackingState:

@@ -1,7 +1,7 @@
-"""External programs under test: parsing of their commands, and execution within limits on time, memory and output.
+"""External programs under test: parsing of their commands, and execution within limits (time, memory, output, files).
 
-Each program has its own process group, so that its child processes can be killed with it. On Linux it is killed when
-its parent process ends.
+Each program has its own process group and temporary folder. Its child processes are killed with it, and the folder is
+removed. On Linux it is killed when its parent process ends.
 """
 
 from __future__ import annotations
@@ -14,19 +14,22 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from marsyard.algorithms.exchange.sandbox import PROGRAM, sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.processes import descendants, resident_bytes
+from marsyard.algorithms.processes import AwakeClock, descendants, kill, resident_bytes
 
-#: Interval of the limit checks, seconds.
-_POLL_S = 0.02
+#: Interval of the checks of time, memory and output, and of the files' size, seconds.
+_POLL_S, _FILES_POLL_S = 0.02, 0.5
 #: Number of characters stored from the end of standard error.
 MAX_STDERR_CHARACTERS = 4000
 #: Time for a persistent program to exit after its input is closed, seconds.
@@ -39,19 +42,57 @@ _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)
 
 
+#: Environment variables: number of a worker process, counted from 0, and device that a program may use.
+WORKER_NUMBER, DEVICE_VARIABLE = "MARSYARD_WORKER_NUMBER", "MARSYARD_DEVICE"
+#: Device without an accelerator.
+CPU = "cpu"
+
+
 class ExecutableLimits(BaseModel):
-    """Limits of an external program under test, for one case or request."""
+    """Limits and isolation of an algorithm in a process of its own: a program, or a custom Python class.
+
+    The limits apply to one case or request; that of the files applies to all files that exist at one time.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time for an answer, s")] = 60.0
     memory_gb: Annotated[float, Field(gt=0.0, le=4096.0, description="resident memory of its process tree")] = 2.0
     output_mb: Annotated[float, Field(gt=0.0, le=1000.0, description="size of its standard output and error")] = 1.0
+    files_mb: Annotated[float, Field(gt=0.0, le=1e6, description="size of the files in its temporary folder")] = 100.0
+    isolated: Annotated[
+        bool, Field(description="custom Python classes run in a process of their own; false: in the worker, to debug")
+    ] = True
+    devices: Annotated[
+        tuple[str, ...], Field(min_length=1, description="devices, such as cuda:0, given to the workers in turn")
+    ] = (CPU,)
+    sandbox: Annotated[
+        bool, Field(description="untrusted: without network, other processes, and files except its own (bubblewrap)")
+    ] = False
+    visible: Annotated[
+        tuple[str, ...], Field(description="further files and folders that it can read in the sandbox")
+    ] = ()
+
+    @model_validator(mode="after")
+    def _check_sandbox(self) -> ExecutableLimits:
+        if self.sandbox and shutil.which(PROGRAM) is None:
+            raise ValueError(f"sandbox needs the program {PROGRAM}, which is not installed (package bubblewrap)")
+        if self.sandbox and set(self.devices) != {CPU}:
+            raise ValueError(f"devices are {', '.join(self.devices)}; allowed in the sandbox: {CPU}")
+        if self.sandbox and not self.isolated:
+            raise ValueError("isolated is false; allowed in the sandbox: true")
+        return self
+
+    @property
+    def device(self) -> str:
+        """Device of this worker process."""
+        number = int(os.environ.get(WORKER_NUMBER, "0"))
+        return self.devices[number % len(self.devices)]
 
 
 @dataclass(frozen=True)
 class Command:
-    """Command line of an external program under test.
+    """Command line of an external program under test; a hashable key of its idle processes.
 
     - words: The program and its arguments
     - persistent: Whether one process of the program answers many cases
@@ -61,6 +102,10 @@ class Command:
     words: tuple[str, ...]
     persistent: bool
     stream: bool = False
+
+    def start(self, limits: ExecutableLimits) -> RunningProgram:
+        """Start a program that receives requests. Raises AlgorithmError if it cannot be started."""
+        return RunningProgram(self.words, limits)
 
 
 #: Prefixes of commands, with `Command.persistent` and `Command.stream`.
@@ -105,30 +150,61 @@ class Output:
 class RunningProgram:
     """A running external program under test.
 
-    If the program exceeds a limit, ends early or cannot be started, methods end it and raise AlgorithmError.
+    If the program exceeds a limit, ends early or cannot be started, methods end it and raise AlgorithmError. Its
+    temporary folder is `folder`, which is removed at its end; the variable TMPDIR contains its path.
     """
 
-    def __init__(self, words: tuple[str, ...], limits: ExecutableLimits) -> None:
+    def __init__(
+        self,
+        words: Sequence[str],
+        limits: ExecutableLimits,
+        folder: Path | None = None,
+        *,
+        working_folder: Path | None = None,
+        readable: Sequence[Path] = (),
+        descriptors: Sequence[int] = (),
+    ) -> None:
+        """Start the program.
+
+        - folder: existing temporary folder; None for a new one
+        - working_folder: None for the current folder
+        - readable: files and folders that it can read in a sandbox, in addition to those named in its command line
+        - descriptors: file descriptors that it inherits
+        """
         self.limits = limits
+        self.folder = folder or temporary_folder()
         self._stdout, self._stderr = bytearray(), bytearray()
+        environment = {**os.environ, "TMPDIR": str(self.folder), DEVICE_VARIABLE: limits.device}
+        if limits.sandbox:
+            readable = [*readable, *map(Path, limits.visible)]
+            words = sandbox_words(words, environment, self.folder, working_folder or Path.cwd(), readable)
         try:
             self._process = subprocess.Popen(  # noqa: S603 (running the user's program is the purpose)
                 words,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
+                cwd=working_folder,
+                env=environment,
+                pass_fds=descriptors,
                 process_group=0,
                 preexec_fn=_kill_with_parent if sys.platform == "linux" else None,
             )
         except OSError as error:
+            shutil.rmtree(self.folder, ignore_errors=True)
             message = f"{words[0]} cannot be started: {error.strerror or error}"
             raise AlgorithmError(Fault.CRASHED, message) from error
-        self._deadline_s = time.monotonic() + limits.time_s
+        self._clock = AwakeClock()
+        self._checked_s = self._files_checked_s = 0.0
 
     @property
     def process_id(self) -> int:
         """Process id of the program."""
         return self._process.pid
+
+    def is_running(self) -> bool:
+        """Whether the program has not ended."""
+        return self._process.poll() is None
 
     def read_all(self) -> Output:
         """Read the output of the program until it exits with status 0."""
@@ -148,7 +224,7 @@ class RunningProgram:
         start_s = time.perf_counter()
         self._stdout.clear()
         self._stderr.clear()
-        self._deadline_s = time.monotonic() + self.limits.time_s
+        self._clock = AwakeClock()
         if request is not None and (early_output := _read_pending(self._process.stdout)):
             message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
             raise self._end_with_fault(Fault.BAD_ANSWER, message)
@@ -206,12 +282,25 @@ class RunningProgram:
 
     def _check_limits(self) -> None:
         """Kill the program and raise AlgorithmError if it exceeds a limit."""
-        if time.monotonic() > self._deadline_s:
+        elapsed_s, now_s = self._clock.elapsed_s(), time.monotonic()
+        if elapsed_s > self.limits.time_s:
             raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
+        if now_s - self._checked_s < _POLL_S:
+            return
+        self._checked_s = now_s
         if resident_bytes([self._process.pid, *descendants(self._process.pid)]) > self.limits.memory_gb * 1e9:
             raise self._end_with_fault(Fault.OUT_OF_MEMORY, f"it used more than {self.limits.memory_gb:g} GB of memory")
+        if now_s - self._files_checked_s >= _FILES_POLL_S:
+            self._files_checked_s = now_s
+            self._check_files()
+
+    def _check_files(self) -> None:
+        """Kill the program and raise AlgorithmError if the files in its temporary folder are too large."""
+        if _folder_bytes(self.folder) > self.limits.files_mb * 1e6:
+            message = f"its temporary folder contained more than {self.limits.files_mb:g} MB"
+            raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, message)
 
     def _wait(self) -> None:
         """Wait until the program exits; raise AlgorithmError unless its exit status is 0."""
@@ -232,20 +321,39 @@ class RunningProgram:
         return AlgorithmError(fault, message, _decode_tail(self._stderr))
 
     def _kill(self) -> None:
-        """Kill the program's process group and close its pipes."""
+        """Kill the program with all its descendants, close its pipes and remove its folder."""
+        processes = descendants(self._process.pid)
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
+        kill(processes)
         self._process.wait()
         for stream in (self._process.stdin, self._process.stdout, self._process.stderr):
             if stream is not None:
                 with suppress(BrokenPipeError):
                     stream.close()
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _collect_output(self, output: bytes, start_s: float) -> Output:
-        """Build the output, including pending data of standard error."""
+        """Build the output, including pending data of standard error. Raises AlgorithmError for too large files."""
+        self._check_files()
         while pending := _read_pending(self._process.stderr):
             self._stderr.extend(pending)
         return Output(output, _decode_tail(self._stderr), time.perf_counter() - start_s)
+
+
+def temporary_folder() -> Path:
+    """Create the temporary folder of a program."""
+    return Path(tempfile.mkdtemp(prefix="marsyard-program-"))
+
+
+def _folder_bytes(folder: Path) -> int:
+    """Sum the sizes of all files in a folder; files that are removed meanwhile are not counted."""
+    total = 0
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            with suppress(OSError):
+                total += Path(parent, name).lstat().st_blocks * 512
+    return total
 
 
 def _kill_with_parent() -> None:

@@ -21,7 +21,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, write_case
-from marsyard.algorithms.exchange.process import Command, ExecutableLimits, Output, RunningProgram, shorten
+from marsyard.algorithms.exchange.process import (
+    Command,
+    ExecutableLimits,
+    Output,
+    RunningProgram,
+    shorten,
+    temporary_folder,
+)
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
 
@@ -135,13 +142,13 @@ _idle: dict[tuple[Command, ExecutableLimits], Server] = {}
 
 
 def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
-    """Return an idle persistent program, or start a new program and check its greeting line.
+    """Return an idle persistent program that still runs, or start a new program and check its greeting line.
 
     The caller must pass it to `release_server` afterwards.
     """
-    if command.persistent and (command, limits) in _idle:
-        return _idle.pop((command, limits))
-    child = RunningProgram(command.words, limits)
+    if command.persistent and (idle := _idle.pop((command, limits), None)) is not None and idle.child.is_running():
+        return idle
+    child = command.start(limits)
     output = child.read_line()
     try:
         greeting = dict(parse_object(output))
@@ -180,7 +187,7 @@ def end_idle_programs() -> None:
 class Session:
     """Connection of one algorithm to a program: one JSON line per request. The first request starts the program.
 
-    The session's `folder` contains the input files and is removed with the session.
+    The session's `folder` is removed with the session.
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
@@ -188,8 +195,22 @@ class Session:
         self._server: Server | None = None
         # releases the program when this session is deleted
         self._release: weakref.finalize[Any, Any] | None = None
-        self.folder = Path(tempfile.mkdtemp(prefix="marsyard-session-"))
-        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+        self._folder: Path | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the input files, in the temporary folder of the program."""
+        if self._folder is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="session-", dir=self._acquire().child.folder))
+            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        return self._folder
+
+    def _acquire(self) -> Server:
+        """Return the program of this session; start it if necessary."""
+        if self._server is None:
+            self._server = acquire_server(self._command, self._limits)
+            self._release = weakref.finalize(self, release_server, self._command, self._limits, self._server)
+        return self._server
 
     def send_request(
         self,
@@ -203,10 +224,7 @@ class Session:
         `files` maps request keys to functions that write the files of a folder; the request contains the folder's path.
         The folders are removed after the answer.
         """
-        request = {"do": action, **values}
-        if self._server is None:
-            self._server = acquire_server(self._command, self._limits)
-            self._release = weakref.finalize(self, release_server, self._command, self._limits, self._server)
+        request, server = {"do": action, **values}, self._acquire()
         with tempfile.TemporaryDirectory(prefix=f"{action}-", dir=self.folder) as request_folder:
             for key, write in (files or {}).items():
                 folder = Path(request_folder) / key
@@ -214,7 +232,7 @@ class Session:
                 write(folder)
                 request[key] = str(folder)
             try:
-                answer, output = self._server.send_request(request)
+                answer, output = server.send_request(request)
             except AlgorithmError:
                 # the program has ended: do not return it to the idle programs
                 if self._release is not None:
@@ -233,13 +251,17 @@ def run_case(
 
     A persistent program that fails is ended; the next case starts it again.
     """
-    with tempfile.TemporaryDirectory(prefix="marsyard-case-") as folder:
-        write_case(Path(folder), measurements)
-        if command.persistent:
-            server = acquire_server(command, limits)
+    if command.persistent:
+        server = acquire_server(command, limits)
+        with tempfile.TemporaryDirectory(prefix="case-", dir=server.child.folder) as folder:
+            write_case(Path(folder), measurements)
             answer, output = server.send_request({"case": folder})
-            release_server(command, limits, server)
-        else:
-            output = RunningProgram((*command.words, folder), limits).read_all()
-            answer = parse_object(output)
+        release_server(command, limits, server)
+    else:
+        temporary = temporary_folder()
+        case = temporary / "case"
+        case.mkdir()
+        write_case(case, measurements)
+        output = RunningProgram((*command.words, str(case)), limits, temporary).read_all()
+        answer = parse_object(output)
     return read_answer(answer, output, read)

@@ -12,23 +12,23 @@ import platform
 import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, is_dataclass
-from enum import Enum
+from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Self
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
-from marsyard.scenarios.estimators import algorithm_sources, list_installed
-from marsyard.scenarios.imports import import_object, relative_to, source_files
+from marsyard.scenarios.estimators import algorithm_sources, custom_path, describe_custom
+from marsyard.scenarios.imports import relative_to, source_files
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
+from marsyard.scenarios.isolation.description import plain_options
 from marsyard.scenarios.offline import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
 from marsyard.scenarios.user_files import input_files
@@ -240,7 +240,7 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
             algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))
             algorithm_class, version = type(algorithm), _distribution_version("marsyard")
             path = f"{algorithm_class.__module__}:{algorithm_class.__qualname__}"
-            options = _plain_options(getattr(algorithm, "options", None))
+            options = plain_options(getattr(algorithm, "options", None))
         else:
             path, version, options = _describe_custom(spec)
         entries.append(
@@ -261,24 +261,8 @@ def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
     command = parse_command(spec)
     if command is not None or is_offline(spec):
         return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
-    entry_point = list_installed().get(spec)
-    path, target = (spec, import_object(spec)) if entry_point is None else (entry_point.value, entry_point.load())
+    path, description = custom_path(spec), describe_custom(spec)
     package = path.partition(":")[0].partition(".")[0]
     versions = map(_distribution_version, metadata.packages_distributions().get(package, []))
-    version = next((text for text in versions if text is not None), None) or getattr(target, "version", None)
-    return path, version if isinstance(version, str) else None, _plain_options(getattr(target, "options", None))
-
-
-def _plain_options(options: object) -> dict[str, Any]:
-    """Convert options to JSON values; empty without options, or if JSON cannot represent the options."""
-    try:
-        if isinstance(options, BaseModel):
-            options = options.model_dump(mode="json")
-        elif is_dataclass(options) and not isinstance(options, type):
-            options = asdict(options)
-        values = {str(key): value for key, value in options.items()} if isinstance(options, Mapping) else {}
-        return dict(
-            json.loads(json.dumps(values, default=lambda value: value.value if isinstance(value, Enum) else str(value)))
-        )
-    except Exception:  # custom values may raise anything, and the record must not stop a campaign
-        return {}
+    version = next((text for text in versions if text is not None), None) or description.version
+    return path, version, dict(description.options)

@@ -15,7 +15,7 @@ from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.estimators import VELOCITY
@@ -106,8 +106,9 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         }
 
         def evaluate(algorithm: str) -> CaseResult:
-            algorithm_run = run_algorithm_on_copy(
-                lambda copy: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case).estimate(copy),
+            algorithm_run = run_on_measurements(
+                lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case),
+                lambda estimator, inputs: estimator.estimate(inputs),
                 lambda answer: check_last_interval(answer, measurements),
                 measurements,
             )

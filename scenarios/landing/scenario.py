@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images, image_columns
 from marsyard.scenarios.estimators import LANDING
@@ -83,8 +83,9 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         shared = {**conditions(case, measurements), **provenance}
 
         def evaluate(algorithm: str) -> CaseResult:
-            algorithm_run = run_algorithm_on_copy(
-                lambda copy: LANDING.make(algorithm, p.hda, p.executable, streams.case).estimate(copy),
+            algorithm_run = run_on_measurements(
+                lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case),
+                lambda estimator, inputs: estimator.estimate(inputs),
                 check_site,
                 measurements,
             )

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import InitialState, PositionEstimator, PositionOutcome
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
 from marsyard.scenarios.descent.exposure import HAZE_PATH_M, HeatShield
@@ -85,8 +85,9 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             measurements = descent.measurements
             tags = measurements.increments.times_s
             span_s = (float(tags[0]), float(tags[-1]))
-            algorithm_run = run_algorithm_on_copy(
-                lambda inputs: _run_estimator(LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case), inputs),
+            algorithm_run = run_on_measurements(
+                lambda: LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case),
+                _run_estimator,
                 lambda answers: _check_answers(answers, span_s),
                 measurements,
             )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.exchange import ExecutablePositionEstimator
-from marsyard.algorithms.localisation.interface import PositionEstimator
+from marsyard.algorithms.localisation.interface import PositionEstimate, PositionEstimator, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.estimators import Task
 from marsyard.scenarios.localisation.offline import POSITION_FORMAT
@@ -14,6 +14,7 @@ LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
     what="position estimator",
     methods=("start", "imu", "altitude", "image", "finish"),
+    answers=(PositionEstimate, PositionOutcome),
     shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},
     executable=ExecutablePositionEstimator,
     options=LvsOptions,

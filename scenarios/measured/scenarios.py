@@ -17,7 +17,7 @@ from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, case_result, run_algorithm_on_copy
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, case_result, run_on_measurements
 from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
@@ -248,12 +248,16 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
 def _run_algorithms(
     p: AlgorithmSelection, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
 ) -> Mapping[str, AlgorithmRun[Answer]]:
-    """Run all algorithms on copies of the measurements."""
-
-    def estimate(spec: str, inputs: Any) -> Any:
-        return p.task.make(spec, options, p.executable, case).estimate(inputs)
-
-    return {spec: run_algorithm_on_copy(partial(estimate, spec), check, measurements) for spec in p.algorithms}
+    """Run all algorithms on the measurements."""
+    return {
+        spec: run_on_measurements(
+            partial(p.task.make, spec, options, p.executable, case),
+            lambda algorithm, inputs: algorithm.estimate(inputs),
+            check,
+            measurements,
+        )
+        for spec in p.algorithms
+    }
 
 
 def _case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:

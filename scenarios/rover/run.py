@@ -10,9 +10,9 @@ Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,9 +25,10 @@ from marsyard.algorithms.navigation.visual_odometry import VisualOdometry, estim
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.placement import Placement
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
-from marsyard.scenarios.algorithm_run import InputCopy, answer_time_s
+from marsyard.scenarios.algorithm_run import InputCopy, Inputs, answer_time_s
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.estimators import TRACKING
+from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     Navigator,
@@ -136,16 +137,32 @@ class TrackerGuide:
     def __init__(self, p: RoverScenarioParameters, run: Run, estimated_pose: RigidTransform) -> None:
         """Create the tracker and designate the run's target; `estimated_pose` is the rover's estimated world pose."""
         self._tracker: TargetTracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
-        self._mast = InputCopy[MastCalibration](run.rig.calibrated)
-        self._tracker.designate(InputCopy(run.target.designation).inputs, estimated_pose)
+        # a tracker in a process of its own cannot change its inputs
+        self._copies: list[InputCopy[Any]] = []
+        self._mast: MastCalibration = self._input(run.rig.calibrated)
+        self._tracker.designate(self._input(run.target.designation), estimated_pose)
+
+    def _input(self, value: Inputs) -> Inputs:
+        """Return a copy of an input, or the input for a tracker in a process of its own."""
+        if is_remote(self._tracker):
+            return value
+        self._copies.append(InputCopy(value))
+        copied: Inputs = self._copies[-1].inputs
+        return copied
+
+    def _check_inputs(self) -> None:
+        """Raise AlgorithmError if the tracker changed the copies that it received; keep only that of the mast."""
+        for copy in self._copies:
+            copy.check()
+        del self._copies[1:]
 
     def aim(self, run: Run) -> MastAim | None:
         """Return the tracker's mast angles and subframe boxes; None if the mast or cameras cannot show the target.
 
         Raises AlgorithmError for an invalid answer, and the tracker's own errors.
         """
-        answer = self._tracker.aim(run.vehicle.estimated_pose, self._mast.inputs)
-        self._mast.check()
+        answer = self._tracker.aim(run.vehicle.estimated_pose, self._mast)
+        self._check_inputs()
         return check_aim(answer, run.rig.calibrated)
 
     def observe(self, run: Run, view: View) -> RunOutcome | None:
@@ -153,13 +170,12 @@ class TrackerGuide:
 
         Raises the same exceptions as `aim`.
         """
-        input_copy = InputCopy((view.images.left, view.images.right))
-        measurements = RoverMeasurements(*input_copy.inputs, self._mast.inputs, *view.angles_rad, view.estimated_pose)
-        start_s = time.process_time()
+        images = self._input((view.images.left, view.images.right))
+        measurements = RoverMeasurements(*images, self._mast, *view.angles_rad, view.estimated_pose)
+        start_s = algorithm_time_s()
         answer = self._tracker.update(measurements)
-        elapsed_s = time.process_time() - start_s
-        input_copy.check()
-        self._mast.check()
+        elapsed_s = algorithm_time_s() - start_s
+        self._check_inputs()
         update = check_update(answer)
         time_s = answer_time_s(update, elapsed_s)
         run.stops.append(Stop.from_view(view, run.target.point_world, run.rig.left, update, time_s))

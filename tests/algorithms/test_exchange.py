@@ -54,7 +54,9 @@ def run_program(spec: str, measurements: DescentMeasurements, **limits: float) -
     """Estimate the velocity with a program; limits: those of `ExecutableLimits`."""
     command = parse_command(spec)
     assert command is not None
-    return ExecutableVelocityEstimator(command, ExecutableLimits(**{"time_s": 60.0, **limits})).estimate(measurements)
+    return ExecutableVelocityEstimator(command, ExecutableLimits.model_validate({"time_s": 60.0, **limits})).estimate(
+        measurements
+    )
 
 
 @pytest.mark.parametrize("image_format", ["pgm", "png"])

@@ -95,7 +95,7 @@ def write_program(folder: Path, text: str) -> str:
 
 def run(spec: str, **limits: float) -> StreamAnswers:
     """Run the algorithm of a specification on `EVENTS`; limits: those of `ExecutableLimits`."""
-    estimator = LOCALISATION.make(spec, LvsOptions(), ExecutableLimits(**{"time_s": 60.0, **limits}))
+    estimator = LOCALISATION.make(spec, LvsOptions(), ExecutableLimits.model_validate({"time_s": 60.0, **limits}))
     return feed(estimator, INITIAL, MAP, EVENTS)
 
 
