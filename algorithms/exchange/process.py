@@ -57,6 +57,9 @@ class ExecutableLimits(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time for an answer, s")] = 60.0
+    loading_s: Annotated[
+        float, Field(gt=0.0, le=86400.0, description="wall-clock time to import and construct a Python class, s")
+    ] = 300.0
     memory_gb: Annotated[float, Field(gt=0.0, le=4096.0, description="resident memory of its process tree")] = 2.0
     output_mb: Annotated[float, Field(gt=0.0, le=1000.0, description="size of its standard output and error")] = 1.0
     files_mb: Annotated[float, Field(gt=0.0, le=1e6, description="size of the files in its temporary folder")] = 100.0
@@ -194,8 +197,13 @@ class RunningProgram:
             shutil.rmtree(self.folder, ignore_errors=True)
             message = f"{words[0]} cannot be started: {error.strerror or error}"
             raise AlgorithmError(Fault.CRASHED, message) from error
-        self._clock = AwakeClock()
+        self._clock, self._time_s = AwakeClock(), limits.time_s
         self._checked_s = self._files_checked_s = 0.0
+
+    @property
+    def loading_s(self) -> float:
+        """Limit of the time until the program is ready."""
+        return self.limits.time_s
 
     @property
     def process_id(self) -> int:
@@ -216,15 +224,15 @@ class RunningProgram:
         self._kill()
         return output
 
-    def read_line(self, request: str | None = None) -> Output:
-        """Send an optional request line and read one output line.
+    def read_line(self, request: str | None = None, time_s: float | None = None) -> Output:
+        """Send an optional request line and read one output line, within `time_s` instead of the limit if it is given.
 
         Output before the request is a fault (BAD_ANSWER): it could be a second line for the previous case.
         """
         start_s = time.perf_counter()
         self._stdout.clear()
         self._stderr.clear()
-        self._clock = AwakeClock()
+        self._clock, self._time_s = AwakeClock(), time_s or self.limits.time_s
         if request is not None and (early_output := _read_pending(self._process.stdout)):
             message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
             raise self._end_with_fault(Fault.BAD_ANSWER, message)
@@ -283,8 +291,8 @@ class RunningProgram:
     def _check_limits(self) -> None:
         """Kill the program and raise AlgorithmError if it exceeds a limit."""
         elapsed_s, now_s = self._clock.elapsed_s(), time.monotonic()
-        if elapsed_s > self.limits.time_s:
-            raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self.limits.time_s:g} s")
+        if elapsed_s > self._time_s:
+            raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self._time_s:g} s")
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
         if now_s - self._checked_s < _POLL_S:

@@ -40,9 +40,11 @@ def sandbox_words(
         if name.startswith(_VARIABLES) or name in _OWN_VARIABLES:
             options += ["--setenv", name, value]
     options += ["--dir", str(working_folder)]
+    visible: list[Path] = []
     for path in [*map(Path, _SYSTEM), *_python_folders(), Path(program), *named, *readable]:
-        absolute = str(path.absolute())
-        options += ["--ro-bind-try", absolute, absolute]
+        if not any(path.absolute().is_relative_to(folder) for folder in visible):
+            visible.append(path.absolute())
+            options += ["--ro-bind-try", str(visible[-1]), str(visible[-1])]
     options += ["--bind", str(folder), str(folder), "--chdir", str(working_folder), "--"]
     return [PROGRAM, *options, program, *words[1:]]
 

@@ -116,15 +116,19 @@ class Server:
     version: int
     request_count: int = 0
 
-    def send_request(self, request: Mapping[str, Any]) -> tuple[Mapping[str, Any], Output]:
+    def send_request(
+        self, request: Mapping[str, Any], time_s: float | None = None
+    ) -> tuple[Mapping[str, Any], Output]:
         """Send one request; return the program's answer without its `id`, and its raw output.
 
+        `time_s` is the limit of the time for the answer; None: the limit of the program.
         If the program fails, its answer is not one JSON object, or the answer belongs to another request, the program
         is ended and AlgorithmError raised.
         """
         self.request_count += 1
         id_field = {"id": self.request_count} if self.version > 1 else {}
-        output = self.child.read_line(json.dumps({"exchange": self.version, **id_field, **request}, allow_nan=False))
+        line = json.dumps({"exchange": self.version, **id_field, **request}, allow_nan=False)
+        output = self.child.read_line(line, time_s)
         try:
             answer = parse_object(output)
             for key, expected in {"exchange": self.version, **id_field}.items():
@@ -149,7 +153,7 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
     if command.persistent and (idle := _idle.pop((command, limits), None)) is not None and idle.child.is_running():
         return idle
     child = command.start(limits)
-    output = child.read_line()
+    output = child.read_line(time_s=child.loading_s)
     try:
         greeting = dict(parse_object(output))
         version = greeting.get("exchange")

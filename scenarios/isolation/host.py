@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
 from marsyard.algorithms.faults import Fault, describe_error
-from marsyard.algorithms.processes import adopt_orphans, end_with_parent
+from marsyard.algorithms.processes import adopt_orphans, descendants, end_with_parent, kill
 
 #: Version of the request lines, see `marsyard.algorithms.exchange.files`.
 VERSION = 2
@@ -55,7 +55,7 @@ def _become_guarded() -> None:
 
 
 def _guard(child: int) -> NoReturn:
-    """Wait for the end of the algorithm's process, and end in the same way."""
+    """Wait for the end of the algorithm's process, kill the processes that it left, and end in the same way."""
     null = os.open(os.devnull, os.O_RDWR)
     for descriptor in range(3):
         os.dup2(null, descriptor)  # the worker sees the end of the streams when the child ends
@@ -64,6 +64,10 @@ def _guard(child: int) -> NoReturn:
         process, wait_status = os.waitpid(-1, 0)
         if process == child:
             status = os.waitstatus_to_exitcode(wait_status)
+    with contextlib.suppress(ChildProcessError):
+        while True:  # until this process has no children
+            kill(descendants(os.getpid()))
+            os.waitpid(-1, 0)
     if status >= 0:
         os._exit(status)
     if -status not in (signal.SIGKILL, signal.SIGSTOP):
@@ -91,11 +95,15 @@ class Host:
             "get": self._get,
         }
         arguments = {key: value for key, value in request.items() if key not in ("exchange", "id", "do")}
+        process = os.getpid()
         try:
-            return actions[request["do"]](**arguments)
+            answer = actions[request["do"]](**arguments)
         except BaseException as error:  # also `SystemExit`
             fault = Fault.OUT_OF_MEMORY if isinstance(error, MemoryError) else Fault.CRASHED
-            return {"fault": fault.name, "message": describe_error(error), "trace": traceback.format_exc()}
+            answer = {"fault": fault.name, "message": describe_error(error), "trace": traceback.format_exc()}
+        if os.getpid() != process:
+            os._exit(0)  # a fork of the algorithm's process, which must not answer a second time
+        return answer
 
     def _load(self, path: list[str], spec: str) -> Any:
         """Import the class, function or stored object; `path` is the search path of the worker."""

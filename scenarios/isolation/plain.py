@@ -18,6 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.faults import bad_answer
 
+#: Maximum bits of an integer; a float64 is below 2 ** 1024.
+_MAX_BITS = 1023
 #: Field of an answer that stays in the process of the algorithm.
 DETAILS = "details"
 
@@ -26,6 +28,8 @@ def encode(value: Any) -> Any:
     """Return the JSON representation of a value of an answer."""
     if isinstance(value, np.generic):
         value = value.item()
+    if isinstance(value, int) and value.bit_length() > _MAX_BITS:
+        return {"other": f"integer of {value.bit_length()} bits"}
     if value is None or type(value) in (bool, int, float, str):
         return value
     if isinstance(value, np.ndarray):

@@ -41,6 +41,11 @@ class PythonProgram(RunningProgram):
             words, limits, folder, working_folder=folder, readable=source_root(spec), descriptors=(self.memory,)
         )
 
+    @property
+    def loading_s(self) -> float:
+        """See `RunningProgram`."""
+        return self.limits.loading_s
+
     def find_algorithm(self) -> int:
         """Return the process id of the algorithm, the last descendant, before it executes code of the user."""
         process = self.process_id
@@ -78,7 +83,8 @@ class RemoteAlgorithm:
         child = cast(PythonProgram, self._server.child)
         self._sender = Sender(child.memory)
         self._process = child.find_algorithm()
-        answer = self._request("start", {"path": search_path(), "spec": spec, "device": limits.device})
+        start = {"path": search_path(), "spec": spec, "device": limits.device}
+        answer = self._request("start", start, limits.loading_s)
         members = answer.get("members")
         self._members = members if isinstance(members, dict) else {}
 
@@ -111,9 +117,9 @@ class RemoteAlgorithm:
         except OSError:  # the process has ended, which the next request reports
             return 0.0
 
-    def _request(self, action: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def _request(self, action: str, values: Mapping[str, Any], time_s: float | None = None) -> Mapping[str, Any]:
         try:
-            answer, output = self._server.send_request({"do": action, **values})
+            answer, output = self._server.send_request({"do": action, **values}, time_s)
             if "fault" in answer:
                 self._server.child.stop()
                 raise _read_fault(answer, output.stderr)
@@ -183,7 +189,8 @@ def describe(spec: str) -> Description:
     command, limits = PythonCommand(spec=spec), ExecutableLimits()
     try:
         server = acquire_server(command, limits)
-        answer, _ = server.send_request({"do": "describe", "path": search_path(), "spec": spec})
+        request = {"do": "describe", "path": search_path(), "spec": spec}
+        answer, _ = server.send_request(request, limits.loading_s)
     except AlgorithmError as error:
         raise ImportError(f"{error.fault.name}: {error}") from error
     server.child.stop()

@@ -45,7 +45,9 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
     from tests.scenarios.test_fieldtest import make_parameters
 
     compared_paths = [f"{SPY}:{spy}" for spy in compared]
+    # in this process, so that the spies record their inputs here
     algorithms: dict[str, Any] = {"algorithm": f"{SPY}:{algorithm}", "compared": compared_paths}
+    algorithms["executable"] = {"isolated": False}
     circle = {"legs": [{"motion": "circle", "step_deg": 5.0, "steps": 1}]}
     parameters: dict[str, Any] = {
         "descent": {**SMALL_WORLD, "descent": DESCENT, **algorithms},

@@ -26,7 +26,7 @@ from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, Task, che
 from marsyard.scenarios.interface import CaseResult, Failure
 from marsyard.scenarios.velocity import consistency_row
 
-LIMITS = ExecutableLimits()
+LIMITS = ExecutableLimits(isolated=False)
 
 
 def test_algorithm_is_imported_from_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

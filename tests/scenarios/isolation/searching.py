@@ -1,0 +1,138 @@
+"""Velocity estimators for tests of the isolation: one counts its constructions, another searches for the truth."""
+
+from __future__ import annotations
+
+import gc
+import os
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from marsyard.algorithms.interface import TargetUpdate, TrackingState, VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.vtt import VisualTargetTracker
+from marsyard.sim.measurements import DescentFrame, DescentMeasurements, RoverMeasurements
+
+#: Largest number of elements of an array that is searched.
+_MAX_ELEMENTS = 100_000
+
+
+def append_line(text: str) -> None:
+    """Append a line to the file to which the environment variable LOG points."""
+    with Path(os.environ["LOG"]).open("a") as file:
+        file.write(f"{text}\n")
+
+
+class Counting:
+    """Writes a line for its construction, for each reset and for each case, with its process and device."""
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        append_line(f"construct {os.getpid()} {device}")
+
+    def reset(self) -> None:
+        """Start a case."""
+        append_line("reset")
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`; the velocity is random."""
+        append_line(f"estimate {os.getpid()}")
+        return VelocityEstimate(VelocityOutcome.VALID, np.random.random_sample(2))  # noqa: NPY002
+
+
+class Stream:
+    """Velocity stream that counts the images it received."""
+
+    def __init__(self) -> None:
+        self.images = 0
+
+    def start(self) -> None:
+        """See `VelocityStream`."""
+        self.images = 0
+
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
+        """See `VelocityStream`."""
+        self.images += 1
+        append_line(f"{type(frame).__name__} {self.images}")
+        return None
+
+    def finish(self) -> VelocityEstimate:
+        """See `VelocityStream`."""
+        return VelocityEstimate(VelocityOutcome.VALID, np.array([float(self.images), 0.0]))
+
+
+class Tracker(VisualTargetTracker):
+    """The tracker of the paper, with a line for each update."""
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        """See `TargetTracker`."""
+        update = super().update(measurements)
+        append_line(f"{update.state is TrackingState.NORMAL} {measurements.left.counts.flags.writeable}")
+        return update
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Yield the numbers in an object: floats, and elements of arrays."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.size <= _MAX_ELEMENTS:
+        yield from value.ravel().tolist()
+
+
+def _search_memory() -> Iterator[float]:
+    """Yield all numbers in the containers and objects of this process, and in the variables of its frames."""
+    frame: FrameType | None = sys._getframe()
+    containers: list[Any] = [dict(vars(module)) for module in list(sys.modules.values()) if module is not None]
+    while frame is not None:
+        containers.append(dict(frame.f_locals))
+        frame = frame.f_back
+    for item in [*gc.get_objects(), *containers]:
+        yield from _numbers(item)
+        values = item.values() if isinstance(item, dict) else item if isinstance(item, list | tuple | set) else ()
+        for value in list(values):
+            yield from _numbers(value)
+        contents = getattr(type(item), "__dataclass_fields__", {})
+        for name in contents:
+            yield from _numbers(getattr(item, name, None))
+
+
+def _search_files() -> Iterator[float]:
+    """Yield the numbers in the environment, in the command line, and in all files below the folders that it knows."""
+    texts = ["\n".join([*os.environ.values(), *sys.argv])]
+    folders = {Path.cwd(), Path(os.environ["TMPDIR"]), *(Path(entry) for entry in sys.argv if Path(entry).is_dir())}
+    marker = os.environ.get("MARSYARD_WORKER")
+    folders |= {Path(marker)} if marker else set()
+    for descriptor in Path("/proc/self/fd").iterdir():
+        target = Path(os.path.realpath(descriptor))
+        folders |= {target.parent} if target.is_file() and target.parent != Path("/") else set()
+    for folder in folders:
+        for path in folder.rglob("*"):
+            is_searched = path.is_file() and path.stat().st_size < 1_000_000 and str(path) != os.environ["LOG"]
+            texts += [path.read_bytes().decode(errors="replace")] if is_searched else []
+    for text in texts:
+        yield from (float(number) for number in re.findall(r"-?\d+\.\d{6,}", text))
+
+
+class Searching:
+    """Searches memory and files for numbers; writes those of the magnitude of a velocity."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`."""
+        found = {number for search in (_search_memory, _search_files) for number in search()}
+        append_line(
+            " ".join(repr(float(number)) for number in found if isinstance(number, float) and abs(number) < 1e3)
+        )
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+
+
+class Modules:
+    """Writes the names of the modules that its process has loaded."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`."""
+        append_line("\n".join(sys.modules))
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)

@@ -1,0 +1,74 @@
+"""Misbehaviours of a custom algorithm: its own outcome, and the unchanged row of the other algorithm of the case."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.sim.streams import Streams
+from tests.campaigns.fake_velocity import FakeVelocityParameters, FakeVelocityScenario
+from tests.scenarios.isolation.misbehaving import ACTIONS, ANSWERS
+
+SPEC = "tests.scenarios.isolation.misbehaving:Misbehaving"
+LIMITS = {"time_s": 2.0, "memory_gb": 0.6}
+TIME = "homography.estimation_time_s"
+
+
+def run_case(monkeypatch: pytest.MonkeyPatch, folder: Path, misbehaviour: str, case: int = 0) -> CaseResult:
+    """Run a case with a misbehaving algorithm under test, compared with `homography`."""
+    name_file = folder / "misbehaviour"
+    name_file.write_text(misbehaviour)
+    monkeypatch.setenv("MISBEHAVIOUR", str(name_file))
+    parameters = FakeVelocityParameters.model_validate(
+        {"algorithm": SPEC, "compared": ["homography"], "executable": LIMITS}
+    )
+    return FakeVelocityScenario().run(parameters, Streams(3, "misbehaviour", case))
+
+
+def compared_row(result: CaseResult) -> dict[str, Scalar]:
+    """Return the columns of the other algorithm, without its computation time."""
+    return {name: value for name, value in result.row.items() if name.startswith("homography.") and name != TIME}
+
+
+@pytest.fixture(scope="module")
+def healthy_rows(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Scalar]]:
+    """Return the rows of `homography` in two cases next to an algorithm that behaves."""
+    folder = tmp_path_factory.mktemp("healthy")
+    with pytest.MonkeyPatch.context() as patch:
+        results = [run_case(patch, folder, "none", case) for case in range(2)]
+    end_idle_programs()
+    assert [result.outcome for result in results] == ["VALID", "VALID"]
+    return [compared_row(result) for result in results]
+
+
+EXPECTED = {name: outcome for name, (_, outcome) in ACTIONS.items()}
+EXPECTED |= dict.fromkeys(ANSWERS, "BAD_ANSWER") | {"change its inputs": "CRASHED", "a nested list": "CRASHED"}
+
+
+@pytest.mark.parametrize("misbehaviour", EXPECTED)
+def test_misbehaviour_affects_only_its_own_row(
+    misbehaviour: str, healthy_rows: list[dict[str, Scalar]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("UNPICKLED", str(tmp_path / "unpickled"))
+    result = run_case(monkeypatch, tmp_path, misbehaviour)
+    assert result.outcome == EXPECTED[misbehaviour], result.failure
+    assert compared_row(result) == healthy_rows[0]
+    time_s = result.row["estimation_time_s"]
+    assert isinstance(time_s, float)
+    assert time_s >= 0.0
+    assert not (tmp_path / "unpickled").exists()
+    # the next case of the other algorithm is not affected either, and no process remains
+    assert compared_row(run_case(monkeypatch, tmp_path, "none", case=1)) == healthy_rows[1]
+    end_idle_programs()
+    assert not subprocess.run(["pgrep", "-f", "sleep 721[12]"], capture_output=True, check=False).stdout
+
+
+def test_traceback_of_the_algorithm_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    failure = run_case(monkeypatch, tmp_path, "raise").failure
+    assert failure is not None
+    assert failure.error == "RuntimeError: no"
+    assert "misbehaving.py" in failure.trace

@@ -1,0 +1,152 @@
+"""Custom algorithms in processes of their own: life cycle, devices, answers, and no access to the truth."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.exchange import ExecutableLimits
+from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.algorithms.vtt import VttOptions
+from marsyard.scenarios.algorithm_run import run_on_measurements
+from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.conformance.trackers import drive_to_target
+from marsyard.scenarios.estimators import TRACKING, VELOCITY
+from marsyard.scenarios.isolation.plain import decode, encode
+from marsyard.scenarios.isolation.remote import is_remote
+from marsyard.scenarios.objects import name_object
+from marsyard.sim.streams import Streams
+from tests.campaigns.fake_velocity import FakeVelocityParameters, FakeVelocityScenario
+
+MODULE = "tests.scenarios.isolation.searching"
+
+
+@pytest.fixture(autouse=True)
+def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Let the algorithms write into a file; end their processes after the test."""
+    path = tmp_path / "log"
+    path.touch()
+    monkeypatch.setenv("LOG", str(path))
+    yield path
+    end_idle_programs()
+
+
+def run_case(algorithm: str, case: int = 0, **executable: Any) -> Any:
+    """Run a case of the fake scenario."""
+    parameters = FakeVelocityParameters.model_validate({"algorithm": f"{MODULE}:{algorithm}", "executable": executable})
+    return FakeVelocityScenario().run(parameters, Streams(7, "isolation", case))
+
+
+def test_algorithm_is_constructed_once_and_reset_before_each_case(log: Path) -> None:
+    for case in range(4):
+        run_case("Counting", case)
+    lines = [line.split() for line in log.read_text().splitlines()]
+    assert Counter(line[0] for line in lines) == {"construct": 1, "reset": 4, "estimate": 4}
+    assert len({line[1] for line in lines if line[0] != "reset"}) == 1
+    assert lines[0][2] == "cpu"
+
+
+def test_workers_get_the_devices_in_turn(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for worker in range(3):
+        monkeypatch.setenv("MARSYARD_WORKER_NUMBER", str(worker))
+        run_case("Counting", devices=["cuda:0", "cuda:1"])
+        end_idle_programs()
+    lines = log.read_text().splitlines()
+    assert [line.split()[2] for line in lines if line.startswith("construct")] == ["cuda:0", "cuda:1", "cuda:0"]
+
+
+def test_random_numbers_depend_on_the_inputs_and_not_on_earlier_cases() -> None:
+    velocities = [
+        [run_case("Counting", case).row["velocity_estimated_x_m_s"] for case in order] for order in ((0, 1), (1, 0))
+    ]
+    assert velocities[0] == velocities[1][::-1]
+    assert velocities[0][0] != velocities[0][1]
+
+
+def test_truth_is_not_in_the_memory_or_files_of_the_process(log: Path) -> None:
+    """The true inertial error and velocity are not found; in the worker itself they are."""
+    case = Streams(7, "isolation", 0).generator("inertial").normal(size=3)
+    measured = inputs.descent().interval_velocities_m_s + case
+    truths = {float(value) for value in case}
+    found = {}
+    for isolated in (True, False):
+        log.write_text("")
+        run_case("Searching", isolated=isolated)
+        found[isolated] = {float(number) for number in log.read_text().split()}
+    assert set(measured.ravel().tolist()) <= found[True]  # its measurements
+    assert not truths & found[True]
+    assert truths <= found[False]
+
+
+def test_classes_of_the_simulation_are_not_loaded_in_the_process(log: Path) -> None:
+    run_case("Modules")
+    modules = set(log.read_text().split())
+    assert "marsyard.sim.measurements" in modules
+    simulation = ("marsyard.sim.terrain", "marsyard.sim.render", "marsyard.sim.dynamics", "marsyard.sim.sensor")
+    assert not [name for name in modules if name.startswith((*simulation, "marsyard.campaigns", "tests.campaigns"))]
+
+
+def test_stream_receives_images_one_by_one(log: Path) -> None:
+    measurements = inputs.inertial_descent(4)
+    stream = VELOCITY.make(f"{MODULE}:Stream", DimesOptions(), ExecutableLimits())
+    assert is_remote(stream)
+    for _ in range(2):
+        estimate = run_on_measurements(
+            lambda: stream, lambda algorithm, case: algorithm.estimate(case), lambda answer: answer, measurements
+        ).answer
+        assert isinstance(estimate, VelocityEstimate)
+        assert estimate.velocity_m_s is not None
+        assert estimate.velocity_m_s.tolist() == [4.0, 0.0]
+        assert estimate.after_images == (None,) * 4
+    assert log.read_text().splitlines() == [f"DescentFrame {number}" for number in (1, 2, 3, 4)] * 2
+
+
+def test_tracker_in_its_own_process_gives_the_same_answers(log: Path) -> None:
+    remote = TRACKING.make(f"{MODULE}:Tracker", VttOptions(), ExecutableLimits())
+    local = TRACKING.make("vtt", VttOptions(), ExecutableLimits())
+    for update, expected in zip(drive_to_target(remote), drive_to_target(local), strict=True):
+        assert (update.state, update.losses) == (expected.state, expected.losses)
+        np.testing.assert_array_equal(update.position_rover, expected.position_rover)
+    assert remote.state is local.state
+    assert set(log.read_text().splitlines()) == {"True False"}
+
+
+def test_stored_object_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = name_object(lambda measurements: VelocityEstimate(VelocityOutcome.VALID, np.ones(2)), tmp_path / "objects")
+    monkeypatch.chdir(tmp_path)
+    relative = f"objects/{Path(spec.rpartition(':')[0]).name}:{spec.rpartition(':')[2]}"
+    for name in (spec, relative):
+        VELOCITY.check(name)
+        estimate = VELOCITY.make(name, DimesOptions(), ExecutableLimits()).estimate(inputs.descent())
+        assert estimate.velocity_m_s is not None
+        assert estimate.velocity_m_s.tolist() == [1.0, 1.0]
+
+
+def test_module_is_not_imported_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_module.py").write_text(
+        "class Mine:\n    version = '3'\n    def estimate(self, measurements): ...\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    VELOCITY.check("own_module:Mine")
+    VELOCITY.make("own_module:Mine", DimesOptions(), ExecutableLimits())
+    assert "own_module" not in sys.modules
+
+
+def test_answers_survive_their_representation_and_unknown_types_do_not() -> None:
+    classes = {"VelocityEstimate": VelocityEstimate, "VelocityOutcome": VelocityOutcome}
+    answer = VelocityEstimate(VelocityOutcome.VALID, np.array([0.1, -3.0], dtype=np.float32), details=object())
+    restored = decode(encode((answer, [1, None, "text", 1e-300])), classes)
+    assert restored[1] == [1, None, "text", 1e-300]
+    assert restored[0].outcome is VelocityOutcome.VALID
+    assert restored[0].details is None
+    np.testing.assert_array_equal(restored[0].velocity_m_s, answer.velocity_m_s)
+    assert restored[0].velocity_m_s.dtype == np.float32
+    assert type(decode(encode(Streams(1, "text", 0)), classes)).__name__ == "Streams"
+    assert not vars(decode(encode({"key": 1}), classes))
