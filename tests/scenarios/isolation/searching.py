@@ -102,6 +102,8 @@ def _search_memory() -> Iterator[float]:
 
 def _search_files() -> Iterator[float]:
     """Yield the numbers in the environment, in the command line, and in all files below the folders that it knows."""
+    if "TMPDIR" not in os.environ:
+        return  # in the process of the test
     texts = ["\n".join([*os.environ.values(), *sys.argv])]
     folders = {Path.cwd(), Path(os.environ["TMPDIR"]), *(Path(entry) for entry in sys.argv if Path(entry).is_dir())}
     marker = os.environ.get("MARSYARD_WORKER")
@@ -123,9 +125,8 @@ class Searching:
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
         """See `VelocityEstimator`."""
         found = {number for search in (_search_memory, _search_files) for number in search()}
-        append_line(
-            " ".join(repr(float(number)) for number in found if isinstance(number, float) and abs(number) < 1e3)
-        )
+        numbers = [float(number) for number in found if isinstance(number, float)]
+        append_line(" ".join(repr(number) for number in numbers if abs(number) < 1e3))
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
 
