@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from marsyard.campaigns.definition.campaign import Campaign, replace_values
+from marsyard.campaigns.definition.campaign import Campaign, find_value, replace_values
 from marsyard.campaigns.definition.claims import (
     FrozenAlgorithm,
     bank_seeds,
@@ -35,6 +35,7 @@ from marsyard.campaigns.definition.evidence import Confirmation, Evidence, Evide
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store.record import git_commit, utc_now
 from marsyard.campaigns.store.registration import find_campaign_file_problem, find_registration_problem
+from marsyard.scenarios.interface import HasAlgorithms
 
 _KINDS = ("chain", "start", "extension", "result")
 #: Keys of the start of a confirmation; those of earlier versions have no `claim`.
@@ -189,7 +190,15 @@ def _derive_seeds(campaign: Campaign, claim: str, record: ConfirmationRecord) ->
 
 
 def select_confirmation_seed(campaign: Campaign) -> Campaign:
-    """Return the campaign with the seeds of its next confirmation. Raises StoreError if the record is invalid."""
+    """Return the campaign with the seeds of its next confirmation.
+
+    Raises StoreError if the record is invalid, and CampaignError if custom algorithms would run inside of the workers.
+    """
+    table = campaign.scenario.algorithm_table if isinstance(campaign.scenario, HasAlgorithms) else ()
+    if find_value(campaign.configuration.parameters, ".".join((*table, "executable", "isolated"))) is False:
+        raise CampaignError(
+            "executable.isolated is false; allowed in a confirmation: true, so that no algorithm can reach the truth"
+        )
     seeds = _derive_seeds(campaign, freeze_algorithm(campaign).claim, read_record(campaign.confirmations))
     parameters = replace_values(campaign.configuration.parameters, seeds.bank_seeds)
     configuration = campaign.configuration.model_copy(update={"seed": seeds.seed, "parameters": parameters})

@@ -8,9 +8,9 @@ suites (`marsyard.scenarios.estimators.Task.suite`). This module selects the sui
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -20,6 +20,7 @@ from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
 from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, list_installed
 from marsyard.scenarios.imports import import_object
+from marsyard.scenarios.offline import is_offline
 from marsyard.scenarios.parts.named import KINDS
 from marsyard.scenarios.systems import systems
 
@@ -60,8 +61,16 @@ class Subject:
             kind = KINDS[self.task]
             return parts.PartSuite(partial(parts.load_part, kind, self.spec), self.spec, False, self.limit_s, kind)
         task = tasks()[self.task]
-        create = partial(task.make, self.spec, task.options(), ExecutableLimits(time_s=self.limit_s))
+        limits = ExecutableLimits(time_s=self.limit_s, isolated=False)
         is_program = self.spec.startswith(tuple(PREFIXES))
+        suite = self._suite(task, partial(task.make, self.spec, task.options(), limits), is_program)
+        if is_program or self.spec in task.shipped or is_offline(self.spec):
+            return suite
+        isolated_limits = limits.model_copy(update={"isolated": True})
+        return replace(suite, make_remote=partial(task.make, self.spec, task.options(), isolated_limits))
+
+    def _suite(self, task: Task[Any, Any], create: Callable[[], Any], is_program: bool) -> Suite:
+        """Return the suite of an algorithm of a task; `create` constructs the algorithm."""
         if task.suite:
             suite: Suite = import_object(task.suite)(create, self.spec, is_program, self.limit_s)
             return suite

@@ -12,7 +12,7 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 from marsyard.algorithms.faults import AlgorithmError
 from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.estimators import algorithm_sources
+from marsyard.scenarios.isolation.host import reset
 
 #: Modules of `marsyard` that an algorithm may import, with their submodules (docs/architecture.md).
 ALLOWED_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")
@@ -91,12 +92,14 @@ class Suite(ABC):
     - spec: name of the algorithm or part
     - is_program: whether it is an external program; a program reads files, so it cannot change the Python inputs
     - limit_s: maximum computation time of an answer
+    - make_remote: constructs a custom algorithm in a process of its own; None for all others
     """
 
     make: Callable[[], Any]
     spec: str
     is_program: bool
     limit_s: float
+    make_remote: Callable[[], Any] | None = field(default=None, kw_only=True)
 
     #: Remedy if the check `deterministic` fails.
     deterministic_advice = (
@@ -142,6 +145,10 @@ class Suite(ABC):
             yield Check("inputs", "does not change its inputs", copies, self._check_inputs)
         requirement = "returns the same answers to the same case, after any other cases"
         yield Check("deterministic", requirement, self.deterministic_advice, self._check_repeatability)
+        if self.make_remote is not None:
+            requirement = "returns the same answers in a process of its own, as in a campaign"
+            advice = "find files by the path of the module, and return only the types of the protocol"
+            yield Check("process", requirement, advice, self._check_process)
         advice = "reduce the computation time, or raise the limit with --time-limit"
         yield Check("time", f"{self.time_verb} within {self.limit_s:g} s", advice, self._check_time)
         if self.forbids_truth and not self.is_program:
@@ -168,10 +175,20 @@ class Suite(ABC):
             if fingerprints[0] != fingerprints[1]:
                 raise BreachError("its answers to the same case differ between two calls")
             for other_case in self._other_cases():
+                reset(getattr(reused_instance, "stream", reused_instance))
                 self._call(reused_instance, copy_inputs(other_case, writable=self.writable_inputs), 2)
+            reset(getattr(reused_instance, "stream", reused_instance))
             answer = self._call(reused_instance, copy_inputs(case, writable=self.writable_inputs), 1)
             if fingerprint(self._check_answer(answer, case)) != fingerprints[0]:
                 raise BreachError(self.dependence_problem)
+        return ""
+
+    def _check_process(self) -> str:
+        if self.make_remote is not None:
+            remote = replace(self, make=self.make_remote)
+            for case in self.cases():
+                if fingerprint(remote._answer(case)) != fingerprint(self._answer(case)):
+                    raise BreachError("its answers in a process of its own differ from those in this process")
         return ""
 
     def _check_time(self) -> str:
