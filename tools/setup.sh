@@ -3,7 +3,7 @@
 # If nothing has changed, it returns immediately.
 #
 #   PYTHON=/path/to/python   the interpreter to build .venv with; otherwise the first Python >= 3.11 on the PATH
-#   tools/setup.sh --browser installs only the browser for the slow tests (`make validate`)
+#   tools/setup.sh --slow-tests installs only the programs for the slow tests (`make validate`)
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
@@ -98,8 +98,11 @@ install_gl_libraries() {
 # The tests build an example in C.
 install_compiler() { command -v cc >/dev/null || need gcc libc6-dev || true; }
 
-# The slow tests of pages use Debian's browser; no other browser is downloaded.
-install_browser() { command -v chromium >/dev/null || need chromium || true; }
+# The slow tests of pages use Debian's browser, no other browser is downloaded; those of the sandbox use bubblewrap.
+install_test_programs() {
+    command -v chromium >/dev/null || need chromium || true
+    command -v bwrap >/dev/null || need bubblewrap || true
+}
 
 # --- the environment --------------------------------------------------------------------------------------------------
 
@@ -139,8 +142,8 @@ check_rendering() {
     [ -n "$works" ] || fail "no GL backend renders an image: $either"
 }
 
-if [ "${1:-}" = --browser ]; then
-    install_browser
+if [ "${1:-}" = --slow-tests ]; then
+    install_test_programs
     exit 0
 fi
 

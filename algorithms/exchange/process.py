@@ -24,7 +24,7 @@ from typing import IO, Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from marsyard.algorithms.exchange.sandbox import PROGRAM, sandbox_words
+from marsyard.algorithms.exchange.sandbox import find_problem, sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.processes import AwakeClock, descendants, kill, resident_bytes
 
@@ -78,8 +78,8 @@ class ExecutableLimits(BaseModel):
 
     @model_validator(mode="after")
     def _check_sandbox(self) -> ExecutableLimits:
-        if self.sandbox and shutil.which(PROGRAM) is None:
-            raise ValueError(f"sandbox needs the program {PROGRAM}, which is not installed (package bubblewrap)")
+        if self.sandbox and (problem := find_problem()):
+            raise ValueError(f"this machine has no sandbox: {problem}")
         if self.sandbox and set(self.devices) != {CPU}:
             raise ValueError(f"devices are {', '.join(self.devices)}; allowed in the sandbox: {CPU}")
         if self.sandbox and not self.isolated:

@@ -8,8 +8,10 @@ its seed, nor the cache of terrains.
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 
 #: Name of the program that creates the namespaces.
@@ -21,6 +23,16 @@ _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/etc", "/opt")
 _VARIABLES = ("PATH", "LANG", "LC_", "PYTHONPATH", "PYTHONHASHSEED", "OMP_", "OPENBLAS_", "MKL_", "NUMBA_NUM_")
 #: Variables with the values of the program itself.
 _OWN_VARIABLES = ("TMPDIR", "MARSYARD_DEVICE")
+
+
+@cache
+def find_problem() -> str:
+    """Return why this machine has no sandbox; empty if it has."""
+    if shutil.which(PROGRAM) is None:
+        return f"the program {PROGRAM} is not installed (package bubblewrap)"
+    words = [PROGRAM, "--unshare-all", "--ro-bind", "/", "/", "true"]
+    trial = subprocess.run(words, capture_output=True, text=True, check=False)  # noqa: S603
+    return "" if trial.returncode == 0 else f"{PROGRAM} cannot create namespaces: {trial.stderr.strip()}"
 
 
 def sandbox_words(

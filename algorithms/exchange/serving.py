@@ -116,9 +116,7 @@ class Server:
     version: int
     request_count: int = 0
 
-    def send_request(
-        self, request: Mapping[str, Any], time_s: float | None = None
-    ) -> tuple[Mapping[str, Any], Output]:
+    def send_request(self, request: Mapping[str, Any], time_s: float | None = None) -> tuple[Mapping[str, Any], Output]:
         """Send one request; return the program's answer without its `id`, and its raw output.
 
         `time_s` is the limit of the time for the answer; None: the limit of the program.

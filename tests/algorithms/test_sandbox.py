@@ -13,7 +13,7 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.exchange import ExecutableLimits, sandbox
+from marsyard.algorithms.exchange import ExecutableLimits, process, sandbox
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import VELOCITY
@@ -58,8 +58,6 @@ MODULE = (
 """
 )
 
-needs_bubblewrap = pytest.mark.skipif(shutil.which(sandbox.PROGRAM) is None, reason="bubblewrap is not installed")
-
 
 @pytest.fixture(autouse=True)
 def _end_programs() -> Iterator[None]:
@@ -67,7 +65,7 @@ def _end_programs() -> Iterator[None]:
     end_idle_programs()
 
 
-@needs_bubblewrap
+@pytest.mark.slow  # needs bubblewrap
 @pytest.mark.parametrize(("text", "prefix"), [(PROGRAM, f"exec:{sys.executable} "), (MODULE, "")])
 @pytest.mark.parametrize("is_sandboxed", [True, False])
 def test_untrusted_algorithm_reaches_only_its_inputs(
@@ -100,15 +98,19 @@ def test_untrusted_algorithm_reaches_only_its_inputs(
 
 def test_sandbox_without_bubblewrap_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    with pytest.raises(ValidationError, match="sandbox needs the program bwrap, which is not installed"):
+    sandbox.find_problem.cache_clear()
+    with pytest.raises(ValidationError, match="this machine has no sandbox: the program bwrap is not installed"):
         ExecutableLimits(sandbox=True)
+    sandbox.find_problem.cache_clear()
 
 
-@needs_bubblewrap
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"devices": ["cuda:0"]}, "allowed in the sandbox: cpu"), ({"isolated": False}, "allowed in the sandbox: true")],
 )
-def test_settings_that_the_sandbox_cannot_enforce_are_refused(settings: dict[str, object], message: str) -> None:
+def test_settings_that_the_sandbox_cannot_enforce_are_refused(
+    settings: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "find_problem", lambda: "")
     with pytest.raises(ValidationError, match=message):
         ExecutableLimits.model_validate({"sandbox": True, **settings})

@@ -190,6 +190,8 @@ def test_errors_are_reported_before_the_first_case(marsyard: Command, tmp_path: 
     assert (output.status, f"{RECORD}:1 is not an entry" in output.err) == (2, True)
     with pytest.raises(StoreError, match="not an entry"):
         read_confirmations(tmp_path / RECORD)
+    output = marsyard("run", "fake.toml", "--confirm", "--set", "executable.isolated=false")
+    assert (output.status, "executable.isolated is false; allowed in a confirmation: true" in output.err) == (2, True)
     output = marsyard("confirmations", "none.jsonl")
     assert (output.status, "no such file" in output.err) == (2, True)
     output = marsyard("confirmations", "--create")

@@ -49,6 +49,11 @@ def _recurse() -> None:
     _recurse()
 
 
+def _kill_parent() -> None:
+    os.kill(os.getppid(), signal.SIGKILL)
+    time.sleep(60)
+
+
 def _fill_temporary_folder() -> None:
     Path(os.environ["TMPDIR"], "large").write_bytes(b"1" * 300_000_000)
 
@@ -69,7 +74,7 @@ def _patch_libraries() -> None:
 
     replaced: Any = lambda *_, **__: 0.0  # noqa: E731
     marsyard.algorithms.answers.check_velocity = replaced
-    np.hypot = replaced  # type: ignore[misc]
+    np.hypot = replaced
     time.process_time = replaced
     builtins.abs = replaced
 
@@ -140,7 +145,7 @@ class _SaysItIsVelocity:
     outcome = VelocityOutcome.VALID
     velocity_m_s = np.zeros(2)
 
-    @property
+    @property  # type: ignore[misc]
     def __class__(self) -> Any:
         return VelocityEstimate
 
@@ -152,7 +157,7 @@ ACTIONS: Mapping[str, tuple[Callable[[], object], str]] = {
     "interrupt": (lambda: _raise(KeyboardInterrupt()), "CRASHED"),
     "exit at once": (lambda: os._exit(0), "CRASHED"),
     "kill itself": (lambda: os.kill(os.getpid(), signal.SIGKILL), "CRASHED"),
-    "kill its parent": (lambda: (os.kill(os.getppid(), signal.SIGKILL), time.sleep(60)), "CRASHED"),
+    "kill its parent": (_kill_parent, "CRASHED"),
     "kill its group": (lambda: os.killpg(0, signal.SIGKILL), "CRASHED"),
     "stop its parent": (lambda: os.kill(os.getppid(), signal.SIGSTOP), "VALID"),
     "stop itself": (lambda: os.kill(os.getpid(), signal.SIGSTOP), "TIMED_OUT"),

@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.algorithms.interface import TargetUpdate, TrackingState, VelocityEstimate, VelocityOutcome
-from marsyard.algorithms.vtt import VisualTargetTracker
-from marsyard.sim.measurements import DescentFrame, DescentMeasurements, RoverMeasurements
+from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
+from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 
 #: Largest number of elements of an array that is searched.
 _MAX_ELEMENTS = 100_000
@@ -63,16 +62,6 @@ class Stream:
     def finish(self) -> VelocityEstimate:
         """See `VelocityStream`."""
         return VelocityEstimate(VelocityOutcome.VALID, np.array([float(self.images), 0.0]))
-
-
-class Tracker(VisualTargetTracker):
-    """The tracker of the paper, with a line for each update."""
-
-    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """See `TargetTracker`."""
-        update = super().update(measurements)
-        append_line(f"{update.state is TrackingState.NORMAL} {measurements.left.counts.flags.writeable}")
-        return update
 
 
 def _numbers(value: Any) -> Iterator[float]:

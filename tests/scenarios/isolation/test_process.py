@@ -108,14 +108,13 @@ def test_stream_receives_images_one_by_one(log: Path) -> None:
     assert log.read_text().splitlines() == [f"DescentFrame {number}" for number in (1, 2, 3, 4)] * 2
 
 
-def test_tracker_in_its_own_process_gives_the_same_answers(log: Path) -> None:
-    remote = TRACKING.make(f"{MODULE}:Tracker", VttOptions(), ExecutableLimits())
+def test_tracker_in_its_own_process_gives_the_same_answers() -> None:
+    remote = TRACKING.make("marsyard.algorithms.vtt:VisualTargetTracker", VttOptions(), ExecutableLimits())
     local = TRACKING.make("vtt", VttOptions(), ExecutableLimits())
     for update, expected in zip(drive_to_target(remote), drive_to_target(local), strict=True):
         assert (update.state, update.losses) == (expected.state, expected.losses)
         np.testing.assert_array_equal(update.position_rover, expected.position_rover)
     assert remote.state is local.state
-    assert set(log.read_text().splitlines()) == {"True False"}
 
 
 def test_stored_object_runs_in_its_own_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
