@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from marsyard.algorithms.exchange import ExecutableLimits
 from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.cache import CacheWarning
@@ -168,6 +169,7 @@ class TestedParameters(FakeParameters):
     terrain: int = Field(default=0, ge=0, le=99)
     algorithm: str
     compared: tuple[str, ...] = ()
+    executable: ExecutableLimits = ExecutableLimits()
 
 
 class TestedScenario(FakeScenario):
