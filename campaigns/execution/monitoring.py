@@ -21,6 +21,7 @@ from typing import Any
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
+from marsyard.algorithms.exchange.process import WORKER_NUMBER
 from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError
 from marsyard.campaigns.execution import supervisor, worker_process
@@ -116,6 +117,8 @@ class MonitoredWorker:
         (self._folder / "tmp").mkdir(parents=True)
         self._mark = f"{_MARK}={self._folder}"
         self._board = worker_process.StatusBoard.create(self._folder / "board")
+        # anonymous memory: a file of this note, with true conditions, could be read by the algorithm under test
+        self._note = os.memfd_create("note")
         self._termination: WorkerDeath | None = None
         self._loaded: Work[Any] | None = None
         self.is_loading = False
@@ -125,8 +128,13 @@ class MonitoredWorker:
         self._executor: Any = ProcessPoolExecutor(
             max_workers=1,
             initializer=worker_process.start_worker,
-            initargs=(os.getpid(), str(self._folder)),
-            env={**_WORKER_ENVIRONMENT, _MARK: str(self._folder), "TMPDIR": str(self._folder / "tmp")},
+            initargs=(os.getpid(), str(self._folder), self._note),
+            env={
+                **_WORKER_ENVIRONMENT,
+                _MARK: str(self._folder),
+                WORKER_NUMBER: self._parent_folder.name,
+                "TMPDIR": str(self._folder / "tmp"),
+            },
         )
 
     def submit(self, work: Work[Any], batch: Sequence[int]) -> Future[Any]:
@@ -238,8 +246,7 @@ class MonitoredWorker:
             item = self._clock.item if self._clock.has_started else None
             death = WorkerDeath(item, cause, self._clock.was_suspended)
         self._kill()
-        note = self._folder / "note"
-        death.error.note = note.read_bytes()[:_MAX_NOTE].decode(errors="replace") if note.exists() else ""
+        death.error.note = os.pread(self._note, _MAX_NOTE, 0).decode(errors="replace")
         self.replace()
         return death
 
@@ -261,7 +268,7 @@ class MonitoredWorker:
         """Kill the process, if it is running, and prepare a new one."""
         self._kill()
         self._executor.shutdown(wait=False)
-        self._board.close()
+        self._close()
         shutil.rmtree(self._folder, ignore_errors=True)
         self._start()
 
@@ -278,4 +285,9 @@ class MonitoredWorker:
             if manager.is_alive():
                 supervisor.kill(find_marked_processes(self._mark))
                 manager.join(_KILLING_S)
+        self._close()
+
+    def _close(self) -> None:
+        """Release the shared memory."""
         self._board.close()
+        os.close(self._note)
