@@ -199,7 +199,7 @@ def test_time_of_the_caller_is_not_time_of_the_cases(tmp_path: Path) -> None:
 
 
 def test_loading_has_its_own_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Loading takes 2 s, longer than the limit of 1 s of a case; then loading has a limit of 4 s, which a start of a process does not exceed."""
+    """Loading takes 2 s, longer than the limit of 1 s of a case. Then its limit is 4 s, longer than starting takes."""
     task, load = partial(sleep_after_start, str(tmp_path), 0.0), partial(time.sleep, 2.0)
     assert [result.result for result in run_items(task, range(3), 1.0, load).values()] == [0, 1, 2]
     monkeypatch.setattr("marsyard.campaigns.execution.monitoring._LOADING_S", 4.0)
