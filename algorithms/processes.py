@@ -14,6 +14,8 @@ from pathlib import Path
 
 #: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
+#: Loaded here, because nothing should be loaded between a fork and the execution of another program.
+_libc = ctypes.CDLL(None)
 #: Maximum time between two readings of an `AwakeClock` that is counted, s.
 _MAX_STEP_S = 1.0
 
@@ -44,13 +46,13 @@ def processor_time_s(process: int) -> float:
 def adopt_orphans() -> None:
     """Make this process the parent of every orphaned descendant, in any session."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+        _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def end_with_parent(parent: int, signal_number: int) -> None:
     """Request a signal at the parent's end; end this process now if the parent has already ended."""
     if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal_number)
+        _libc.prctl(_PR_SET_PDEATHSIG, signal_number)
         if os.getppid() != parent:
             os._exit(1)
 

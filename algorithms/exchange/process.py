@@ -6,19 +6,18 @@ removed. On Linux it is killed when its parent process ends.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import selectors
 import shlex
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Annotated
 
@@ -26,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from marsyard.algorithms.exchange.sandbox import find_problem, sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.processes import AwakeClock, descendants, kill, resident_bytes
+from marsyard.algorithms.processes import AwakeClock, descendants, end_with_parent, kill, resident_bytes
 
 #: Interval of the checks of time, memory and output, and of the files' size, seconds.
 _POLL_S, _FILES_POLL_S = 0.02, 0.5
@@ -36,12 +35,6 @@ MAX_STDERR_CHARACTERS = 4000
 _EXIT_GRACE_S = 0.5
 #: Maximum number of bytes in one read or write of a pipe.
 _CHUNK_BYTES = 1 << 16
-
-#: Linux's `prctl` option for the signal that a process receives when its parent ends.
-_PR_SET_PDEATHSIG = 1
-_libc = ctypes.CDLL(None)
-
-
 #: Environment variables: number of a worker process, counted from 0, and device that a program may use.
 WORKER_NUMBER, DEVICE_VARIABLE = "MARSYARD_WORKER_NUMBER", "MARSYARD_DEVICE"
 #: Device without an accelerator.
@@ -191,7 +184,7 @@ class RunningProgram:
                 env=environment,
                 pass_fds=descriptors,
                 process_group=0,
-                preexec_fn=_kill_with_parent if sys.platform == "linux" else None,
+                preexec_fn=partial(end_with_parent, os.getpid(), signal.SIGKILL),
             )
         except OSError as error:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -362,11 +355,6 @@ def _folder_bytes(folder: Path) -> int:
             with suppress(OSError):
                 total += Path(parent, name).lstat().st_blocks * 512
     return total
-
-
-def _kill_with_parent() -> None:
-    """Configure Linux to kill the program when its parent thread ends; called between fork and exec."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _read_pending(stream: IO[bytes] | None) -> bytes:

@@ -23,9 +23,10 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 
 from marsyard.algorithms.exchange.process import WORKER_NUMBER
 from marsyard.algorithms.processes import descendants, used_memory
+from marsyard.algorithms.processes import kill as kill_processes
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError
-from marsyard.campaigns.execution import supervisor, worker_process
-from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, find_marked_processes, is_stopped, kill
+from marsyard.campaigns.execution import worker_process
+from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, find_marked_processes, is_stopped
 from marsyard.campaigns.execution.worker_process import Work, WorkLimits, load_task, run_batch
 
 _THREAD_VARIABLES = (
@@ -171,7 +172,7 @@ class MonitoredWorker:
         self._checked_s = now_s
         if not self._is_alive():
             # descendants without a supervisor keep loky's pipe open, so loky waits for their end: kill them
-            kill(find_marked_processes(self._mark))
+            kill_processes(find_marked_processes(self._mark))
             return
         clock = self._clock
         clock.update(self._board.read())
@@ -222,7 +223,7 @@ class MonitoredWorker:
         if self._process is None or self._wait_for_end(_KILLING_S):
             return
         # the supervisor was stopped or is busy, so its processes are killed directly
-        kill([*descendants(self._process.pid), self._process.pid, *find_marked_processes(self._mark)])
+        kill_processes([*descendants(self._process.pid), self._process.pid, *find_marked_processes(self._mark)])
 
     def _wait_for_end(self, max_seconds: float) -> bool:
         """Wait for the end of the process; return whether it has ended."""
@@ -283,7 +284,7 @@ class MonitoredWorker:
         if manager is not None:
             manager.join(_KILLING_S)
             if manager.is_alive():
-                supervisor.kill(find_marked_processes(self._mark))
+                kill_processes(find_marked_processes(self._mark))
                 manager.join(_KILLING_S)
         self._close()
 

@@ -7,18 +7,16 @@ parent sends signals only to the supervisor.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-from marsyard.algorithms.processes import descendants
+from marsyard.algorithms.processes import adopt_orphans, descendants, end_with_parent, kill
 
 #: Signal on which a worker writes its stack trace; the supervisor forwards it.
 DUMP_SIGNAL = signal.SIGUSR2
@@ -89,34 +87,10 @@ def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[sign
     os._exit(128 - status)  # as shells report a signal: 128 plus its number
 
 
-#: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
-_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 #: Maximum seconds of repeated killing, since processes may start other processes meanwhile.
 _KILLING_S = 10.0
 #: Seconds between two rounds of killing.
 _PAUSE_S = 0.005
-
-
-def adopt_orphans() -> None:
-    """Make this process the parent of every orphaned descendant, in any session."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
-
-
-def end_with_parent(parent: int, signal_number: int) -> None:
-    """Request a signal at the parent's end; end this process now if the parent has already ended."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal_number)
-        if os.getppid() != parent:
-            os._exit(1)
-
-
-def kill(processes: Iterable[int]) -> None:
-    """Kill single processes, except process 1; numbers below 1, which mean process groups, are ignored."""
-    for process in processes:
-        if process > 1:
-            with suppress(ProcessLookupError, PermissionError):
-                os.kill(process, signal.SIGKILL)
 
 
 def find_marked_processes(mark: str) -> list[int]:
