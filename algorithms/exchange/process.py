@@ -50,6 +50,9 @@ class ExecutableLimits(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time for an answer, s")] = 60.0
+    total_s: Annotated[
+        float, Field(gt=0.0, le=864000.0, description="wall-clock time for all answers to one case, s")
+    ] = 600.0
     loading_s: Annotated[
         float, Field(gt=0.0, le=86400.0, description="wall-clock time to import and construct a Python class, s")
     ] = 300.0
@@ -190,6 +193,8 @@ class RunningProgram:
             shutil.rmtree(self.folder, ignore_errors=True)
             message = f"{words[0]} cannot be started: {error.strerror or error}"
             raise AlgorithmError(Fault.CRASHED, message) from error
+        #: time that is left for the answers to the present case, s
+        self.left_s = limits.total_s
         self._clock, self._time_s = AwakeClock(), limits.time_s
         self._checked_s = self._files_checked_s = 0.0
 
@@ -225,7 +230,7 @@ class RunningProgram:
         start_s = time.perf_counter()
         self._stdout.clear()
         self._stderr.clear()
-        self._clock, self._time_s = AwakeClock(), time_s or self.limits.time_s
+        self._clock, self._time_s = AwakeClock(), min(time_s or self.limits.time_s, self.left_s)
         if request is not None and (early_output := _read_pending(self._process.stdout)):
             message = f"it wrote {shorten(early_output)} before the request; expected one line per request"
             raise self._end_with_fault(Fault.BAD_ANSWER, message)
@@ -240,6 +245,7 @@ class RunningProgram:
         first_line, _, extra_output = bytes(self._stdout).partition(b"\n")
         if extra_output:
             raise self._end_with_fault(Fault.BAD_ANSWER, "it wrote more than one line")
+        self.left_s -= self._clock.elapsed_s()
         return self._collect_output(first_line, start_s)
 
     def stop(self) -> None:
@@ -285,7 +291,13 @@ class RunningProgram:
         """Kill the program and raise AlgorithmError if it exceeds a limit."""
         elapsed_s, now_s = self._clock.elapsed_s(), time.monotonic()
         if elapsed_s > self._time_s:
-            raise self._end_with_fault(Fault.TIMED_OUT, f"no answer within {self._time_s:g} s")
+            is_total = self._time_s == self.left_s
+            message = (
+                f"no answers to the case within {self.limits.total_s:g} s"
+                if is_total
+                else (f"no answer within {self._time_s:g} s")
+            )
+            raise self._end_with_fault(Fault.TIMED_OUT, message)
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")
         if now_s - self._checked_s < _POLL_S:

@@ -149,6 +149,7 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
     The caller must pass it to `release_server` afterwards.
     """
     if command.persistent and (idle := _idle.pop((command, limits), None)) is not None and idle.child.is_running():
+        idle.child.left_s = limits.total_s
         return idle
     child = command.start(limits)
     output = child.read_line(time_s=child.loading_s)

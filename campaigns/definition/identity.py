@@ -20,7 +20,7 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from marsyard.algorithms.exchange import parse_command
+from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits, parse_command
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
@@ -123,6 +123,19 @@ def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
     if tested_key in configuration.dispersions:
         specs += configuration.dispersions[tested_key].extremes()
     return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
+
+
+def own_limits(configuration: CampaignConfiguration) -> tuple[float, float]:
+    """Return the time (s) and memory (bytes) that the algorithms in processes of their own may use for one case."""
+    selected_scenario = find_scenario(configuration.scenario)
+    if not isinstance(selected_scenario, HasAlgorithms):
+        return 0.0, 0.0
+    found = find_value(configuration.parameters, ".".join((*selected_scenario.algorithm_table, "executable")))
+    limits = ExecutableLimits.model_validate(found if isinstance(found, Mapping) else {})
+    shipped = selected_scenario.task.shipped
+    custom = [spec for spec in list_algorithms(configuration) if spec not in shipped and not is_offline(spec)]
+    count = len([spec for spec in custom if limits.isolated or spec.startswith(tuple(PREFIXES))])
+    return count * (limits.loading_s + limits.total_s), count * limits.memory_gb * 1e9
 
 
 def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from typing import Any
 from marsyard.algorithms.faults import describe_error
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
+from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
@@ -131,6 +132,10 @@ def run_cases(
     task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), selection, dict(points))
     note_counts: Counter[str] = Counter()
     limits = work_limits(configuration.limits, configuration.limits.case_time_s)
+    # algorithms in processes of their own have their own limits: one that uses them up must not end the case
+    time_s, memory_bytes = own_limits(configuration)
+    case_memory = None if limits.memory_bytes is None else limits.memory_bytes + memory_bytes
+    limits = replace(limits, time_s=limits.time_s + time_s, memory_bytes=case_memory)
     for results in executor.run(Work(task, cases, limits, total, create_loader(configuration))):
         completed_cases = []
         for task_result in results:

@@ -6,6 +6,7 @@ after an exception, an exceeded limit or an unreadable answer; the next case sta
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -84,7 +85,9 @@ class RemoteAlgorithm:
         self._sender = Sender(child.memory)
         self._process = child.find_algorithm()
         start = {"path": search_path(), "spec": spec, "device": limits.device}
+        child.left_s = math.inf
         answer = self._request("start", start, limits.loading_s)
+        child.left_s = limits.total_s
         members = answer.get("members")
         self._members = members if isinstance(members, dict) else {}
 

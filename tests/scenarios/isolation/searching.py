@@ -6,6 +6,7 @@ import gc
 import os
 import re
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
@@ -41,6 +42,31 @@ class Counting:
         """See `VelocityEstimator`; the velocity is random."""
         append_line(f"estimate {os.getpid()}")
         return VelocityEstimate(VelocityOutcome.VALID, np.random.random_sample(2))  # noqa: NPY002
+
+
+class Slow:
+    """Velocity stream that waits at each image."""
+
+    def start(self) -> None:
+        """See `VelocityStream`."""
+
+    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
+        """See `VelocityStream`."""
+        time.sleep(0.5)
+        return None
+
+    def finish(self) -> VelocityEstimate:
+        """See `VelocityStream`."""
+        return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
+
+
+class Hanging:
+    """Velocity estimator without an answer."""
+
+    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
+        """See `VelocityEstimator`."""
+        time.sleep(3600.0)
+        raise AssertionError
 
 
 class Stream:

@@ -13,8 +13,11 @@ import pytest
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.exchange import ExecutableLimits
 from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
+from marsyard.campaigns.definition.identity import own_limits
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.algorithm_run import run_on_measurements
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target
@@ -23,6 +26,7 @@ from marsyard.scenarios.isolation.plain import decode, encode
 from marsyard.scenarios.isolation.remote import is_remote
 from marsyard.scenarios.objects import name_object
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
 from tests.campaigns.fake_velocity import FakeVelocityParameters, FakeVelocityScenario
 
 MODULE = "tests.scenarios.isolation.searching"
@@ -106,6 +110,40 @@ def test_stream_receives_images_one_by_one(log: Path) -> None:
         assert estimate.velocity_m_s.tolist() == [4.0, 0.0]
         assert estimate.after_images == (None,) * 4
     assert log.read_text().splitlines() == [f"DescentFrame {number}" for number in (1, 2, 3, 4)] * 2
+
+
+def test_answers_to_one_case_have_a_limit_together() -> None:
+    limits = ExecutableLimits(time_s=60.0, total_s=1.2)
+    for _ in range(2):
+        stream = VELOCITY.make(f"{MODULE}:Slow", DimesOptions(), limits)
+        with pytest.raises(AlgorithmError, match=r"no answers to the case within 1\.2 s") as raised:
+            stream.estimate(inputs.inertial_descent(8))
+        assert raised.value.fault is Fault.TIMED_OUT
+    slow_enough = VELOCITY.make(f"{MODULE}:Slow", DimesOptions(), ExecutableLimits(total_s=60.0))
+    assert slow_enough.estimate(inputs.inertial_descent(3)).outcome is VelocityOutcome.NO_VALID_TRACK
+
+
+def test_limit_of_an_algorithm_does_not_end_the_case(tmp_path: Path) -> None:
+    """The algorithm hangs longer than the limit of a case, and its limit is longer too."""
+    path = tmp_path / "hanging.toml"
+    path.write_text(
+        f"""
+        name = "hanging"
+        scenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"
+        cases = 2
+        seed = 1
+        [limits]
+        case_time_s = 2.0
+        memory_gb = 1.0
+        [parameters]
+        algorithm = "homography"
+        compared = ["{MODULE}:Hanging"]
+        executable = {{ time_s = 3.0, total_s = 4.0, loading_s = 60.0 }}
+        """
+    )
+    rows = read_case_rows(run(path, tmp_path / "run", RecordingWatch()))
+    assert own_limits(load_campaign(str(path)).configuration) == (64.0, 2e9)
+    assert [(row["outcome"], row["Hanging.outcome"]) for row in rows] == [("VALID", "TIMED_OUT")] * 2
 
 
 def test_tracker_in_its_own_process_gives_the_same_answers() -> None:
