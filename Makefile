@@ -34,7 +34,7 @@ bench: setup ## Measure speed and memory
 
 validate: setup ## Run the slow tests, and compare with the papers' published results
 	@tools/setup.sh --slow-tests
-	@$(BIN)/python -m pip install -qq --no-input --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[notebook,view]'
+	@$(BIN)/python -m pip install -qq --no-input --disable-pip-version-check -c constraints.txt --no-build-isolation -e '.[network,notebook,view]'
 	@tools/test.sh -m slow
 	$(BIN)/python -m benchmarks.validation
 

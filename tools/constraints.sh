@@ -9,7 +9,7 @@ trap 'rm -rf "$scratch"' EXIT
 
 "$python" -m venv "$scratch/venv"
 "$scratch/venv/bin/python" -m pip install -qq --upgrade pip setuptools
-"$scratch/venv/bin/python" -m pip install -qq --no-build-isolation -e '.[bench,dask,dev,docs,geo,notebook,spice,validate,view]'
+"$scratch/venv/bin/python" -m pip install -qq --no-build-isolation -e '.[bench,dask,dev,docs,geo,network,notebook,spice,validate,view]'
 "$scratch/venv/bin/python" - >"$scratch/constraints.txt" <<'PYTHON'
 import re
 from importlib.metadata import distributions

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -19,10 +21,17 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 
-TUTORIALS = sorted((Path(__file__).parents[2] / "docs" / "tutorials").glob("*.md"))
+DOCS = Path(__file__).parents[2] / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))
 CODE_BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 #: End of the text before a code block that is saved to a file.
 FILE_NAME = re.compile(r"Save\s+it\s+as\s+`([\w./-]+)`:\s*\Z")
+#: Link to an example file, which the reader copies to the same path in the folder of the tutorial.
+EXAMPLE_LINK = re.compile(r"\]\(\.\./examples/([\w./-]+)\)")
+#: Lines of an example file, shown in the text with an indentation of four columns.
+EXCERPT = re.compile(r"(?:^ {4}.*\n(?:\n(?= {4}))?)+", re.MULTILINE)
+#: Tutorials that need the packages of an extra, which `make validate` installs.
+OPTIONAL_PACKAGES = {"neural-network": ("onnx", "onnxruntime")}
 #: Files that exist after the tutorial.
 EXPECTED_FILES = {
     "first-campaign": (
@@ -45,6 +54,13 @@ EXPECTED_FILES = {
         "budget/report.html",
         "rare/report.html",
     ),
+    "neural-network": (
+        "velocity_network/network.onnx",
+        "online/report.html",
+        "smoke/cases/000023/image_3.png",
+        "answers.csv",
+        "offline/report.html",
+    ),
     "custom-system": ("fallen/report.html", "fallen/cases/2/altitude.png"),
 }
 #: Folder of the packages that a tutorial installs.
@@ -56,7 +72,12 @@ EXIT_CODES = re.compile(r"# exits with (\d)(?: or (\d))?")
 @pytest.mark.slow
 @pytest.mark.parametrize("tutorial", TUTORIALS, ids=[path.stem for path in TUTORIALS])
 def test_tutorial_commands_succeed(tutorial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in OPTIONAL_PACKAGES.get(tutorial.stem, ()):
+        pytest.importorskip(package)
     text = tutorial.read_text(encoding="utf-8")
+    for name in EXAMPLE_LINK.findall(text):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(DOCS / "examples" / name, tmp_path / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     has_installation = "$ pip install" in text
@@ -86,6 +107,18 @@ def test_tutorial_commands_succeed(tutorial: Path, tmp_path: Path, monkeypatch: 
     assert n_commands >= 3
     for name in EXPECTED_FILES.get(tutorial.stem, ()):
         assert (tmp_path / name).stat().st_size > 0
+
+
+def test_excerpts_are_parts_of_the_example_files() -> None:
+    n_excerpts = 0
+    for tutorial in TUTORIALS:
+        text = tutorial.read_text(encoding="utf-8")
+        sources = [(DOCS / "examples" / name).read_text(encoding="utf-8") for name in EXAMPLE_LINK.findall(text)]
+        for excerpt in EXCERPT.findall(CODE_BLOCK.sub("", text)) if sources else ():
+            n_excerpts += 1
+            code = textwrap.dedent(excerpt).strip()
+            assert any(code in textwrap.dedent(source) or excerpt.rstrip() in source for source in sources), code
+    assert n_excerpts >= 2
 
 
 def _invoke_in_process(arguments: list[str], allowed_codes: set[int]) -> None:
