@@ -20,6 +20,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 from scipy import stats
 
 from marsyard.reports import rates
+from marsyard.reports.blocks import NO_FAULT, OutcomesBySize, Rows
 from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.figures import ELLIPSE
@@ -33,11 +34,11 @@ from marsyard.reports.section import (
     Section,
     Subject,
     build_grid,
+    create_section,
     in_page_style,
     new_axes,
     svg_figure,
 )
-from marsyard.reports.section_kinds import OutcomesBySize, Rows, SectionDeclaration
 from marsyard.reports.statistics.changes import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.statistics.proportions import proportion_interval
@@ -374,10 +375,9 @@ def consistency_section(subject: Subject) -> Section | None:
     return Section("consistency", "Consistency", "Reported covariances against errors", blocks, results)
 
 
-def _classify_answers(rows: Rows, subject: Subject) -> dict[str, Bool[np.ndarray, " n"]]:
+def _classify_answers(rows: Rows, metric: str, bound: float) -> dict[str, Bool[np.ndarray, " n"]]:
     """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers."""
-    is_answered = rates.population_mask(rows, "valid")
-    is_correct = rates.success_mask(rows, str(subject.metric), math.nan if subject.bound is None else subject.bound)
+    is_answered, is_correct = rates.population_mask(rows, "valid"), rates.success_mask(rows, metric, bound)
     return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
 
 
@@ -389,27 +389,25 @@ def find_frequent_refusal(rows: Rows) -> str:
     return str(refusals.index[0]) if len(refusals) else ""
 
 
-#: Outcomes of `_classify_answers` by fault and its size.
-FAULT_OUTCOMES = OutcomesBySize(
-    outcomes=_classify_answers,
-    styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
-    cases="Cases",
-    caption="Solid bars: answers within the bound. Hatched bars: no answer. Cross-hatched bars: wrong answers.",
-    wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == "none" else f"{size:g}"),
-    extra_columns=(
-        ("Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING),
-    ),
-)
+def fault_outcomes(metric: str, bound: float) -> OutcomesBySize:
+    """Define the outcomes of `_classify_answers` by fault and its size."""
+    return OutcomesBySize(
+        outcomes=lambda rows: _classify_answers(rows, metric, bound),
+        styles={"valid": ("valid", "full"), "invalid": ("invalid", "hatched"), "wrong": ("wrong", "crossed")},
+        cases="Cases",
+        wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == NO_FAULT else f"{size:g}"),
+        extra_columns=(
+            ("Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING),
+        ),
+    )
 
 
 def faults_section(subject: Subject) -> Section | None:
     """Create the section on outcomes by fault and size; None without faults or bound."""
     if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
         return None
-    note = note_text(
-        "common.faults",
-        bound=f"{subject.bound:g}",
-        unit=split_unit(subject.metric)[1],
-        confidence=format_fraction(CONFIDENCE),
-    )
-    return SectionDeclaration("faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), note=note)(subject)
+    unit, confidence = split_unit(subject.metric)[1], format_fraction(CONFIDENCE)
+    note = note_text("common.faults", bound=f"{subject.bound:g}", unit=unit, confidence=confidence)
+    caption = "Solid bars: answers within the bound. Hatched bars: no answer. Cross-hatched bars: wrong answers."
+    blocks = fault_outcomes(subject.metric, subject.bound).blocks(subject.frame, "faults", caption, note)
+    return create_section("faults", "Faults", "Faults by size", *blocks)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
-from matplotlib.ticker import LogFormatter, MaxNLocator, PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
 from marsyard.reports import section
 from marsyard.reports.rates import ENGINE_FAILURES, CaseFraction, PooledRate
@@ -347,12 +347,10 @@ def cumulative_figure(
             axes.axvline(position, color=REQUIREMENT, linewidth=0.9, linestyle="-.", label=line_label)
     axes.set(xlabel=labels[0], ylabel=labels[1], ylim=(0.0, 1.03))
     axes.set_xlim(left=0.0)
-    if bound is None or edge is None:
-        axes.legend(loc="upper right" if complementary else "lower right")
-        return figure
-    axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
-    axes.set_xlim(0.0, 1.02 * edge)
-    note_beyond(axes, int((all_values > edge).sum()))
+    if bound is not None and edge is not None:
+        axes.axvline(bound, color=REQUIREMENT, linewidth=1.5, linestyle="--")
+        axes.set_xlim(0.0, 1.02 * edge)
+        note_beyond(axes, int((all_values > edge).sum()))
     axes.legend(**_BELOW_AXES)
     return figure
 
@@ -429,11 +427,13 @@ def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, l
         axes.plot(*medians, "o-", color=SERIES[0], markersize=4.5)
         if logarithmic:
             axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             # the page's style does not support superscripts of powers of ten
-            axes.yaxis.set_major_formatter(LogFormatter())
-            axes.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False))
+            axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.yaxis.set_minor_formatter(NullFormatter())
         if y == rows[-1]:
             axes.set_xlabel(x, fontsize=8)
         if x == columns[0]:
-            axes.set_ylabel(y, fontsize=8)
+            # the unit has its own line, so that labels of adjacent panels do not overlap
+            axes.set_ylabel(y.replace(" (", "\n("), fontsize=8)
     return figure

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from marsyard.reports.blocks import Rows
 from marsyard.reports.rates import all_flags, finite_values, flag_fraction, fraction_text, median_text
-from marsyard.reports.section import Block, Grid, Section, Subject
-from marsyard.reports.section_kinds import Part, Rows
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section
 from marsyard.reports.wording import NOTHING
 
 
@@ -24,9 +23,8 @@ def read_paper(path: Path) -> Mapping[str, Any]:
         return tomllib.load(file)
 
 
-@dataclass(frozen=True)
-class PaperFacts:
-    """Section of the report with a paper's numbers of a single run next to those of the campaign that repeats it.
+def paper_section(subject: Subject, path: Path, *extra_blocks: Block) -> Section | None:
+    """Create the section with a paper's numbers of a single run next to those of the campaign that repeats it.
 
     The paper's TOML file contains a table `[[facts]]` for each run. Its keys are `campaign` (name of the campaign that
     repeats the run), `title`, `source`, `note`, and `rows`. Keys of a row:
@@ -35,28 +33,18 @@ class PaperFacts:
     - optional: `statistic` (``spread``: median, minimum and maximum; or ``rate``), `among` (flags that select rows),
       `scale`, `digits`, `magnitude` (remove signs)
 
-    extra_parts: additional parts of the section by campaign name
+    None if the paper's file has no run with the campaign's name.
     """
-
-    path: Path
-    extra_parts: Mapping[str, Part] = field(default_factory=dict)
-
-    def __call__(self, subject: Subject) -> Section | None:
-        """Create the section; None if the paper's file has no run with the campaign's name."""
-        facts = {fact["campaign"]: fact for fact in read_paper(self.path)["facts"]}.get(subject.run.name)
-        if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
-            return None
-        data: dict[str, Any] = {
-            row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_simulated_value(subject.frame, row)}
-            for row in facts["rows"]
-        }
-        grid = Grid(["", "Paper", "Ours"], [[name, *fact.values()] for name, fact in data.items()])
-        blocks = [Block(grid=grid, note=f"{_VALUES_NOTE} {facts.get('note', '')}".strip())]
-        if subject.run.name in self.extra_parts:
-            extra_blocks, extra_data = self.extra_parts[subject.run.name].draw(subject.frame, subject, "paper")
-            blocks += extra_blocks
-            data |= extra_data
-        return Section("paper", "Paper comparison", facts["title"], blocks, data)
+    facts = {fact["campaign"]: fact for fact in read_paper(path)["facts"]}.get(subject.run.name)
+    if facts is None or not any(row["column"] in subject.frame for row in facts["rows"]):
+        return None
+    data = {
+        row["name"]: {"paper": row.get("paper", NOTHING), "ours": format_simulated_value(subject.frame, row)}
+        for row in facts["rows"]
+    }
+    grid = Grid(["", "Paper", "Ours"], [[name, *fact.values()] for name, fact in data.items()])
+    block = Block(grid=grid, note=f"{_VALUES_NOTE} {facts.get('note', '')}".strip(), data=data)
+    return create_section("paper", "Paper comparison", facts["title"], block, *extra_blocks)
 
 
 _VALUES_NOTE = (
@@ -65,7 +53,7 @@ _VALUES_NOTE = (
 
 
 def format_simulated_value(frame: Rows, row: Mapping[str, Any]) -> str:
-    """Format Marsyard's value of a quantity of a paper; `row` is a row of `PaperFacts`."""
+    """Format Marsyard's value of a quantity of a paper; `row` is a row of `paper_section`."""
     rows, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":
         return fraction_text(flag_fraction(rows, column)) if column in rows else NOTHING

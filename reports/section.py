@@ -202,13 +202,19 @@ class Subject:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a section: heading, text, figures, table, note; all are optional."""
+    """A block of a section: heading, text, figures, table, note, and its numbers in `report.json`; all are optional."""
 
     heading: str = ""
     text: str = ""
     figures: Sequence[SvgFigure] = ()
     grid: Grid | None = None
     note: str = ""
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether the page shows nothing of the block."""
+        return not (self.heading or self.text or self.figures or self.grid or self.note)
 
 
 @dataclass(frozen=True)
@@ -228,3 +234,16 @@ class Section:
 
 
 SectionMaker = Callable[[Subject], Section | None]
+
+
+def create_section(key: str, name: str, title: str, *blocks: Block | None) -> Section | None:
+    """Create a section of the blocks that exist, with their data; None if no block has a content."""
+    known_blocks = [block for block in blocks if block is not None]
+    contents = [block for block in known_blocks if not block.is_empty]
+    data = {name: value for block in known_blocks for name, value in block.data.items()}
+    return Section(key, name, title, contents, data) if contents else None
+
+
+def has_values(frame: pd.DataFrame, *columns: str) -> bool:
+    """Whether all columns exist and contain a value."""
+    return all(name in frame and not frame[name].isna().all() for name in columns)

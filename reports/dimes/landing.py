@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from marsyard.reports import rates, section_kinds
+from marsyard.reports import rates
+from marsyard.reports.blocks import Rows
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
@@ -28,7 +29,7 @@ def landing_rows(subject: Subject) -> pd.DataFrame | None:
     return landings if len(landings) else None
 
 
-def landing_fractions(landings: section_kinds.Rows) -> dict[str, rates.CaseFraction]:
+def landing_fractions(landings: Rows) -> dict[str, rates.CaseFraction]:
     """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
     change = numbers(landings, SPEED_CORRECTED) - numbers(landings, SPEED_UNCORRECTED)
     fractions = {
@@ -66,7 +67,7 @@ _LANDING_NOTE = (
 )
 
 
-def create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
+def create_speed_block(landings: Rows, subject: Subject) -> Block:
     """Create the table of touchdown speeds with and without steering: mean, quantiles, fractions above speeds."""
     columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
     groups = rates.terrain_groups(landings)
@@ -103,7 +104,7 @@ def create_speed_blocks(landings: section_kinds.Rows, subject: Subject, key: str
         landings=len(landings), **_landing_model(subject),
     )  # fmt: skip
     grid = Grid(["", "With steering", "Without steering"], kept_rows)
-    return [Block(heading="Speeds with and without steering", grid=grid, note=note)], data
+    return Block(heading="Speeds with and without steering", grid=grid, note=note, data=data)
 
 
 def omit_empty_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Sequence[str]], str]:

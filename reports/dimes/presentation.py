@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.reports import presentation
 from marsyard.reports.dimes import case_figures as figures
-from marsyard.reports.dimes.sections import FIRING, LANDING, field_test_section, sensitivity_section
+from marsyard.reports.dimes.sections import field_test_section, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.presentation import (
     CaseKind,
     CaseView,
@@ -247,7 +247,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 DIMES = Presentation(
     cases=(STREAM_CASE, DIMES_CASE),
-    sections=(FIRING, LANDING, sensitivity_section),
+    sections=(ignition_section, landing_section, sensitivity_section),
     outcomes=(VelocityOutcome,),
     explain=explain,
 )

@@ -17,11 +17,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from scipy import stats
 
-from marsyard.reports import rates, section_kinds
+from marsyard.reports import rates
+from marsyard.reports.blocks import Quantity, Rows, distribution_block, quantile_block, rate_block
 from marsyard.reports.dimes.landing import (
     SPEED_CORRECTED,
     SPEED_UNCORRECTED,
-    create_speed_blocks,
+    create_speed_block,
     landing_fractions,
     landing_rows,
     omit_empty_rows,
@@ -39,6 +40,8 @@ from marsyard.reports.section import (
     Subject,
     SvgFigure,
     build_grid,
+    create_section,
+    has_values,
     in_page_style,
     new_axes,
     svg_figure,
@@ -178,7 +181,7 @@ def scatter_figures(subject: Subject) -> list[SvgFigure]:
 
 
 @in_page_style
-def _draw_scatter(rows: section_kinds.Rows, components: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
+def _draw_scatter(rows: Rows, components: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for index, run in enumerate(runs):
@@ -202,58 +205,61 @@ _FIRING_NOTE = (
 )
 
 
-def _create_ignition_blocks(frame: section_kinds.Rows, subject: Subject, key: str) -> section_kinds.BlocksAndData:
-    """Create the table of statistics of the error at ignition."""
+def ignition_section(subject: Subject) -> Section | None:
+    """Create the section on the error of the propagated velocity at thruster ignition, at a height near 100 m.
+
+    Section I of the paper. None without the error, or if it is the page's metric.
+    """
+    frame = subject.frame
+    if subject.metric == _FIRING or not has_values(frame, _FIRING):
+        return None
     summaries = error_summaries(frame, _FIRING)
     rows, too_few_cases = omit_empty_rows(statistics_rows([summary for _, summary in summaries]))
     grid = Grid(["", *(name for name, _ in summaries)], rows)
     data = {name: asdict(summary) for name, summary in summaries}
-    return [Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}")], data
-
-
-#: Error of the velocity that the inertial unit propagates to thruster ignition at a height near 100 m (section I).
-FIRING = section_kinds.SectionDeclaration(
-    "firing",
-    "Ignition",
-    "Velocity error at thruster ignition",
-    rows=lambda subject: None if subject.metric == _FIRING else subject.frame,
-    requires=(_FIRING,),
-    parts=(
-        section_kinds.CustomBlocks(_create_ignition_blocks),
-        section_kinds.Quantiles(
-            [section_kinds.Quantity("firing_after_s")],
+    return create_section(
+        "firing",
+        "Ignition",
+        "Velocity error at thruster ignition",
+        Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}", data=data),
+        quantile_block(
+            frame,
+            [Quantity("firing_after_s")],
             {"Minimum": 0.0, "Median": 0.5, "Maximum": 1.0},
-            heading="Time available to compute the velocity",
+            "Time available to compute the velocity",
         ),
-    ),
-)
+    )
 
-#: Horizontal speed at touchdown with and without steering by the estimated velocity.
-LANDING = section_kinds.SectionDeclaration(
-    "landing",
-    "Landing",
-    "Horizontal speed at touchdown",
-    rows=landing_rows,
-    parts=(
-        section_kinds.Distribution(
-            [
-                section_kinds.Quantity(SPEED_CORRECTED, "with steering"),
-                section_kinds.Quantity(SPEED_UNCORRECTED, "without steering"),
-            ],
+
+def landing_section(subject: Subject) -> Section | None:
+    """Create the section on the horizontal speed at touchdown with and without steering by the estimated velocity."""
+    landings = landing_rows(subject)
+    if landings is None:
+        return None
+    return create_section(
+        "landing",
+        "Landing",
+        "Horizontal speed at touchdown",
+        distribution_block(
+            "landing",
+            {
+                "with steering": rates.finite_values(landings, SPEED_CORRECTED),
+                "without steering": rates.finite_values(landings, SPEED_UNCORRECTED),
+            },
             ("horizontal speed at touchdown (m/s)", "fraction of landings above this speed"),
             "The same landings with steering by the reported velocity, and without. The lower curve is better.",
             complementary=True,
         ),
-        section_kinds.RateTable(
-            landing_fractions,
-            cases="Landings",
-            heading="Effect of steering",
-            note="The intervals are two-sided Clopper-Pearson intervals, corrected for shared terrains.",
+        rate_block(
+            landing_fractions(landings),
+            "Landings",
+            "Effect of steering",
+            "The intervals are two-sided Clopper-Pearson intervals, corrected for shared terrains.",
             data="fractions",
         ),
-        section_kinds.CustomBlocks(create_speed_blocks),
-    ),
-)
+        create_speed_block(landings, subject),
+    )
+
 
 #: Conditions that the paper compares (all of them must vary), and additional conditions.
 PAPER_CONDITIONS = ("descent_rate_m_s", "altitude_1_m", "attitude_rate_max_deg_s")

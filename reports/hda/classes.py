@@ -16,11 +16,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from marsyard.reports import section
+from marsyard.reports.blocks import Rows
 from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, drop_empty_columns, landing_rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
 from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
-from marsyard.reports.section_kinds import BlocksAndData, Rows
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, numbers, percent
 from marsyard.scenarios.landing.images import CLASS_BOUNDS, CLASS_NAMES
 
@@ -98,11 +98,11 @@ def count_hazard_classes(frame: Rows) -> list[HazardClass]:
     return classes
 
 
-def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
+def create_class_blocks(frame: Rows) -> list[Block]:
     """Create figure and tables of missed hazards by size, and of rates of footprints; nothing without the counts."""
     classes = count_hazard_classes(frame)
     if not classes:
-        return [], {}
+        return []
     n_safe_rightly = numbers(frame, "footprints_called_safe") - numbers(frame, "footprints_called_safe_unsafe")
     rate_rows = frame.assign(footprints_called_safe_rightly=n_safe_rightly)
     rates = {name: pooled_rate(rate_rows, *columns) for name, columns in RATES.items()}
@@ -126,12 +126,14 @@ def create_class_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndDat
     figures = []
     if any(item.called_safe.hits or item.unflagged.hits for item in hazards):
         caption = "Bars are the intervals of the table. There is no bar if the rate is 0."
-        figures.append(section.svg_figure(class_figure(hazards), key, caption))
-    class_blocks = [Block(heading="Missed hazards by size", figures=figures, grid=class_grid)] if hazards else []
-    rate_block = Block(heading="Safe footprints and large hazards", grid=rate_grid, note=f"{_CLASS_NOTE} {_RATE_NOTE}")
-    blocks = [*class_blocks, rate_block]
-    rates_data = {name: asdict(item) for name, item in rates.items()}
-    return blocks, {"rates": rates_data, "classes": [asdict(item) for item in classes]}
+        figures.append(section.svg_figure(class_figure(hazards), "classes", caption))
+    blocks = [Block(heading="Missed hazards by size", figures=figures, grid=class_grid)] if hazards else []
+    data = {
+        "rates": {name: asdict(item) for name, item in rates.items()},
+        "classes": [asdict(item) for item in classes],
+    }
+    heading, note = "Safe footprints and large hazards", f"{_CLASS_NOTE} {_RATE_NOTE}"
+    return [*blocks, Block(heading=heading, grid=rate_grid, note=note, data=data)]
 
 
 @in_page_style

@@ -11,25 +11,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from marsyard.reports import rates, section_kinds
-from marsyard.reports.hda.sections import (
-    INTERVAL_NOTE,
-    MIN_CURVE_VALUES,
-    PAPER,
-    draw_distribution,
-    drop_empty_columns,
-    landing_rows,
-)
+from marsyard.reports import rates
+from marsyard.reports.blocks import Quantity, collect_values, flag_rate, rate_block
+from marsyard.reports.figures import cumulative_figure
+from marsyard.reports.hda.sections import INTERVAL_NOTE, MIN_CURVE_VALUES, PAPER, drop_empty_columns, landing_rows
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
 from marsyard.reports.statistics.samples import mean_interval
 from marsyard.reports.wording import NOTHING, count, format_fraction, interval, number, numbers
 
 #: Three measures of the distance from touchdown to site.
 TOUCHDOWN_ERRORS = (
-    section_kinds.Quantity("touchdown_error_gps_m", "averaged GPS, as in the paper"),
-    section_kinds.Quantity("touchdown_error_m", "true touchdown"),
-    section_kinds.Quantity("touchdown_error_estimated_m", "navigation filter"),
+    Quantity("touchdown_error_gps_m", "averaged GPS, as in the paper"),
+    Quantity("touchdown_error_m", "true touchdown"),
+    Quantity("touchdown_error_estimated_m", "navigation filter"),
 )
 _DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
 _TOUCHDOWN_NOTE = (
@@ -42,23 +37,18 @@ _TOUCHDOWN_NOTE = (
 )
 
 
-def _landed_rows(subject: Subject) -> pd.DataFrame | None:
-    frame = landing_rows(subject)
-    return None if frame is None else frame[rates.flag_mask(frame, "landed")]
-
-
-def _create_error_blocks(landings: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
-    """Create the curves of touchdown errors; nothing for few landings."""
-    errors = {measure.title: rates.finite_values(landings, measure.column) for measure in TOUCHDOWN_ERRORS}
+def _create_error_block(landings: pd.DataFrame) -> Block | None:
+    """Create the curves of touchdown errors; None for few landings."""
+    errors = collect_values(landings, TOUCHDOWN_ERRORS)
     if max(values.size for values in errors.values()) < MIN_CURVE_VALUES:
-        return [], {}
+        return None
     runs = {"paper, runs 1, 3 and 4": [run["error_m"] for run in PAPER["landings"]]}
     labels = ("distance from touchdown to site (m)", "fraction of landings")
-    figure = draw_distribution(errors, labels, limits=runs)
-    return [Block(figures=[svg_figure(figure, key, "Fraction of landings up to each distance.")])], {}
+    figure = cumulative_figure(errors, labels, limits=runs)
+    return Block(figures=[svg_figure(figure, "touchdown", "Fraction of landings up to each distance.")])
 
 
-def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
+def _create_table_2_block(landings: pd.DataFrame) -> Block:
     """Create the errors of Table II: the paper's runs and their mean, and the landings by `TOUCHDOWN_ERRORS`."""
     runs: Sequence[Mapping[str, float]] = PAPER["landings"]
     columns = ("error_m", "north_m", "east_m")
@@ -94,55 +84,33 @@ def _create_table_2_blocks(landings: pd.DataFrame, subject: Subject, key: str) -
         "touchdown_safe": safe_fraction,
         "paper_m": {str(run["run"]): run["error_m"] for run in runs},
     }
-    return [
-        Block(heading="Distances as in Table II", grid=drop_empty_columns(Grid(head, rows)), note=_TOUCHDOWN_NOTE)
-    ], data
+    grid = drop_empty_columns(Grid(head, rows))
+    return Block(heading="Distances as in Table II", grid=grid, note=_TOUCHDOWN_NOTE, data=data)
 
 
-def _safe_at_apriori_site(landings: pd.DataFrame) -> rates.CaseFraction:
-    rows = landings[~rates.flag_mask(landings, "site_reported")]
-    return rates.fraction_of(rates.flag_mask(rows, "touchdown_safe"), rows)
-
-
-TOUCHDOWN = section_kinds.SectionDeclaration(
-    "touchdown",
-    "Touchdown",
-    "Distance from touchdown to site, compared with Table II of the paper",
-    rows=_landed_rows,
-    requires=("touchdown_error_gps_m", "touchdown_error_m"),
-    parts=(
-        section_kinds.CustomBlocks(_create_error_blocks),
-        section_kinds.CustomBlocks(_create_table_2_blocks),
-        section_kinds.RateTable(
-            (
-                section_kinds.Rate(
-                    "touchdown",
-                    "true touchdown on safe ground, all landings",
-                    section_kinds.flag_rate("touchdown_safe"),
-                ),
-                section_kinds.Rate(
-                    "touchdown_reported",
-                    "true touchdown on safe ground, landings at a reported site",
-                    section_kinds.flag_rate("touchdown_safe", "site_reported"),
-                ),
-                section_kinds.Rate(
-                    "touchdown_apriori",
-                    "true touchdown on safe ground, landings at the a-priori site",
-                    _safe_at_apriori_site,
-                ),
-                section_kinds.Rate(
-                    "site",
-                    "site of the landing (reported or a-priori) is truly safe",
-                    section_kinds.flag_rate("descent_target_safe"),
-                ),
-            ),
-            cases="Landings",
-            heading="Safety of the ground at touchdown",
-            note=INTERVAL_NOTE,
-            data="ground",
+def touchdown_section(subject: Subject) -> Section | None:
+    """Compare the distance from touchdown to site with Table II; None without touchdown errors."""
+    frame = landing_rows(subject)
+    landings = None if frame is None else frame[rates.flag_mask(frame, "landed")]
+    if landings is None or not has_values(landings, "touchdown_error_gps_m", "touchdown_error_m"):
+        return None
+    at_apriori_site = landings[~rates.flag_mask(landings, "site_reported")]
+    ground = {
+        "true touchdown on safe ground, all landings": flag_rate("touchdown_safe")(landings),
+        "true touchdown on safe ground, landings at a reported site": flag_rate("touchdown_safe", "site_reported")(
+            landings
         ),
-    ),
-)
+        "true touchdown on safe ground, landings at the a-priori site": flag_rate("touchdown_safe")(at_apriori_site),
+        "site of the landing (reported or a-priori) is truly safe": flag_rate("descent_target_safe")(landings),
+    }
+    return create_section(
+        "touchdown",
+        "Touchdown",
+        "Distance from touchdown to site, compared with Table II of the paper",
+        _create_error_block(landings),
+        _create_table_2_block(landings),
+        rate_block(ground, "Landings", "Safety of the ground at touchdown", INTERVAL_NOTE, "ground"),
+    )
 
 
 def run_times_section(subject: Subject) -> Section | None:

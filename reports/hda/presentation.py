@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from marsyard.algorithms.interface import SiteOutcome
+from marsyard.reports.blocks import rate_block
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import (
@@ -22,10 +23,9 @@ from marsyard.reports.hda.case_figures import (
     write_hda_figures,
 )
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
-from marsyard.reports.hda.paper_tables import TOUCHDOWN, run_times_section
+from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
 from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, is_true, to_float
-from marsyard.reports.section import draw_images, svg_figure
-from marsyard.reports.section_kinds import CustomBlocks, RateTable, SectionDeclaration
+from marsyard.reports.section import Section, Subject, create_section, draw_images, svg_figure
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
@@ -132,28 +132,31 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
     return None
 
 
-SITES = SectionDeclaration(
-    "sites",
-    "Sites",
-    "Sites and hazards compared with the ground truth",
-    rows=sections.landing_rows,
-    parts=(
-        CustomBlocks(sections.create_outcome_blocks),
-        RateTable(
-            sections.site_fractions,
-            cases="Flights",
-            heading="Fractions of correct answers",
-            note=sections.INTERVAL_NOTE,
-            data="fractions",
-        ),
-        CustomBlocks(sections.create_distance_blocks),
-        CustomBlocks(create_class_blocks),
-    ),
-)
-_SECTIONS = (sections.THRESHOLD, sections.FAULTS, limits_section, sections.MAP_ERRORS, TOUCHDOWN, SITES)
+def sites_section(subject: Subject) -> Section | None:
+    """Compare sites and hazards with the ground truth; None if the rows are not those of landings."""
+    frame = sections.landing_rows(subject)
+    if frame is None:
+        return None
+    fractions = rate_block(
+        sections.site_fractions(frame), "Flights", "Fractions of correct answers", sections.INTERVAL_NOTE, "fractions"
+    )
+    return create_section(
+        "sites",
+        "Sites",
+        "Sites and hazards compared with the ground truth",
+        sections.create_outcome_block(frame),
+        fractions,
+        sections.create_distance_block(frame),
+        *create_class_blocks(frame),
+    )
+
+
 HDA = Presentation(
     cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, _LEGEND),),
-    sections=(*_SECTIONS, run_times_section),
+    sections=(
+        sections.threshold_section, sections.faults_section, limits_section, sections.map_section, touchdown_section,
+        sites_section, run_times_section,
+    ),
     outcomes=(SiteOutcome,),
     explain=explain,
-)
+)  # fmt: skip

@@ -6,22 +6,29 @@ Figures and "the paper" refer to Johnson, Montgomery & Matthies, "Vision Guided 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from marsyard.reports import rates, section_kinds
-from marsyard.reports.figures import cumulative_figure, scatter_panels
+from marsyard.reports import rates
+from marsyard.reports.blocks import (
+    OutcomesBySize,
+    Quantity,
+    Rate,
+    condition_blocks,
+    flag_rate,
+    pooled_fraction,
+    quantile_block,
+    scatter_block,
+)
+from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Subject, in_page_style, svg_figure
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
 from marsyard.reports.statistics.drivers import MIN_CASES
 from marsyard.reports.statistics.samples import is_interpolated, quantile_bounds
 from marsyard.reports.wording import NOTHING, count, format_fraction, number, numbers
@@ -55,84 +62,58 @@ def drop_empty_columns(grid: Grid) -> Grid:
     )
 
 
-@in_page_style
-def draw_distribution(
-    curves: Mapping[str, Float[np.ndarray, " n"]],
-    labels: tuple[str, str],
-    *,
-    complementary: bool = False,
-    limits: Mapping[str, Sequence[float]] | None = None,
-) -> Figure:
-    """Draw cumulative curves as `cumulative_figure`, with the legend below the axes."""
-    figure = cumulative_figure(curves, labels, complementary=complementary, limits=limits)
-    figure.axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
-    return figure
-
-
-def _threshold_rows(subject: Subject) -> pd.DataFrame | None:
-    """Return the rows of landing cases with the additional column `footprints_not_safe`; None for other rows.
-
-    The column is the number of footprints that are not truly safe.
-    """
-    frame = landing_rows(subject)
-    if frame is None:
-        return None
-    n_unsafe = numbers(frame, "footprints") - numbers(frame, "footprints_truly_safe")
-    return frame.assign(footprints_not_safe=n_unsafe)
-
-
 def _lander_limit_m(subject: Subject) -> float:
     """Return the roughness limit of the campaign's lander, or the default limit."""
     limit = subject.run.parameter("lander", "max_roughness_m")
     return float(limit) if isinstance(limit, int | float) else LanderParameters().max_roughness_m
 
 
-#: False alarms and misses against the roughness threshold, to check the paper's remark on false positives.
-THRESHOLD = section_kinds.SectionDeclaration(
-    "threshold",
-    "Threshold",
-    "False alarms and misses by roughness threshold",
-    rows=_threshold_rows,
-    requires=("false_alarms",),
-    parts=(
-        section_kinds.RateByCondition(
-            by=section_kinds.Quantity("max_roughness_m", "Roughness threshold (m)"),
-            rates=(
-                section_kinds.Rate(
-                    "false_alarms",
-                    "False alarms",
-                    section_kinds.pooled_fraction("false_alarms", "footprints_truly_safe"),
-                ),
-                section_kinds.Rate("missed", "Missed", section_kinds.pooled_fraction("missed", "footprints_not_safe")),
-                section_kinds.Rate(
-                    "called_safe_unsafe",
-                    "Classified as safe, not truly safe",
-                    section_kinds.pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
-                ),
-                section_kinds.Rate(
-                    "site_reported",
-                    "Site reported, if a wide safe site exists",
-                    section_kinds.flag_rate("site_reported", "wide_site_exists"),
-                    in_figure=False,
-                ),
-                section_kinds.Rate(
-                    "safe", "Sites truly safe", section_kinds.flag_rate("site_safe", "site_reported"), in_figure=False
-                ),
-            ),
-            cases="Flights",
-            ylabel="fraction of footprints",
-            text="According to the paper, both results of its Fig. 7 contain false positive hazards. The causes are a "
-            "low roughness threshold and noise of the map. A higher threshold would remove them. The paper gives no "
-            "numbers.",
-            note="A footprint is the circle that the lander covers around a grid point. A hazard is detected if the "
-            "map of slope or roughness exceeds the threshold in at least one cell of the footprint. False "
-            "alarms: fraction of the truly safe footprints with a detected hazard. Missed: fraction of the "
-            "unsafe footprints without a detected hazard.",
-            caption=f"Bars are {format_fraction(CONFIDENCE)} intervals.",
-            limit=("the lander's limit", _lander_limit_m),
-            data="thresholds",
-        ),
+def threshold_section(subject: Subject) -> Section | None:
+    """Create the section on false alarms and misses by threshold, to check the paper's remark on false positives."""
+    frame = landing_rows(subject)
+    if frame is None or not has_values(frame, "false_alarms"):
+        return None
+    n_unsafe = numbers(frame, "footprints") - numbers(frame, "footprints_truly_safe")
+    blocks = condition_blocks(
+        frame.assign(footprints_not_safe=n_unsafe),
+        "threshold",
+        Quantity("max_roughness_m", "Roughness threshold (m)"),
+        _THRESHOLD_RATES,
+        cases="Flights",
+        ylabel="fraction of footprints",
+        text=_THRESHOLD_TEXT,
+        note=_THRESHOLD_NOTE,
+        caption=f"Bars are {format_fraction(CONFIDENCE)} intervals.",
+        limit=("the lander's limit", _lander_limit_m(subject)),
+        data="thresholds",
+    )
+    return create_section("threshold", "Threshold", "False alarms and misses by roughness threshold", *blocks)
+
+
+_THRESHOLD_RATES = (
+    Rate("false_alarms", "False alarms", pooled_fraction("false_alarms", "footprints_truly_safe")),
+    Rate("missed", "Missed", pooled_fraction("missed", "footprints_not_safe")),
+    Rate(
+        "called_safe_unsafe",
+        "Classified as safe, not truly safe",
+        pooled_fraction("footprints_called_safe_unsafe", "footprints_called_safe"),
     ),
+    Rate(
+        "site_reported",
+        "Site reported, if a wide safe site exists",
+        flag_rate("site_reported", "wide_site_exists"),
+        in_figure=False,
+    ),
+    Rate("safe", "Sites truly safe", flag_rate("site_safe", "site_reported"), in_figure=False),
+)
+_THRESHOLD_TEXT = (
+    "According to the paper, both results of its Fig. 7 contain false positive hazards. The causes are a low roughness "
+    "threshold and noise of the map. A higher threshold would remove them. The paper gives no numbers."
+)
+_THRESHOLD_NOTE = (
+    "A footprint is the circle that the lander covers around a grid point. A hazard is detected if the map of slope or "
+    "roughness exceeds the threshold in at least one cell of the footprint. False alarms: fraction of the truly safe "
+    "footprints with a detected hazard. Missed: fraction of the unsafe footprints without a detected hazard."
 )
 
 
@@ -173,8 +154,8 @@ def _two_decimals(value: float) -> str:
     return NOTHING if math.isnan(value) else f"{value:.2f}"
 
 
-FAULT_OUTCOMES = section_kinds.OutcomesBySize(
-    outcomes=lambda frame, _: classify_answers(frame),
+FAULT_OUTCOMES = OutcomesBySize(
+    outcomes=classify_answers,
     styles={
         "safe": ("safe site", "full"),
         "refused": ("no safe site", "hatched"),
@@ -187,15 +168,21 @@ FAULT_OUTCOMES = section_kinds.OutcomesBySize(
         ("Touchdown error (m)", "off_m", lambda rows: _median(rows, "touchdown_error_m"), _two_decimals),
         ("Sink rate (m/s)", "sink_m_s", lambda rows: _median(rows, "touchdown_sink_m_s"), _two_decimals),
     ),
-    caption="Fraction of flights by answer, for each fault and size.",
-    note="Safe site, unsafe site: a site is reported, and it is truly safe or not. No safe site: the algorithm gives "
+)
+_FAULT_NOTE = (
+    "Safe site, unsafe site: a site is reported, and it is truly safe or not. No safe site: the algorithm gives "
     "this answer; it can be correct. Not converged: the algorithm reports this, and the helicopter descends to the "
     f"a-priori site. The interval is at {format_fraction(CONFIDENCE)} confidence. Touchdown error: median distance of "
-    "the true touchdown from the site. Sink rate: median vertical speed at touchdown.",
+    "the true touchdown from the site. Sink rate: median vertical speed at touchdown."
 )
-FAULTS = section_kinds.SectionDeclaration(
-    "landing-faults", "Faults", "Faults by size", (FAULT_OUTCOMES,), rows=landing_rows
-)
+
+
+def faults_section(subject: Subject) -> Section | None:
+    """Create the section on answers by fault and size; None without faults."""
+    frame = landing_rows(subject)
+    caption = "Fraction of flights by answer, for each fault and size."
+    blocks = [] if frame is None else FAULT_OUTCOMES.blocks(frame, "landingfaults", caption, _FAULT_NOTE)
+    return create_section("landing-faults", "Faults", "Faults by size", *blocks)
 
 
 def map_rows(subject: Subject) -> pd.DataFrame | None:
@@ -216,17 +203,12 @@ def map_rows(subject: Subject) -> pd.DataFrame | None:
 
 
 #: Errors of the map; columns of `map_rows`.
-_MAP_ERRORS = (
-    section_kinds.Quantity("rms_fraction", "elevation error (% of height)", 100.0),
-    section_kinds.Quantity("noise_fraction", "elevation noise (% of height)", 100.0),
-    section_kinds.Quantity("slope_error_rms_deg", "slope error (deg)"),
+MAP_ERRORS = (
+    Quantity("rms_fraction", "elevation error (% of height)", 100.0),
+    Quantity("noise_fraction", "elevation noise (% of height)", 100.0),
+    Quantity("slope_error_rms_deg", "slope error (deg)"),
 )
-_MAP_QUANTILES = section_kinds.Quantiles(
-    _MAP_ERRORS,
-    {"Minimum": 0.0, "5 %": 0.05, "Median": 0.5, "95 %": 0.95, "Maximum": 1.0},
-    heading="Errors of the maps",
-    data="maps",
-)
+_QUANTILES = {"Minimum": 0.0, "5 %": 0.05, "Median": 0.5, "95 %": 0.95, "Maximum": 1.0}
 _MAP_NOTE = (
     "{maps}: one value per map. Elevation error: RMS difference between the map and the true mean height of each cell. "
     "It includes errors that shift, tilt or scale the whole map. Elevation noise: robust standard deviation "
@@ -234,77 +216,37 @@ _MAP_NOTE = (
     "error: RMS difference between the slope in the map and the true slope of a lander footprint. Height: height above "
     "ground at the first image."
 )
-#: Dependence of the map errors on conditions.
-MAP_EFFECTS = section_kinds.Scatter(
-    x=(
-        section_kinds.Quantity("baseline_fraction", "baseline / height"),
-        section_kinds.Quantity("texture", "texture contrast / nominal contrast"),
-        section_kinds.Quantity("grid_px", "grid spacing (px)"),
-        section_kinds.Quantity("level_error_deg", "error of the estimated vertical (deg)"),
-        section_kinds.Quantity("altimeter_fraction", "|altimeter error| (% of range)", 100.0),
-    ),
-    y=_MAP_ERRORS,
-    caption="Each dot is a map. The vertical axes are logarithmic.",
-    logarithmic=True,
+#: Conditions that may affect the map errors.
+MAP_CONDITIONS = (
+    Quantity("baseline_fraction", "baseline / height"),
+    Quantity("texture", "texture contrast / nominal contrast"),
+    Quantity("grid_px", "grid spacing (px)"),
+    Quantity("level_error_deg", "error of the estimated vertical (deg)"),
+    Quantity("altimeter_fraction", "|altimeter error| (% of range)", 100.0),
 )
 
 
-def _create_map_error_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
-    """Create the table of map errors, without quantiles that need more maps."""
-    blocks, data = _MAP_QUANTILES.draw(frame, subject, key)
-    note = _MAP_NOTE.format(maps=count(len(frame), "map"))
-    return [
-        replace(block, grid=None if block.grid is None else drop_empty_columns(block.grid), note=note)
-        for block in blocks
-    ], data
-
-
-def _create_map_effect_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
-    """Create panels and rank correlations of `MAP_EFFECTS`; only dots for fewer than `MIN_CASES` maps."""
-    blocks, data = MAP_EFFECTS.draw(frame, subject, key)
-    if not blocks:
-        return [], {}
-    caption, grid = MAP_EFFECTS.caption, blocks[0].grid
+def map_section(subject: Subject) -> Section | None:
+    """Create the section on map errors, without quantiles and correlations that need more maps."""
+    frame = map_rows(subject)
+    if frame is None:
+        return None
+    errors = quantile_block(
+        frame, MAP_ERRORS, _QUANTILES, "Errors of the maps", _MAP_NOTE.format(maps=count(len(frame), "map"))
+    )
+    if errors is not None and errors.grid is not None:
+        errors = replace(errors, grid=drop_empty_columns(errors.grid), data={"maps": len(frame)})
+    caption = "Each dot is a map. The vertical axes are logarithmic."
     note = f"Medians and rank correlations need {MIN_CASES} maps."
-    if len(frame) >= MIN_CASES:
-        caption = f"{caption} Lines are medians of bins with equal numbers of maps."
+    has_statistics = len(frame) >= MIN_CASES
+    if has_statistics:
+        caption += " Lines are medians of bins with equal numbers of maps."
         note = f"Spearman's rank correlations, with their intervals at {format_fraction(CONFIDENCE)} confidence."
-    else:
-        grid = None
-    figure = svg_figure(map_effect_figure(frame, data["effects"]), key, caption, wide=True)
     note += " Baseline: horizontal distance between the cameras of both images."
-    return [Block(heading="Dependence on conditions", figures=[figure], grid=grid, note=note)], data
+    heading, style = "Dependence on conditions", {"logarithmic": True, "statistics": has_statistics}
+    effects = scatter_block(frame, "maperrors", MAP_CONDITIONS, MAP_ERRORS, caption, heading, note, **style)
+    return create_section("map-errors", "Map", "Errors of the elevation map", errors, effects)
 
-
-@in_page_style
-def map_effect_figure(frame: pd.DataFrame, effects: Sequence[Mapping[str, Any]]) -> Figure:
-    """Draw the map errors against the conditions; medians of bins for at least `MIN_CASES` maps."""
-    values = {quantity.title: quantity.values(frame) for quantity in (*MAP_EFFECTS.x, *MAP_EFFECTS.y)}
-    has_medians = len(frame) >= MIN_CASES
-    panels = {
-        (effect["driver"], effect["error"]): (
-            (values[effect["driver"]], values[effect["error"]]),
-            (effect["centres"], effect["medians"]) if has_medians else ((), ()),
-        )
-        for effect in effects
-    }
-    figure = scatter_panels(panels, logarithmic=True)
-    for axes in figure.axes:
-        # the unit has its own line, so that labels of adjacent panels do not overlap
-        axes.set_ylabel(axes.get_ylabel().replace(" (", "\n("))
-        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-    return figure
-
-
-MAP_ERRORS = section_kinds.SectionDeclaration(
-    "map-errors",
-    "Map",
-    "Errors of the elevation map",
-    rows=map_rows,
-    parts=(section_kinds.CustomBlocks(_create_map_error_blocks), section_kinds.CustomBlocks(_create_map_effect_blocks)),
-)
 
 #: Classes of the true ground that both images show, best first. All positions within one lander radius of a wide safe
 #: site are also safe.
@@ -350,7 +292,7 @@ def outcome_counts(frame: pd.DataFrame) -> dict[str, dict[str, int]]:
     }
 
 
-def create_outcome_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
+def create_outcome_block(frame: pd.DataFrame) -> Block:
     """Create the table of the outcomes of the search by class of the true ground."""
     counts = outcome_counts(frame)
     rows = [
@@ -364,7 +306,8 @@ def create_outcome_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> se
         "safe. Narrow: all other safe sites. If the algorithm does not converge, the helicopter descends to the "
         "a-priori site, which is set before the images are processed."
     )
-    return [Block(heading="Answers by ground truth", grid=Grid(head, rows), note=note)], {"outcomes": counts}
+    grid, data = Grid(head, rows), {"outcomes": counts}
+    return Block(heading="Answers by ground truth", grid=grid, note=note, data=data)
 
 
 def hazard_distances(frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
@@ -405,12 +348,12 @@ def _distance_text(distance_m: float) -> str:
     return "0" if distance_m == 0.0 else number(distance_m)
 
 
-def create_distance_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> section_kinds.BlocksAndData:
+def create_distance_block(frame: pd.DataFrame) -> Block | None:
     """Create table and curves of the distances to true hazards; no curves for few distances."""
     distances = hazard_distances(frame)
     grid = drop_empty_columns(distance_grid(distances))
     if not grid.rows:
-        return [], {}
+        return None
     all_values = np.concatenate([*distances.values()])
     edge_m = float(np.max(all_values[np.isfinite(all_values)], initial=0.0))
     figures = []
@@ -418,13 +361,13 @@ def create_distance_blocks(frame: pd.DataFrame, subject: Subject, key: str) -> s
         # infinite distances lie beyond the axis
         curves = {name: np.where(np.isinf(values), 2.0 * edge_m, values) for name, values in distances.items()}
         labels = ("distance to the nearest unsafe position (m)", "fraction above this distance")
-        figure = draw_distribution(curves, labels, complementary=True)
+        figure = cumulative_figure(curves, labels, complementary=True)
         figure.axes[0].set_xlim(0.0, 1.02 * edge_m)
-        figures.append(svg_figure(figure, key, "The drop at 0 is the fraction on unsafe ground."))
+        figures.append(svg_figure(figure, "distances", "The drop at 0 is the fraction on unsafe ground."))
     note = (
         "A position is unsafe if slope or roughness of the lander footprint around it exceeds the limit; the hazard "
         "itself can be at the edge of the footprint. The distance is 0 on unsafe ground. On safe ground, it is the "
         "distance to the nearest unsafe position of a grid over the ground in the first image (the area), or ∞ without "
         "such a position. Reported site: its true position. True touchdown: at the reported or at the a-priori site."
     )
-    return [Block(heading="Distance to true hazards", figures=figures, grid=grid, note=note)], {}
+    return Block(heading="Distance to true hazards", figures=figures, grid=grid, note=note)

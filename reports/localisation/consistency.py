@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 import numpy as np
 import pandas as pd
 from scipy import stats
 
 from marsyard.reports.rates import finite_values
-from marsyard.reports.section import Block, Grid, Subject
+from marsyard.reports.section import Block, Grid
 from marsyard.reports.wording import number
 
 #: Degrees of freedom: the components of the horizontal position.
@@ -19,13 +16,11 @@ _DEGREES_OF_FREEDOM = 2
 _PROBABILITY = 0.9
 
 
-def create_consistency_blocks(
-    frame: pd.DataFrame, _subject: Subject, _key: str
-) -> tuple[Sequence[Block], Mapping[str, Any]]:
+def create_consistency_block(frame: pd.DataFrame) -> Block | None:
     """Compare the normalised squared errors (NEES) with the chi-square distribution with two degrees of freedom."""
     nees = finite_values(frame, "position_nees")
     if nees.size == 0:
-        return [], {}
+        return None
     tail = 0.5 * (1.0 - _PROBABILITY)
     # the sum of n independent NEES has the chi-square distribution with 2 n degrees of freedom
     low, high = (float(stats.chi2.ppf(p, _DEGREES_OF_FREEDOM * nees.size)) / nees.size for p in (tail, 1.0 - tail))
@@ -41,6 +36,5 @@ def create_consistency_blocks(
         "is 2 for a correct covariance; larger values mean that the errors are larger than reported. The interval "
         "assumes independent descents."
     )
-    block = Block(heading="Consistency of the covariance", grid=Grid(["", ""], rows), note=note)
     data = {"nees": {"n": int(nees.size), "mean": float(nees.mean()), "lower": low, "upper": high, "inside": inside}}
-    return [block], data
+    return Block(heading="Consistency of the covariance", grid=Grid(["", ""], rows), note=note, data=data)

@@ -15,9 +15,9 @@ import pandas as pd
 from marsyard.algorithms.interface import TargetLoss
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
+from marsyard.reports.blocks import Rows, distribution_block
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Subject
-from marsyard.reports.section_kinds import BlocksAndData, CustomBlocks, Distribution, Rows, SectionDeclaration
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.wording import NOTHING, format_fraction, numbers
 from marsyard.scenarios.rover.stops import RunOutcome
@@ -73,12 +73,6 @@ def selectable_targets(frame: pd.DataFrame, face: bool = True) -> pd.DataFrame:
     return frame[rates.all_flags(frame, *names)]
 
 
-def goal_rows(subject: Subject) -> Rows | None:
-    """Select rows with selectable targets; None unless the tracker guides the rover to a goal."""
-    frame = subject.frame
-    return selectable_targets(frame) if is_closed_loop(frame) and "camera" in frame else None
-
-
 def _group_by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the name of each camera and its rows."""
     for name in sorted(runs["camera"].dropna().unique()):
@@ -125,7 +119,7 @@ def _errors_grid(cameras: Sequence[Mapping[str, Any]]) -> Grid:
     return Grid(["Camera", *columns], rows)
 
 
-def _create_camera_blocks(runs: Rows, subject: Subject, key: str) -> BlocksAndData:
+def _create_camera_blocks(runs: Rows) -> list[Block]:
     """Create the tables of rates and errors of each camera, and of the runs that lost the target."""
     cameras = summarize_cameras(runs)
     rows = [
@@ -134,15 +128,15 @@ def _create_camera_blocks(runs: Rows, subject: Subject, key: str) -> BlocksAndDa
         for name, rate in _RATES.items()
     ]
     run_grid = Grid(["Camera", "Result", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
-    blocks = [Block(heading="Runs at selectable targets", grid=run_grid, note=_RATES_NOTE)]
+    data = [row | {rate: vars(row[rate]) for rate in _RATES.values()} for row in cameras]
+    blocks = [Block("Runs at selectable targets", grid=run_grid, note=_RATES_NOTE, data={"cameras": data})]
     if any(row["completed"].hits for row in cameras):
         grid, note = _errors_grid(cameras), _describe_errors(cameras)
         blocks.append(Block(heading="Errors of the completed runs at the goal", grid=grid, note=note))
     loss_grid = losses_grid(runs)
     if loss_grid.rows:
         blocks.append(Block(heading="Runs that lost the target", grid=loss_grid, note=losses_note(runs)))
-    data = [row | {rate: vars(row[rate]) for rate in _RATES.values()} for row in cameras]
-    return blocks, {"cameras": data}
+    return blocks
 
 
 def pointing_error_cm(range_m: float) -> float:
@@ -210,24 +204,26 @@ def losses_note(frame: Rows) -> str:
     return " ".join([text, *meanings])
 
 
-GOAL = SectionDeclaration(
-    "goal",
-    "Goal",
-    "Target position error at the goal",
-    rows=goal_rows,
-    requires=("camera",),
-    parts=(
-        Distribution(
-            lambda runs: {
-                f"{camera} ({error.size:,})": error
-                for camera, camera_rows in _group_by_camera(runs)
-                if (error := rates.finite_values(camera_rows, "position_error_m", 100.0)).size
-            },
-            ("position error at the goal (cm)", "fraction of completed runs"),
-            "Completed runs at selectable targets; their number is in brackets. Red line: requirement of "
-            f"{100.0 * MAX_ERROR_M:g} cm.",
-            bound=100.0 * MAX_ERROR_M,
-        ),
-        CustomBlocks(_create_camera_blocks),
-    ),
-)
+def goal_section(subject: Subject) -> Section | None:
+    """Create the section on the position error at the goal; None unless the tracker guides the rover to a goal."""
+    if not is_closed_loop(subject.frame):
+        return None
+    runs = selectable_targets(subject.frame)
+    if not has_values(runs, "camera"):
+        return None
+    curves = {
+        f"{camera} ({error.size:,})": error
+        for camera, camera_rows in _group_by_camera(runs)
+        if (error := rates.finite_values(camera_rows, "position_error_m", 100.0)).size
+    }
+    distribution = distribution_block(
+        "goal",
+        curves,
+        ("position error at the goal (cm)", "fraction of completed runs"),
+        "Completed runs at selectable targets; their number is in brackets. Red line: requirement of "
+        f"{100.0 * MAX_ERROR_M:g} cm.",
+        bound=100.0 * MAX_ERROR_M,
+    )
+    return create_section(
+        "goal", "Goal", "Target position error at the goal", distribution, *_create_camera_blocks(runs)
+    )

@@ -18,7 +18,7 @@ from marsyard.reports.vtt.case_figures import (
     read_stops,
     write_vtt_figures,
 )
-from marsyard.reports.vtt.goal import GOAL
+from marsyard.reports.vtt.goal import goal_section
 from marsyard.reports.wording import NOTHING, label, number, percent
 from marsyard.scenarios.rover.stops import RunOutcome
 
@@ -117,7 +117,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 VTT = Presentation(
     cases=(CaseKind(is_vtt_case, view, write_vtt_figures, _LEGEND),),
-    first=(*sections.SECTIONS, GOAL),
+    first=(*sections.SECTIONS, goal_section),
     outcomes=(RunOutcome, HandOffOutcome),
     explain=explain,
 )

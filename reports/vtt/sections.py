@@ -19,11 +19,11 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports import rates
+from marsyard.reports.blocks import Rows
 from marsyard.reports.figures import RateLine, rate_figure
-from marsyard.reports.papers import PaperFacts, read_paper
+from marsyard.reports.papers import paper_section, read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
-from marsyard.reports.section_kinds import BlocksAndData, CustomBlocks, Rows
 from marsyard.reports.stored import table
 from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, losses_note, selectable_targets
 from marsyard.reports.vtt.table_1 import table_1_section
@@ -72,15 +72,14 @@ def table_4_grid(frame: Rows, legs: Sequence[Mapping[str, Any]]) -> Grid:
     return Grid(["Mode", "Updates, paper", "Updates, ours", "Minutes, paper", "Minutes, ours"], rows)
 
 
-def _create_mode_blocks(frame: Rows, subject: Subject, key: str) -> BlocksAndData:
-    if "update_1_leg" not in frame:
-        return [], {}
-    grid = table_4_grid(frame, read_legs(subject))
-    return [Block(heading="By operational mode", grid=grid, note=note_text("vtt.table_4"))], {}
+def single_run_section(subject: Subject) -> Section | None:
+    """Compare the paper's single runs with the campaigns that repeat them; None for other campaigns."""
+    blocks = []
+    if subject.run.name == CHECKOUT_3 and "update_1_leg" in subject.frame:
+        grid = table_4_grid(subject.frame, read_legs(subject))
+        blocks.append(Block(heading="By operational mode", grid=grid, note=note_text("vtt.table_4")))
+    return paper_section(subject, _PAPER_FILE, *blocks)
 
-
-#: Comparison of the paper's single runs with the campaigns that repeat them.
-SINGLE_RUNS = PaperFacts(_PAPER_FILE, extra_parts={CHECKOUT_3: CustomBlocks(_create_mode_blocks)})
 
 #: Quantities of an update in the table: heading, suffix of the column `update_<number>_<suffix>`, digits.
 QUANTITIES: tuple[tuple[str, str, int], ...] = (
@@ -395,4 +394,6 @@ def regression_section(subject: Subject) -> Section | None:
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
 
 
-SECTIONS = (table_1_section, SINGLE_RUNS, updates_section, steps_section, terrains_section, regression_section)
+SECTIONS = (
+    table_1_section, single_run_section, updates_section, steps_section, terrains_section, regression_section,
+)  # fmt: skip

@@ -21,9 +21,9 @@ from marsyard.algorithms.vtt.accuracy import (
     tracked_approach_error_m,
 )
 from marsyard.reports import rates
+from marsyard.reports.blocks import Rows
 from marsyard.reports.papers import read_paper
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.section_kinds import Rows
 from marsyard.reports.vtt.goal import is_closed_loop, pointing_error_cm, selectable_targets
 from marsyard.reports.wording import NOTHING, numbers
 

@@ -12,9 +12,9 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.common_sections import FAULT_OUTCOMES, answer_fractions, faults_section
+from marsyard.reports.common_sections import answer_fractions, fault_outcomes, faults_section
 from marsyard.reports.conditions import bin_conditions, conditions_section, terrain_variance
-from marsyard.reports.dimes.sections import FIRING, LANDING, estimate_effects, sensitivity_section
+from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
 
@@ -123,8 +123,8 @@ def test_variance_between_terrains_is_estimated() -> None:
 
 def test_firing_section_needs_the_firing_error(make_rows: Rows) -> None:
     frame = make_rows(30)
-    assert FIRING(make_subject(frame)) is None
-    section = FIRING(make_subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
+    assert ignition_section(make_subject(frame)) is None
+    section = ignition_section(make_subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
     assert find_cells(section, "mean")[1] == "0.500"
     assert find_cells(section, "time from the last image to ignition (s)")[1:] == ["18.00", "18.00", "18.00"]
 
@@ -139,7 +139,7 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
             METRIC: [1.0] * 10 + [np.nan] * 6 + [9.0] * 3 + [1.0] * 11,
         }
     )
-    rows = FAULT_OUTCOMES.records(frame, make_subject(frame))
+    rows = fault_outcomes(METRIC, 5.0).records(frame)
     assert [(row["fault"], row["n"], row["valid"], row["invalid"], row["wrong"]) for row in rows] == [
         ("none", 10, 10, 0, 0),
         ("dust", 10, 10, 0, 0),
@@ -215,7 +215,7 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
         {"touchdown_speed_corrected_m_s": corrected_m_s, "touchdown_speed_uncorrected_m_s": uncorrected_m_s}
     )
     frame.loc[100] = [np.nan, np.nan]  # crashed
-    section = LANDING(make_subject(frame))
+    section = landing_section(make_subject(frame))
     assert section is not None
     assert (section.data["landings"], section.data["reduced_fraction"], section.data["increased_fraction"]) == (
         100,
@@ -224,7 +224,7 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     )
     assert (section.data["largest_gain_m_s"], section.data["largest_loss_m_s"]) == pytest.approx((4.0, 2.0))
     assert find_cells(section, "faster than 20 m/s")[1:] == ["5.00 %", "25.00 %"]
-    assert LANDING(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
+    assert landing_section(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
 
 
 def test_page_and_json_contain_every_section(make_rows: Rows, make_run: MakeRun) -> None:

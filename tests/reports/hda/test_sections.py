@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from marsyard.reports.blocks import estimate_effects
 from marsyard.reports.campaign import write_report
 from marsyard.reports.hda.classes import (
     SizeResult,
@@ -18,20 +19,21 @@ from marsyard.reports.hda.classes import (
     find_knee,
     tracking_curves,
 )
-from marsyard.reports.hda.paper_tables import TOUCHDOWN, run_times_section
+from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
 from marsyard.reports.hda.sections import (
     FAULT_OUTCOMES,
-    FAULTS,
-    MAP_EFFECTS,
+    MAP_CONDITIONS,
     MAP_ERRORS,
     PAPER,
-    THRESHOLD,
     distance_grid,
     drop_empty_columns,
+    faults_section,
     hazard_distances,
     map_rows,
+    map_section,
     outcome_counts,
     site_fractions,
+    threshold_section,
 )
 from marsyard.reports.rates import PooledRate, pooled_rate
 from marsyard.reports.section import Subject
@@ -89,7 +91,7 @@ def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
 
 def test_touchdown_errors_are_compared_with_table_2() -> None:
     frame = landing_frame(200)
-    section = TOUCHDOWN(_make_subject(frame))
+    section = touchdown_section(_make_subject(frame))
     assert section is not None
     landings = frame[frame["landed"]]
     assert section.data["landings"] == len(landings)
@@ -97,7 +99,7 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
     # landings 1, 3 and 4 of Table 2
     assert section.data["paper_m"] == {"1": 1.21, "3": 1.20, "4": 0.89}
     assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
-    assert TOUCHDOWN(_make_subject(frame.assign(landed=False))) is None
+    assert touchdown_section(_make_subject(frame.assign(landed=False))) is None
 
 
 def test_reported_sites_are_scored_against_the_truth() -> None:
@@ -146,21 +148,20 @@ def test_distance_to_hazards_is_0_on_unsafe_ground() -> None:
 
 def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:
     frame = landing_frame(10)
-    blocks, data = create_class_blocks(frame, _make_subject(frame), "sites3")
+    blocks = create_class_blocks(frame)
     assert blocks[0].grid is not None
     assert [row[1] for row in blocks[0].grid.rows] == 2 * ["1 to 1.5", "1.5 to 2", "2 to 3", "> 3"]
     # 400 of 1000 footprints are classified as safe, 2 of them are unsafe; 600 are truly safe
-    rightly_safe = data["rates"]["truly safe footprints that are classified as safe"]
+    rightly_safe = blocks[-1].data["rates"]["truly safe footprints that are classified as safe"]
     assert (rightly_safe["hits"], rightly_safe["total"]) == (3980, 6000)
     assert blocks[0].figures
     hits = [str(name) for name in frame if str(name).endswith(("_safe", "_unflagged"))]
-    blocks, _ = create_class_blocks(frame.assign(**dict.fromkeys(hits, 0)), _make_subject(frame), "sites3")
-    assert not blocks[0].figures
+    assert not create_class_blocks(frame.assign(**dict.fromkeys(hits, 0)))[0].figures
 
 
 def test_rates_are_reported_per_roughness_threshold() -> None:
     frame = landing_frame(40).assign(max_roughness_m=np.tile([0.1, 0.2], 20), false_alarms=np.tile([120, 30], 20))
-    section = THRESHOLD(_make_subject(frame))
+    section = threshold_section(_make_subject(frame))
     assert section is not None
     low, high = section.data["thresholds"]
     assert (low["max_roughness_m"], high["max_roughness_m"]) == (0.1, 0.2)
@@ -169,14 +170,14 @@ def test_rates_are_reported_per_roughness_threshold() -> None:
         pytest.approx(0.05),
     )
     assert low["missed"]["fraction"] == pytest.approx(8 / 400)
-    assert THRESHOLD(_make_subject(landing_frame(40))) is None
+    assert threshold_section(_make_subject(landing_frame(40))) is None
 
 
 def test_faults_are_grouped_by_kind_and_size() -> None:
     frame = landing_frame(60)
     frame["fault"] = np.repeat(["none", "laser_stuck", "laser_silent"], 20)
     frame["fault_size"] = np.concatenate([np.zeros(20), np.tile([0.05, 1.0], 10), np.ones(20)])
-    rows = FAULT_OUTCOMES.records(frame, _make_subject(frame))
+    rows = FAULT_OUTCOMES.records(frame)
     assert [(row["fault"], row["size"], row["n"]) for row in rows] == [
         ("none", 0.0, 20),
         ("laser_silent", 1.0, 20),
@@ -186,7 +187,7 @@ def test_faults_are_grouped_by_kind_and_size() -> None:
     result_columns = ("safe", "refused", "unconverged", "wrong", "unfinished")
     assert all(sum(row[column] for column in result_columns) == row["n"] for row in rows)
     assert sum(row["wrong"] for row in rows) == (frame["site_reported"] & ~frame["site_safe"]).sum()
-    assert FAULTS(_make_subject(landing_frame(20))) is None
+    assert faults_section(_make_subject(landing_frame(20))) is None
 
 
 def _make_motion_rows(column: str, sizes: list[float], fractions: list[float]) -> pd.DataFrame:
@@ -239,7 +240,10 @@ def test_map_errors_have_the_expected_rank_correlations() -> None:
     frame["elevation_rms_m"] = np.abs(frame["range_error_m"])
     mapped_rows = map_rows(_make_subject(frame))
     assert mapped_rows is not None
-    effects = {(effect["driver"], effect["error"]): effect for effect in MAP_EFFECTS.effects(mapped_rows)}
+    effects = {
+        (effect["driver"], effect["error"]): effect
+        for effect in estimate_effects(mapped_rows, MAP_CONDITIONS, MAP_ERRORS)
+    }
     noise = effects["baseline / height", "elevation noise (% of height)"]
     assert noise["rank_correlation"] == pytest.approx(-1.0)
     assert np.all(np.diff(noise["medians"]) < 0.0)
@@ -252,7 +256,7 @@ def test_quantiles_and_correlations_need_20_maps(maps: int, has_statistics: bool
     rng = np.random.default_rng(4)
     columns = ("baseline_fraction", "texture", "elevation_noise_m", "elevation_rms_m", "slope_error_rms_deg")
     values = {name: rng.uniform(0.1, 1.0, maps) for name in columns}
-    section = MAP_ERRORS(_make_subject(landing_frame(maps).assign(height_m=10.0, **values)))
+    section = map_section(_make_subject(landing_frame(maps).assign(height_m=10.0, **values)))
     assert section is not None
     errors, effects = section.blocks
     assert errors.grid is not None

@@ -17,8 +17,8 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.products import is_hda_case
 from marsyard.reports.localisation.case_figures import draw_errors, draw_landmarks, draw_map, is_localisation_case
-from marsyard.reports.localisation.consistency import create_consistency_blocks
-from marsyard.reports.localisation.presentation import CONDITIONS, LOCALISATION, POSITION, view
+from marsyard.reports.localisation.consistency import create_consistency_block
+from marsyard.reports.localisation.presentation import LOCALISATION, conditions_section, position_section, view
 from marsyard.reports.presentation import find_case_kind, presentations, write_case_figures
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
@@ -165,7 +165,7 @@ def test_view_of_a_refused_descent_has_one_row() -> None:
 
 def test_position_section_has_rates_and_quantiles() -> None:
     frame = localisation_frame(200)
-    section = POSITION(_make_subject(frame))
+    section = position_section(_make_subject(frame))
     assert section is not None
     rates = section.data["rates"]
     assert rates["Position reported within 10 s"]["hits"] == frame["fixed_in_time"].sum()
@@ -180,7 +180,7 @@ def test_position_section_has_rates_and_quantiles() -> None:
 
 
 def test_condition_section_is_created() -> None:
-    section = CONDITIONS(_make_subject(localisation_frame(200)))
+    section = conditions_section(_make_subject(localisation_frame(200)))
     assert section is not None
     bins = section.data["by_condition"]
     assert sum(entry["n"] for entry in bins) == 200
@@ -188,7 +188,7 @@ def test_condition_section_is_created() -> None:
 
 
 def test_algorithm_without_coarse_stage_has_no_coarse_rate() -> None:
-    section = POSITION(_make_subject(localisation_frame(200).assign(coarse_error_m=np.nan)))
+    section = position_section(_make_subject(localisation_frame(200).assign(coarse_error_m=np.nan)))
     assert section is not None
     assert section.data["rates"]["Coarse position within 200 m"]["n"] == 0
 
@@ -197,20 +197,20 @@ def test_consistent_covariances_are_inside_the_interval() -> None:
     """The mean of n errors is chi-square with 2 n degrees of freedom divided by n: 90 % within the interval."""
     inside, cases = 0, 40
     for seed in range(cases):
-        blocks, data = create_consistency_blocks(
-            localisation_frame(50, 1.0, seed), _make_subject(pd.DataFrame()), "key"
-        )
-        assert len(blocks) == 1
+        block = create_consistency_block(localisation_frame(50, 1.0, seed))
+        assert block is not None
+        data = block.data
         inside += data["nees"]["lower"] <= data["nees"]["mean"] <= data["nees"]["upper"]
     # binomial(40, 0.9): mean 36, standard deviation 1.9
     assert inside >= 30
     assert data["nees"]["lower"] == pytest.approx(stats.chi2.ppf(0.05, 100) / 50)
     too_small = localisation_frame(50, 1.0).assign(position_nees=lambda rows: 4.0 * rows["position_nees"])
-    _, data = create_consistency_blocks(too_small, _make_subject(pd.DataFrame()), "key")
-    assert data["nees"]["mean"] > data["nees"]["upper"]
+    block = create_consistency_block(too_small)
+    assert block is not None
+    assert block.data["nees"]["mean"] > block.data["nees"]["upper"]
 
 
-@pytest.mark.parametrize("section", [POSITION, CONDITIONS])
+@pytest.mark.parametrize("section", [position_section, conditions_section])
 def test_sections_of_refusals_report_their_rate(section: Any) -> None:
     """A campaign in which no descent has a position still reports that fact."""
     created = section(_make_subject(localisation_frame(30, fixed_fraction=0.0)))
@@ -218,7 +218,7 @@ def test_sections_of_refusals_report_their_rate(section: Any) -> None:
     assert created.blocks
 
 
-@pytest.mark.parametrize("section", [POSITION, CONDITIONS])
+@pytest.mark.parametrize("section", [position_section, conditions_section])
 def test_other_campaigns_have_no_section(section: Any) -> None:
     assert section(_make_subject(pd.DataFrame({"case": [0, 1], "sun_difference_deg": [1.0, 2.0]}))) is None
 

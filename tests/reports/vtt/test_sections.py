@@ -7,16 +7,16 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.presentation import presentations
-from marsyard.reports.vtt.goal import GOAL, losses_grid, summarize_cameras
+from marsyard.reports.vtt.goal import goal_section, losses_grid, summarize_cameras
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.vtt.sections import (
     CHECKOUT_1,
     CHECKOUT_3,
     PAPER,
     REGRESSION,
-    SINGLE_RUNS,
     TERRAINS,
     regression_section,
+    single_run_section,
     step_rates,
     steps_section,
     terrains_section,
@@ -182,15 +182,15 @@ def test_table_3_agrees_with_the_text_of_the_paper() -> None:
 
 def test_single_runs_are_compared_with_the_paper() -> None:
     frame = make_rows(4, target_motion_m=[0.1, 0.2, 0.3, 0.4], tracked=[True, True, True, False])
-    table = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(frame, "vtt-checkout-2")))}
+    table = {row[""]: row for row in read_table(single_run_section(make_subject(frame, "vtt-checkout-2")))}
     target_motion = table["target moved, first to last estimate (cm)"]
     assert (target_motion["Paper"], target_motion["Ours"]) == ("36", "25.0 (10.0 to 40.0)")
     assert table["tracked to the goal"]["Ours"] == "3 of 4: 75.00 %"
     assert table["maximum correction (px)"]["Ours"] == "–"
     roll_rows = make_rows(4, roll_compensated=[True, True, False, False], tracked=[True, True, True, False])
-    table = {row[""]: row for row in read_table(SINGLE_RUNS(make_subject(roll_rows, "vtt-roll")))}
+    table = {row[""]: row for row in read_table(single_run_section(make_subject(roll_rows, "vtt-roll")))}
     assert table["tracked with roll compensation"]["Ours"] == "2 of 2: 100 %"
-    assert SINGLE_RUNS(make_subject(frame, "another")) is None
+    assert single_run_section(make_subject(frame, "another")) is None
 
 
 def test_updates_and_minutes_are_listed_per_mode_of_table_4() -> None:
@@ -203,7 +203,7 @@ def test_updates_and_minutes_are_listed_per_mode_of_table_4() -> None:
     for number, leg in enumerate(legs, start=1):
         frame[f"update_{number}_leg"], frame[f"update_{number}_time_s"] = float(leg), 60.0 * number
     frame.loc[1, ["update_27_leg", "update_27_time_s"]] = np.nan  # the second run ended one step earlier
-    table = read_table(SINGLE_RUNS(make_subject(frame, CHECKOUT_3, legs=legs_driven)), 1)
+    table = read_table(single_run_section(make_subject(frame, CHECKOUT_3, legs=legs_driven)), 1)
     assert [row["Updates, paper"] for row in table] == ["2", "7", "10", "4", "4"]
     assert [row["Updates, ours"] for row in table] == ["2", "7", "10", "4", "4 (3 to 4)"]
     assert [row["Minutes, ours"] for row in table[:4]] == ["2.0", "7.0", "10.0", "4.0"]
@@ -275,15 +275,15 @@ def test_goal_statistics_are_computed_per_camera() -> None:
     assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5", "3.0"]]
     set_values(frame, n, clear_sky=False)
     assert losses_grid(frame).rows == [["LOST", "match score", "1", "3.5", "3.0", "1"]]
-    table = read_table(GOAL(make_subject(frame)), 1)
+    table = read_table(goal_section(make_subject(frame)), 1)
     assert table[1]["Position error, median (cm)"] == "0.40"
     bound = "Upper bound of the 99 % quantile (cm)"
-    one_small_camera = read_table(GOAL(make_subject(frame.iloc[: n + 20])), 1)
+    one_small_camera = read_table(goal_section(make_subject(frame.iloc[: n + 20])), 1)
     assert [row[bound] for row in one_small_camera] == [table[0][bound], "too few runs"]
 
 
 def test_quantiles_without_enough_runs_are_omitted() -> None:
-    section = GOAL(make_subject(make_rows(20)))
+    section = goal_section(make_subject(make_rows(20)))
     assert "99 %" not in " ".join(read_table(section, 1)[0])
     assert section is not None
     assert "Too few runs" in section.blocks[-1].note

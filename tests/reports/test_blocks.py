@@ -1,4 +1,4 @@
-"""Tests of declared report sections: a list of statistics, rates and figures with their columns."""
+"""Tests of blocks of report sections: rates, distributions and figures of rows, and sections of a system."""
 
 from __future__ import annotations
 
@@ -10,43 +10,47 @@ import pandas as pd
 import pytest
 
 from marsyard.reports import presentation
-from marsyard.reports.campaign import section_makers, write_report
-from marsyard.reports.figures import cumulative_figure
-from marsyard.reports.papers import PaperFacts
-from marsyard.reports.presentation import Presentation, presentations
-from marsyard.reports.section import Grid, Subject
-from marsyard.reports.section_kinds import (
-    Distribution,
+from marsyard.reports.blocks import (
     Quantity,
     Rate,
-    RateByCondition,
-    RateTable,
-    Scatter,
-    SectionDeclaration,
-    Statistics,
+    collect_values,
     condition_bins,
+    condition_blocks,
+    distribution_block,
     flag_rate,
+    quantile_block,
+    rate_block,
+    scatter_block,
 )
+from marsyard.reports.campaign import section_makers, write_report
+from marsyard.reports.figures import cumulative_figure
+from marsyard.reports.papers import paper_section
+from marsyard.reports.presentation import Presentation, presentations
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.stored import StoredRun
 from marsyard.scenarios.systems import System
 
 ERROR = Quantity("altitude_error_m")
-ALTITUDE = SectionDeclaration(
-    key="altitude",
-    name="Altitude",
-    title="Altitude from two images",
-    requires=("altitude_error_m",),
-    parts=(
-        Statistics("altitude_error_m"),
-        Distribution(
-            [ERROR], ("altitude error (m)", "fraction of cases"), "Fraction of cases up to each error.", bound=5.0
-        ),
-        RateTable([Rate("answered", "answered", flag_rate("answered"))]),
-        RateByCondition(Quantity("altitude_m"), [Rate("answered", "Answered", flag_rate("answered"))]),
-        Scatter([Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
-    ),
-    note="Synthetic data.",
-)
+ANSWERED = Rate("answered", "Answered", flag_rate("answered"))
+
+
+def altitude_section(subject: Subject) -> Section | None:
+    """Create a section with rates, a distribution, rates by condition and a scatter plot."""
+    frame = subject.frame
+    if not has_values(frame, "altitude_error_m"):
+        return None
+    curves = collect_values(frame, [ERROR])
+    labels, caption = ("altitude error (m)", "fraction of cases"), "Fraction of cases up to each error."
+    return create_section(
+        "altitude",
+        "Altitude",
+        "Altitude from two images",
+        rate_block({"answered": ANSWERED.compute(frame)}),
+        distribution_block("errors", curves, labels, caption, bound=5.0),
+        *condition_blocks(frame, "answers", Quantity("altitude_m"), [ANSWERED]),
+        scatter_block(frame, "scatter", [Quantity("altitude_m")], [ERROR], "Every case, and medians of bins."),
+        Block(note="Synthetic data."),
+    )
 
 
 def make_subject(frame: pd.DataFrame, name: str = "altitude-flight-2") -> Subject:
@@ -63,11 +67,11 @@ def make_rows_of_two_altitudes() -> pd.DataFrame:
     )
 
 
-def test_declared_section_contains_its_parts_in_order() -> None:
-    section = ALTITUDE(make_subject(make_rows_of_two_altitudes()))
+def test_section_contains_its_blocks_and_their_data_in_order() -> None:
+    section = altitude_section(make_subject(make_rows_of_two_altitudes()))
     assert section is not None
-    # statistics, distribution, rates, rates by condition (figure, table), scatter plot, note
-    assert [len(block.figures) for block in section.blocks] == [0, 1, 0, 1, 0, 1, 0]
+    # rates, distribution, rates by condition (figure, table), scatter plot, note
+    assert [len(block.figures) for block in section.blocks] == [0, 1, 1, 0, 1, 0]
     assert section.blocks[-1].note == "Synthetic data."
     low, high = section.data["by_condition"]
     assert (low["altitude_m"], low["answered"]["hits"], low["answered"]["n"]) == (400.0, 20, 20)
@@ -80,10 +84,13 @@ def test_declared_section_contains_its_parts_in_order() -> None:
 
 
 def test_missing_columns_give_no_section() -> None:
-    assert ALTITUDE(make_subject(make_rows_of_two_altitudes().drop(columns="altitude_error_m"))) is None
-    assert ALTITUDE(make_subject(make_rows_of_two_altitudes().assign(altitude_error_m=np.nan))) is None
-    declaration = SectionDeclaration("errors", "Errors", "Errors", [Distribution([Quantity("missing")], ("", ""), "")])
-    assert declaration(make_subject(make_rows_of_two_altitudes())) is None
+    assert altitude_section(make_subject(make_rows_of_two_altitudes().drop(columns="altitude_error_m"))) is None
+    assert altitude_section(make_subject(make_rows_of_two_altitudes().assign(altitude_error_m=np.nan))) is None
+    frame = make_rows_of_two_altitudes()
+    missing = [Quantity("missing")]
+    blocks = [distribution_block("errors", collect_values(frame, missing), ("", ""), "")]
+    blocks += [quantile_block(frame, missing, {"Median": 0.5}), scatter_block(frame, "errors", missing, [ERROR], "")]
+    assert create_section("errors", "Errors", "Errors", *blocks, rate_block({})) is None
 
 
 def test_cumulative_curve_rises_and_complementary_curve_falls() -> None:
@@ -116,14 +123,14 @@ def test_paper_values_are_compared_with_results(tmp_path: Path) -> None:
         ]
         """
     )
-    section = PaperFacts(path)(make_subject(make_rows_of_two_altitudes()))
+    section = paper_section(make_subject(make_rows_of_two_altitudes()), path)
     assert section is not None
     assert section.data == {
         "altitude error (cm)": {"paper": "120", "ours": "100 (100 to 200)"},
         "answered": {"paper": "–", "ours": "30 of 40: 75.00 %"},
         "slope": {"paper": "3", "ours": "–"},
     }
-    assert PaperFacts(path)(make_subject(make_rows_of_two_altitudes(), "another")) is None
+    assert paper_section(make_subject(make_rows_of_two_altitudes(), "another"), path) is None
 
 
 @pytest.fixture
@@ -139,7 +146,7 @@ def register_altitude_system(monkeypatch: pytest.MonkeyPatch) -> Callable[[str],
     return register
 
 
-REPORT = Presentation(sections=(ALTITUDE,))
+REPORT = Presentation(sections=(altitude_section,))
 
 
 def test_sections_of_a_registered_system_are_written(
@@ -147,7 +154,7 @@ def test_sections_of_a_registered_system_are_written(
 ) -> None:
     register_altitude_system(f"{__name__}:REPORT")
     try:
-        assert ALTITUDE in section_makers()
+        assert altitude_section in section_makers()
         page = write_report(
             make_run(make_rows_of_two_altitudes().assign(case=np.arange(40), outcome="VALID"), requirements=[])
         )

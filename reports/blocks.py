@@ -1,0 +1,295 @@
+"""Blocks of report sections, created from rows: rates, outcomes by fault, distributions, quantiles, scatter plots.
+
+A section is a function from rows to blocks (`marsyard.reports.section.create_section`). `docs/reports.md` contains an
+example. The argument `key` of these functions is the identifier of the figure on the page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from marsyard.reports import rates
+from marsyard.reports.figures import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
+from marsyard.reports.rates import CONFIDENCE, CaseFraction, PooledRate, finite_values, varies
+from marsyard.reports.section import Block, Grid, svg_figure
+from marsyard.reports.statistics.drivers import MIN_CASES, estimate_driver
+from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, numbers, percent
+
+Rows = pd.DataFrame
+#: Function that computes a rate of rows.
+RateFunction = Callable[[Rows], CaseFraction | PooledRate]
+#: Maximum number of bins of a condition (bins have equal numbers of cases), and minimum number of cases of a bin.
+_MAX_BINS, _MIN_CASES_IN_BIN = 5, 4
+#: Maximum number of values of a condition with a row each.
+_MAX_VALUES = 24
+#: Fault type of cases without a fault.
+NO_FAULT = "none"
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of numbers with its name on the page (default: the column in words) and a scale."""
+
+    column: str
+    name: str = ""
+    scale: float = 1.0
+
+    @property
+    def title(self) -> str:
+        """The name on the page."""
+        return self.name or label(self.column)
+
+    def values(self, frame: Rows) -> Float[np.ndarray, " n"]:
+        """The scaled numbers; NaN if missing."""
+        return np.asarray(self.scale * numbers(frame, self.column))
+
+
+def collect_values(frame: Rows, quantities: Sequence[Quantity]) -> dict[str, Float[np.ndarray, " n"]]:
+    """Collect the finite values of quantities by title."""
+    return {quantity.title: finite_values(frame, quantity.column, quantity.scale) for quantity in quantities}
+
+
+def flag_rate(name: str, *conditions: str, value: bool = True) -> RateFunction:
+    """Return a function that computes how often flag `name` equals `value`, in the rows with all flags `conditions`."""
+
+    def compute_rate(frame: Rows) -> CaseFraction:
+        all_rows = np.ones(len(frame), dtype=np.bool_)
+        masks = (rates.flag_mask(frame, condition) for condition in conditions)
+        selected_rows = frame[np.logical_and.reduce([all_rows, *masks])]
+        return rates.fraction_of(rates.flag_mask(selected_rows, name) == value, selected_rows)
+
+    return compute_rate
+
+
+def pooled_fraction(numerator: str, denominator: str) -> RateFunction:
+    """Return a function that divides the sum of one column of counts by that of another, over all rows."""
+    return lambda frame: rates.pooled_rate(frame, numerator, denominator)
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A rate: key in `report.json`, name on the page, function that computes it, and whether figures show it."""
+
+    key: str
+    name: str
+    compute: RateFunction
+    in_figure: bool = True
+
+
+def rate_block(
+    rates_by_name: Mapping[str, CaseFraction | PooledRate], cases: str = "Cases", heading: str = "", note: str = "",
+    data: str = "rates",
+) -> Block | None:  # fmt: skip
+    """Create a table of rates with intervals that allow for shared terrains; None if no rate has a case.
+
+    data: key of the rates in `report.json`
+    """
+    rows = []
+    for name, rate in rates_by_name.items():
+        if isinstance(rate, CaseFraction) and rate.n:
+            rows.append([name, rates.fraction_text(rate), rates.interval_text(rate, shared=True)])
+        elif isinstance(rate, PooledRate) and rate.total:
+            fraction = f"{rate.hits:,} of {rate.total:,}: {percent(rate.fraction)}"
+            rows.append([name, fraction, rates.range_text(rate.lower, rate.upper)])
+    grid = Grid(["", cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
+    values = {data: {name: asdict(rate) for name, rate in rates_by_name.items()}}
+    return Block(heading=heading, grid=grid if rows else None, note=note if rows else "", data=values)
+
+
+def condition_blocks(
+    frame: Rows, key: str, by: Quantity, declared_rates: Sequence[Rate], cases: str = "Cases",
+    ylabel: str = "fraction of cases", text: str = "", note: str = "", caption: str = "",
+    limit: tuple[str, float] | None = None, data: str = "by_condition",
+) -> list[Block]:  # fmt: skip
+    """Create curves and a table of rates against a condition; empty if the condition does not vary.
+
+    by: the condition; each value has a row, or each bin with an equal number of cases if there are many values
+    cases, ylabel: heading of the number of cases in the table, and label of the figure's vertical axis
+    limit: name and position of a vertical line
+    data: key of the list in `report.json`
+    """
+    if not varies(frame, by.column):
+        return []
+    values = by.values(frame)
+    bins = [
+        (float(np.median(values[mask])), int(mask.sum()), [rate.compute(frame[mask]) for rate in declared_rates])
+        for mask in condition_bins(values, _MAX_VALUES)
+    ]
+    x = [value for value, _, _ in bins]
+    lines = [
+        RateLine(rate.name.lower(), x, [bin_rates[index] for _, _, bin_rates in bins])
+        for index, rate in enumerate(declared_rates)
+        if rate.in_figure
+    ]
+    rows, records = [], []
+    for value, n, bin_rates in bins:
+        rows.append([f"{value:.4g}", f"{n:,}", *map(_describe_rate, bin_rates)])
+        named_rates = zip(declared_rates, bin_rates, strict=True)
+        records.append({by.column: value, "n": n} | {rate.key: asdict(result) for rate, result in named_rates})
+    grid = Grid([by.title, cases, *(rate.name for rate in declared_rates)], rows)
+    figure = svg_figure(rate_figure(lines, (by.title, ylabel), limit), key, caption or by.title)
+    values_of_block = {data: records} | ({} if limit is None else {"limit": limit[1]})
+    return [Block(text=text, figures=[figure], data=values_of_block), Block(grid=grid, note=note)]
+
+
+def _describe_rate(rate: CaseFraction | PooledRate) -> str:
+    return rates.fraction_text(rate) if isinstance(rate, CaseFraction) else rates.rate_text(rate)
+
+
+def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _MAX_BINS) -> list[Bool[np.ndarray, " n"]]:
+    """Create a mask for each value, or for bins with equal numbers of cases if there are many values, without NaN."""
+    finite = np.isfinite(values)
+    distinct = np.unique(values[finite])
+    if distinct.size <= max_values:
+        return [values == value for value in distinct]
+    bins = max(1, min(_MAX_BINS, int(finite.sum()) // _MIN_CASES_IN_BIN))
+    ranks = np.argsort(np.argsort(values[finite], kind="stable"), kind="stable")
+    bin_numbers = np.full(values.size, -1)
+    bin_numbers[finite] = ranks * bins // int(finite.sum())
+    return [bin_numbers == index for index in range(bins)]
+
+
+@dataclass(frozen=True)
+class OutcomesBySize:
+    """Outcomes of cases by type (column `fault`) and size of their fault.
+
+    - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
+      a confidence interval for the last outcome of `styles`
+    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.section.BARS`), in order
+    - cases: heading of the number of rows
+    - wording: function that returns fault type and size in words; an unknown size is empty
+    - extra_columns: further columns of the table, each with its heading, its key in `report.json`, a function that
+      computes its value from the rows, and a function that formats the value
+    """
+
+    outcomes: Callable[[Rows], Mapping[str, Bool[np.ndarray, " n"]]]
+    styles: Mapping[str, tuple[str, str]]
+    cases: str
+    wording: Callable[[str, float], tuple[str, str]]
+    extra_columns: Sequence[tuple[str, str, Callable[[Rows], Any], Callable[[Any], str]]] = ()
+
+    def records(self, frame: Rows) -> list[dict[str, Any]]:
+        """Count the outcomes for each fault type and size; cases without a fault come first."""
+        records = []
+        for fault, size, rows in rates.group_by_size(frame, "fault", "fault_size", NO_FAULT):
+            masks = self.outcomes(rows)
+            last_outcome = [*self.styles][-1]
+            counts: dict[str, Any] = {name: int(mask.sum()) for name, mask in masks.items()}
+            counts[f"{last_outcome}_fraction"] = rates.fraction_of(masks[last_outcome], rows)
+            values = {name: compute(rows) for _, name, compute, _ in self.extra_columns}
+            records.append({"fault": fault, "size": size, "n": len(rows), **counts, **values})
+        return records
+
+    def blocks(self, frame: Rows, key: str, caption: str, note: str = "") -> list[Block]:
+        """Create stacked bars and a table of the outcomes; empty if no row has a fault."""
+        records = self.records(frame) if "fault" in frame else []
+        if all(record["fault"] == NO_FAULT for record in records):
+            return []
+        texts = [self.wording(record["fault"], record["size"]) for record in records]
+        last = [*self.styles][-1]
+        head = ["Fault", "Size", self.cases, *(name.capitalize() for name, _ in self.styles.values())]
+        head += [f"{self.styles[last][0].capitalize()}, interval", *(heading for heading, *_ in self.extra_columns)]
+        rows = [
+            [
+                *(name, size or NOTHING, f"{record['n']:,}"),
+                *(f"{record[outcome]:,} ({percent(record[outcome] / record['n'])})" for outcome in self.styles),
+                rates.interval_text(record[f"{last}_fraction"]),
+                *(format_value(record[name]) for _, name, _, format_value in self.extra_columns),
+            ]
+            for record, (name, size) in zip(records, texts, strict=True)
+        ]
+        percentages = {
+            name: (style, [100.0 * record[outcome] / record["n"] for record in records])
+            for outcome, (name, style) in self.styles.items()
+        }
+        figure = stacked_bars([" ".join(pair).strip() for pair in texts], percentages, f"% of {self.cases.lower()}")
+        data = [{**record, f"{last}_fraction": asdict(record[f"{last}_fraction"])} for record in records]
+        figures = [svg_figure(figure, key, caption)]
+        return [Block(figures=figures, data={"rows": data}), Block(grid=Grid(head, rows), note=note)]
+
+
+def distribution_block(
+    key: str, curves: Mapping[str, Float[np.ndarray, " n"]], labels: tuple[str, str], caption: str, heading: str = "",
+    *, complementary: bool = False, bound: float | None = None,
+) -> Block | None:  # fmt: skip
+    """Draw cumulative curves of values by name; None if no curve has a value."""
+    if not any(values.size for values in curves.values()):
+        return None
+    figure = cumulative_figure(curves, labels, complementary=complementary, bound=bound)
+    return Block(heading=heading, figures=[svg_figure(figure, key, caption)])
+
+
+def quantile_block(
+    frame: Rows, quantities: Sequence[Quantity], columns: Mapping[str, float], heading: str = "", note: str = ""
+) -> Block | None:
+    """Create a table of quantiles; `columns` maps headings to probabilities. None if there are no values."""
+    rows = [
+        [name, *(number(rates.quantile(values, probability)) for probability in columns.values())]
+        for name, values in collect_values(frame, quantities).items()
+        if values.size
+    ]
+    return Block(heading=heading, grid=Grid(["", *columns], rows), note=note) if rows else None
+
+
+def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[dict[str, Any]]:
+    """Compute the effect of every condition `x` that varies on every response `y`.
+
+    Keys: `driver`, `error`, Spearman's `rank_correlation` with its interval, `centres` and `medians` of the bins.
+    """
+    effects, groups = [], rates.terrain_groups(frame)
+    for condition in (condition for condition in x if varies(frame, condition.column)):
+        for response in y:
+            conditions, responses = condition.values(frame), response.values(frame)
+            bins = condition_bins(np.where(np.isfinite(responses), conditions, np.nan))
+            centres, medians = ([float(np.median(values[mask])) for mask in bins] for values in (conditions, responses))
+            ranks = estimate_driver(conditions, responses, groups, CONFIDENCE)
+            rank_values = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
+            effect: dict[str, Any] = {"driver": condition.title, "error": response.title}
+            effect |= zip(("rank_correlation", "lower", "upper"), rank_values, strict=True)
+            effects.append(effect | {"centres": centres, "medians": medians})
+    return effects
+
+
+def scatter_block(
+    frame: Rows, key: str, x: Sequence[Quantity], y: Sequence[Quantity], caption: str, heading: str = "",
+    note: str = "", *, logarithmic: bool = False, statistics: bool = True,
+) -> Block | None:  # fmt: skip
+    """Draw responses `y` against the conditions `x` that vary; None if no condition varies.
+
+    statistics: whether the block contains medians of bins, and rank correlations
+    """
+    effects = estimate_effects(frame, x, y)
+    if not effects:
+        return None
+    columns = {quantity.title: quantity.values(frame) for quantity in (*x, *y)}
+    panels = {
+        (effect["driver"], effect["error"]): (
+            (columns[effect["driver"]], columns[effect["error"]]),
+            (effect["centres"], effect["medians"]) if statistics else ((), ()),
+        )
+        for effect in effects
+    }
+    texts_by_condition: dict[str, list[str]] = {}
+    for effect in effects:
+        texts_by_condition.setdefault(effect["driver"], []).append(correlation_text(effect))
+    head = ["Rank correlation", *(response.title for response in y)]
+    grid = Grid(head, [[name, *cells] for name, cells in texts_by_condition.items()]) if statistics else None
+    figure = svg_figure(scatter_panels(panels, logarithmic=logarithmic), key, caption, wide=len(effects) > 1)
+    note = note or (
+        f"The intervals are at {format_fraction(CONFIDENCE)} confidence. A dash means that there are fewer than "
+        f"{MIN_CASES} cases or only one value."
+    )
+    return Block(heading=heading, figures=[figure], grid=grid, note=note, data={"effects": effects})
+
+
+def correlation_text(effect: Mapping[str, Any]) -> str:
+    """Format a rank correlation with its interval; a dash for NaN."""
+    value, lower, upper = (coefficient(effect[key]) for key in ("rank_correlation", "lower", "upper"))
+    return NOTHING if math.isnan(effect["rank_correlation"]) else f"{value} ({lower} to {upper})"
