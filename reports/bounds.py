@@ -14,21 +14,9 @@ import numpy as np
 
 from marsyard.reports.case_evidence import Mask
 from marsyard.reports.statistics import proportions
-from marsyard.reports.statistics.clusters import ClusteredCases, TerrainEvidence, attainable_risk, count_sizes
+from marsyard.reports.statistics.clusters import ClusteredCases, attainable_risk, count_sizes
 from marsyard.reports.statistics.proportions import SequentialTest, confidence_at
-
-
-@dataclass(frozen=True)
-class RequiredRate:
-    """Required success rate, and the confidence at which it must be shown."""
-
-    probability: float
-    confidence: float
-
-    @property
-    def risk(self) -> float:
-        """Permitted probability of a wrong verdict."""
-        return 1.0 - self.confidence
+from marsyard.reports.verdicts import Verdict
 
 
 @dataclass(frozen=True)
@@ -43,63 +31,45 @@ class Looks:
     risk_fraction: float = 1.0
 
 
-@dataclass(frozen=True)
-class RateBounds:
-    """Bounds of a success rate.
-
-    - lower, upper: one-sided bounds, with their confidences `lower_confidence` and `upper_confidence`
-    - consumer_risk: probability of this result or a better one if the true rate equals the required rate
-    - further_cases: additional cases of the population without a failure for PASS; on new terrains if `clustered`
-    - clustered: evidence from shared terrains; None if no terrain is shared
-    """
-
-    lower: float
-    upper: float
-    lower_confidence: float
-    upper_confidence: float
-    consumer_risk: float
-    further_cases: int
-    clustered: TerrainEvidence | None = None
-
-
-def independent_bounds(success: Mask, member: Mask, required: RequiredRate, looks: Looks) -> RateBounds:
-    """Compute the bounds of the success rate of a population (`member`) of independent cases, at least one."""
+def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks: Looks) -> Verdict:
+    """Add the bounds of the success rate of a population (`member`) of independent cases, at least one."""
     n, failures = int(member.sum()), int((member & ~success).sum())
     if looks.in_first_look is None:
-        confidence = confidence_at(required.confidence, looks.risk_fraction)
-        bounds = _binomial_bounds(n, failures, required, (confidence, confidence))
+        confidence = confidence_at(verdict.confidence, looks.risk_fraction)
+        bounded = _add_binomial_bounds(verdict, n, failures, (confidence, confidence))
         if looks.risk_fraction < 1.0:
-            further = proportions.further_cases_needed(n, failures, required.probability, confidence)
-            return replace(bounds, further_cases=further)
+            further = proportions.further_cases_needed(n, failures, verdict.probability, confidence)
+            return replace(bounded, further_cases=further)
         first_n = n
     else:
         first_n = int((member & looks.in_first_look).sum())
-    pass_test, fail_test = _sequential_tests(required, first_n)
+    pass_test, fail_test = _sequential_tests(verdict, first_n)
     further = pass_test.cases_needed(n, failures) - n
     if looks.in_first_look is None:
-        return replace(bounds, further_cases=further)
+        return replace(bounded, further_cases=further)
     confidences = 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
-    return replace(_binomial_bounds(n, failures, required, confidences), further_cases=further)
+    return replace(_add_binomial_bounds(verdict, n, failures, confidences), further_cases=further)
 
 
-def clustered_bounds(cases: ClusteredCases, required: RequiredRate, looks: Looks) -> RateBounds:
-    """Compute the bounds of the success rate of a population of cases that share terrains, at least one case."""
-    evidence, max_failure_rate = cases.count_terrains(), 1.0 - required.probability
+def add_clustered_bounds(verdict: Verdict, cases: ClusteredCases, looks: Looks) -> Verdict:
+    """Add the bounds of the success rate of a population of cases that share terrains, at least one case."""
+    evidence, max_failure_rate = cases.count_terrains(), 1.0 - verdict.probability
     if looks.in_first_look is not None:
-        return _bounds_at_later_look(cases, required, looks.in_first_look)
-    confidence = confidence_at(required.confidence, looks.risk_fraction)
+        return _add_bounds_at_later_look(verdict, cases, looks.in_first_look)
+    confidence = confidence_at(verdict.confidence, looks.risk_fraction)
     risk = 1.0 - confidence
     if looks.risk_fraction < 1.0:
         further = cases.further_cases_needed(max_failure_rate, risk)
     else:
         # these cases would be evaluated at a later look
         terrains = int((cases.is_first_on_terrain & cases.member).sum())
-        pass_test = _clustered_test(cases, np.ones_like(cases.member), max_failure_rate, required.risk)
+        pass_test = _clustered_test(cases, np.ones_like(cases.member), max_failure_rate, 1.0 - verdict.confidence)
         further = pass_test.cases_needed(terrains, min(evidence.failed_terrains, terrains)) - terrains
-    return RateBounds(
+    return replace(
+        verdict,
         lower=1.0 - cases.max_failure_rate(risk),
         upper=1.0 - cases.min_failure_rate(risk),
-        lower_confidence=confidence,
+        bounds_confidence=confidence,
         upper_confidence=confidence,
         consumer_risk=cases.consumer_risk(max_failure_rate, risk),
         further_cases=further,
@@ -107,22 +77,24 @@ def clustered_bounds(cases: ClusteredCases, required: RequiredRate, looks: Looks
     )
 
 
-def _bounds_at_later_look(cases: ClusteredCases, required: RequiredRate, in_first_look: Mask) -> RateBounds:
-    """Compute the bounds at a look after the first: terrains are counted instead of cases."""
+def _add_bounds_at_later_look(verdict: Verdict, cases: ClusteredCases, in_first_look: Mask) -> Verdict:
+    """Add the bounds at a look after the first: terrains are counted instead of cases."""
     evidence = cases.count_terrains()
     terrains = int((cases.is_first_on_terrain & cases.member).sum())
     failed = min(evidence.failed_terrains, terrains)
     pass_test, fail_test = (
-        _clustered_test(cases, in_first_look, rate, required.risk)
-        for rate in (1.0 - required.probability, required.probability)
+        _clustered_test(cases, in_first_look, rate, 1.0 - verdict.confidence)
+        for rate in (1.0 - verdict.probability, verdict.probability)
     )
     confidences = 1.0 - pass_test.significance_level(terrains), 1.0 - fail_test.significance_level(terrains)
     successful = min(evidence.successful_terrains, terrains)
-    return RateBounds(
-        proportions.proportion_lower(terrains - failed, terrains, confidences[0]),
-        proportions.proportion_upper(successful, terrains, confidences[1]),
-        *confidences,
-        consumer_risk=proportions.consumer_risk(terrains - failed, terrains, required.probability),
+    return replace(
+        verdict,
+        lower=proportions.proportion_lower(terrains - failed, terrains, confidences[0]),
+        upper=proportions.proportion_upper(successful, terrains, confidences[1]),
+        bounds_confidence=confidences[0],
+        upper_confidence=confidences[1],
+        consumer_risk=proportions.consumer_risk(terrains - failed, terrains, verdict.probability),
         further_cases=pass_test.cases_needed(terrains, failed) - terrains,
         clustered=evidence,
     )
@@ -137,17 +109,21 @@ def _clustered_test(cases: ClusteredCases, in_first_look: Mask, rate: float, ris
     return SequentialTest(rate, risk, first_n, first_risk if cases.member.all() or first_risk == 0.0 else risk)
 
 
-def _sequential_tests(required: RequiredRate, first_n: int) -> tuple[SequentialTest, SequentialTest]:
+def _sequential_tests(verdict: Verdict, first_n: int) -> tuple[SequentialTest, SequentialTest]:
     """Create the tests for PASS and for FAIL at looks after the first, for independent cases."""
+    risk = 1.0 - verdict.confidence
     return (
-        SequentialTest(1.0 - required.probability, required.risk, first_n),
-        SequentialTest(required.probability, required.risk, first_n),
+        SequentialTest(1.0 - verdict.probability, risk, first_n), SequentialTest(verdict.probability, risk, first_n)
+    )  # fmt: skip
+
+
+def _add_binomial_bounds(verdict: Verdict, n: int, failures: int, confidences: tuple[float, float]) -> Verdict:
+    """Add the bounds of n independent cases at the confidences of the lower and of the upper bound."""
+    return replace(
+        verdict,
+        lower=proportions.proportion_lower(n - failures, n, confidences[0]),
+        upper=proportions.proportion_upper(n - failures, n, confidences[1]),
+        bounds_confidence=confidences[0],
+        upper_confidence=confidences[1],
+        consumer_risk=proportions.consumer_risk(n - failures, n, verdict.probability),
     )
-
-
-def _binomial_bounds(n: int, failures: int, required: RequiredRate, confidences: tuple[float, float]) -> RateBounds:
-    """Compute the bounds of n independent cases at the confidences of the lower and of the upper bound."""
-    lower = proportions.proportion_lower(n - failures, n, confidences[0])
-    upper = proportions.proportion_upper(n - failures, n, confidences[1])
-    risk = proportions.consumer_risk(n - failures, n, required.probability)
-    return RateBounds(lower, upper, *confidences, consumer_risk=risk, further_cases=0)

@@ -9,7 +9,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
 from marsyard.reports.multiplicity import multiplicity_text
 from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
 from marsyard.reports.rare import rare_section, read_result, result_sentences
+from marsyard.reports.record import SCHEMA, CampaignReport, StudySummary
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import read_search, search_section, search_sentences
@@ -55,11 +56,6 @@ STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget
 #: Maximum number of names of sites, and of algorithms, in `report.json`.
 _MAX_NAMES = 24
 
-#: Version of the layout of `report.json` and its JSON Schema. A removed field, or a new meaning, increases the version.
-SCHEMA = 7
-SCHEMA_FILE = Path(__file__).with_name("report.schema.json")
-#: Properties of a verdict that `report.json` contains next to its fields.
-_VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "margin")
 PAGE_FILE = "report.html"
 REPORT_JSON = "report.json"
 VERIFICATION_FILE = "verification.csv"
@@ -94,11 +90,11 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     subject = Subject(random_run, metric, bound)
     makers = STUDY_SECTIONS if is_study else section_makers()
     extra_sections = [section for maker in makers if (section := maker(subject)) is not None]
-    report_data = build_report_data(evaluation, subject, extra_sections)
+    report = build_report(evaluation, subject, extra_sections)
     algorithms = read_algorithms(run.record)
     write_atomic(
         directory / REPORT_JSON,
-        hide_folders(json.dumps(report_data, indent=2, allow_nan=False, ensure_ascii=False)) + "\n",
+        hide_folders(json.dumps(report.to_json(), indent=2, allow_nan=False, ensure_ascii=False)) + "\n",
     )
     rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
     write_atomic(directory / VERIFICATION_FILE, hide_folders(verification_csv(rows)))
@@ -239,7 +235,7 @@ def study_sentences(record: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def describe_study(record: Mapping[str, Any]) -> dict[str, str] | None:
+def describe_study(record: Mapping[str, Any]) -> StudySummary | None:
     """Return kind, requirement and main result of a study for `report.json`; None for an ordinary campaign."""
     study, sentences = table(record.get("study")), study_sentences(record)
     if not study:
@@ -247,49 +243,42 @@ def describe_study(record: Mapping[str, Any]) -> dict[str, str] | None:
     # the first sentence of a rare study is its verdict, the second the probability
     main_sentences = sentences[1:2] if study.get("kind") == "rare" else sentences[:1]
     sentence = "".join(main_sentences) or "The study is not finished."
-    return {"kind": str(study.get("kind")), "requirement": str(study.get("requirement")), "sentence": sentence}
+    return StudySummary(str(study.get("kind")), str(study.get("requirement")), sentence)
 
 
-def build_report_data(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> dict[str, Any]:
-    """Create the data of `report.json`; NaN and infinities become null."""
-    run, sampling, overall_verdict = evaluation.run, evaluation.sampling, evaluation.overall_verdict
-    metric = subject.metric
+def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> CampaignReport:
+    """Create the record of `report.json`."""
+    run, overall_verdict, metric = evaluation.run, evaluation.overall_verdict, subject.metric
     summaries = error_summaries(subject.all_cases, metric) if metric is not None else []
-    report_data = {
-        "schema": SCHEMA,
-        "campaign": run.name,
+    worst_rows = [] if metric is None else sections.worst_cases(subject.run, metric).rows
+    return CampaignReport(
+        schema=SCHEMA,
+        campaign=run.name,
         **{key: run.recorded(key) for key in ("state", "seed", "git_commit", "started_utc", "finished_utc")},
-        "cases": len(run.all_cases),
-        "crashed": overall_verdict.crashed,
-        "sites": _unique_values(run.frame, "site"),
-        "algorithms": _unique_values(run.frame, "algorithm"),
-        "algorithm_details": [asdict(algorithm) for algorithm in read_algorithms(run.record)],
-        "sampling": {**asdict(sampling), "independent": sampling.independent, "text": sampling.text},
-        "evidence": {
-            **evaluation.evidence.to_table(),
-            "title": evaluation.evidence.title,
-            "text": evaluation.evidence.text,
-        },
-        "verdict": overall_verdict.word,
-        "sentence": overall_verdict.sentence,
-        "study": describe_study(run.record),
-        "exit_code": evaluation.exit_code,
-        "verdicts": [
-            asdict(verdict) | {name: getattr(verdict, name) for name in _VERDICT_PROPERTIES}
-            for verdict in evaluation.verdicts
-        ],
-        "outcomes": dict(outcome_counts(run.all_cases)),
-        "metric": metric,
-        "statistics": {name: asdict(values) for name, values in summaries},
-        "worst_cases": [] if metric is None else [row.case for row in sections.worst_cases(subject.run, metric).rows],
-        "sections": {section.key: section.data for section in extra_sections},
-        "showcases": run.showcases,
-    }
-    return dict(_to_json_types(report_data))
+        cases=len(run.all_cases),
+        crashed=overall_verdict.crashed,
+        sites=_unique_values(run.frame, "site"),
+        algorithms=_unique_values(run.frame, "algorithm"),
+        algorithm_details=tuple(read_algorithms(run.record)),
+        sampling=evaluation.sampling,
+        evidence=evaluation.evidence,
+        verdict=overall_verdict.word,
+        sentence=overall_verdict.sentence,
+        study=describe_study(run.record),
+        exit_code=evaluation.exit_code,
+        verdicts=tuple(evaluation.verdicts),
+        outcomes=dict(outcome_counts(run.all_cases)),
+        metric=metric,
+        statistics=dict(summaries),
+        worst_cases=tuple(row.case for row in worst_rows),
+        sections={section.key: section.data for section in extra_sections},
+        showcases=run.showcases,
+    )
 
 
-def _unique_values(frame: pd.DataFrame, column: str) -> list[str]:
-    return [] if column not in frame else [str(value) for value in frame[column].dropna().unique()[:_MAX_NAMES]]
+def _unique_values(frame: pd.DataFrame, column: str) -> tuple[str, ...]:
+    values = frame[column].dropna().unique()[:_MAX_NAMES] if column in frame else ()
+    return tuple(str(value) for value in values)
 
 
 def status_class(word: object) -> str:
@@ -315,17 +304,6 @@ def page_environment() -> Environment:
     environment.filters["status_class"] = status_class
     environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
     return environment
-
-
-def _to_json_types(value: Any) -> Any:
-    """Convert a value to types of JSON; NaN and infinities become None, folders of the user are hidden."""
-    if isinstance(value, Mapping):
-        return {str(name): _to_json_types(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_to_json_types(inner) for inner in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, int | bool) else hide_folders(str(value))
 
 
 def write_atomic(path: Path, text: str) -> None:

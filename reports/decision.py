@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports import rates
-from marsyard.reports.bounds import Looks, RequiredRate, clustered_bounds, independent_bounds
+from marsyard.reports.bounds import Looks, add_clustered_bounds, add_independent_bounds
 from marsyard.reports.case_evidence import CaseEvidence, Mask, RequirementEvidence
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics import proportions
@@ -23,23 +23,12 @@ from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, AllCases, Status, V
 from marsyard.reports.wording import count
 
 
-def _add_bounds(verdict: Verdict, evidence: CaseEvidence, looks: Looks) -> tuple[Verdict, int]:
-    """Add bounds of the success rate of at least one case; also return the additional cases for PASS."""
-    required = RequiredRate(verdict.probability, verdict.confidence)
-    plain, clustered = independent_bounds(evidence.success, evidence.member, required, looks), evidence.clustered
-    bounds = plain if clustered is None else clustered_bounds(clustered, required, looks)
-    verdict = replace(
-        verdict,
-        lower=bounds.lower,
-        upper=bounds.upper,
-        plain_lower=plain.lower,
-        plain_upper=plain.upper,
-        bounds_confidence=bounds.lower_confidence,
-        upper_confidence=bounds.upper_confidence,
-        consumer_risk=bounds.consumer_risk,
-        clustered=bounds.clustered,
-    )
-    return verdict, bounds.further_cases
+def _add_bounds(verdict: Verdict, evidence: CaseEvidence, looks: Looks) -> Verdict:
+    """Add bounds of the success rate of at least one case, and the additional cases for PASS."""
+    plain = add_independent_bounds(verdict, evidence.success, evidence.member, looks)
+    clustered = evidence.clustered
+    bounded = plain if clustered is None else add_clustered_bounds(plain, clustered, looks)
+    return replace(bounded, plain_lower=plain.lower, plain_upper=plain.upper)
 
 
 def evaluate_requirements(
@@ -206,7 +195,8 @@ def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, 
         return replace(with_counts, status=status, reason=reason)
     in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look
     looks = Looks(in_first_look, sampling.risk_fraction_at(len(frame)))
-    verdict_with_bounds, additional = _add_bounds(with_counts, evidence, looks)
+    bounded = _add_bounds(with_counts, evidence, looks)
+    additional, verdict_with_bounds = bounded.further_cases or 0, replace(bounded, further_cases=None)
     status = verdict_with_bounds.confident_status
     decides_by_rate = decides_by_rate and status is not Status.PASS
     if decides_by_rate:

@@ -3,30 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
 
-from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import format_fraction
 
 
-@runtime_checkable
-class DecidedVerdict(Protocol):
-    """Verdict of a requirement: way of its decision, confidence, and number of cases of its population."""
-
-    @property
-    def decide_by(self) -> str:
-        """`confidence` or `estimate`."""
-
-    @property
-    def confidence(self) -> float:
-        """Required confidence."""
-
-    @property
-    def n(self) -> int:
-        """Number of cases of the population."""
-
-
-def multiplicity_text(verdicts: Sequence[DecidedVerdict]) -> str:
+def multiplicity_text(verdicts: Sequence[Verdict]) -> str:
     """State the expected number of false PASSes and the joint confidence; empty for fewer than two requirements.
 
     A requirement that is not met gets PASS with a probability of at most 1 - confidence (consumer's risk). The expected

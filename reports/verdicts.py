@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from marsyard.reports.statistics.clusters import TerrainEvidence
+from marsyard.reports.statistics.number import Number
 from marsyard.reports.wording import count, format_fraction, percent, population_text
 
 #: Beginning of the statement of a requirement whose population the flight system cannot know.
@@ -46,9 +47,9 @@ class AllCases:
     status: Status
     n: int
     failures: int
-    estimate: float
-    lower: float
-    upper: float
+    estimate: Number
+    lower: Number
+    upper: Number
     configured: tuple[str, ...] = ()
 
     @property
@@ -87,26 +88,26 @@ class Verdict:
     requirement_id: str
     statement: str
     metric: str
-    bound: float
-    probability: float
-    confidence: float
+    bound: Number
+    probability: Number
+    confidence: Number
     population: str
     status: Status = Status.INSUFFICIENT
     n: int = 0
     failures: int = 0
-    estimate: float = math.nan
-    lower: float = math.nan
-    upper: float = math.nan
+    estimate: Number = math.nan
+    lower: Number = math.nan
+    upper: Number = math.nan
     further_cases: int | None = None
     decide_by: str = "confidence"
     reason: str = ""
     terrains: int | None = None
     clustered: TerrainEvidence | None = None
-    consumer_risk: float = math.nan
-    plain_lower: float = math.nan
-    plain_upper: float = math.nan
-    bounds_confidence: float = math.nan
-    upper_confidence: float = math.nan
+    consumer_risk: Number = math.nan
+    plain_lower: Number = math.nan
+    plain_upper: Number = math.nan
+    bounds_confidence: Number = math.nan
+    upper_confidence: Number = math.nan
     advice: str = ""
     accept_rate: bool = False
     withheld_status: Status | None = None
@@ -115,7 +116,7 @@ class Verdict:
     joint_text: str = ""
     source: str = ""
     kind: str = ""
-    scale: float = 1.0
+    scale: Number = 1.0
 
     @property
     def plain_status(self) -> Status | None:

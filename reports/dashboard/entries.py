@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.requirements import SharedRequirement
-from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store.record import reject_links
-from marsyard.reports.campaign import REPORT_JSON, SCHEMA, is_own_report, write_evaluation
+from marsyard.reports.campaign import REPORT_JSON, is_own_report, write_evaluation
 from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.record import CampaignReport, read_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import Algorithm, format_tested_algorithms, read_algorithms
-from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status
+from marsyard.reports.traceability import format_tested_algorithms
+from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict
 from marsyard.reports.wording import NOTHING, percent
 from marsyard.scenarios.systems import find_system
 
@@ -27,85 +28,48 @@ _MAX_DEPTH = 3
 
 
 @dataclass(frozen=True)
-class RequirementVerdict:
-    """Verdict of a campaign on one requirement, from `report.json`; see `marsyard.reports.verdicts.Verdict`.
-
-    - margin: value that decides (lower bound or rate) minus the required probability; NaN if unknown
-    - n, failures: number of cases of the population, and of those that violate the requirement
-    - all_cases: text with the failures over all cases; empty if the population is all cases
-    """
-
-    requirement: str
-    statement: str
-    status: str
-    estimate: float
-    lower: float
-    probability: float
-    margin: float
-    n: int
-    failures: int
-    confidence: float
-    decide_by: str
-    note: str
-    all_cases: str
-
-
-@dataclass(frozen=True)
-class Study:
-    """Kind (`rare`, `search`, `budget`), requirement and main result of a study."""
-
-    kind: str
-    requirement: str
-    sentence: str
-
-
-@dataclass(frozen=True)
 class Entry:
-    """A stored campaign, from its record and its report; fields are empty if not recorded.
+    """A stored campaign.
 
     - slug: name of the campaign's folder in the site: letters, digits and hyphens, with a hash of the campaign's path
-    - report: folder of the report: the campaign's folder, or that of its pages
-    - evidence: kind of evidence of the run (`marsyard.campaigns.definition.evidence`)
-    - tested: algorithms with versions, options and source hashes: those under test first, then those only compared
-    - study: main result of a study; None for an ordinary campaign
-    - worst: numbers of the cases with the largest errors, the largest first
+    - folder: folder of the report: the campaign's folder, or that of its pages
+    - sites, algorithms: names from the rows, else from the parameters
+    - report: the content of `report.json`
     """
 
     slug: str
     directory: Path
-    report: Path
+    folder: Path
     name: str
     system: str
     sites: tuple[str, ...]
     algorithms: tuple[str, ...]
-    tested: tuple[Algorithm, ...]
-    commit: str
-    evidence: str
-    started: str
-    state: str
-    cases: int
-    crashed: int
-    verdict: str
-    sentence: str
-    requirements: tuple[RequirementVerdict, ...]
-    worst: tuple[str, ...]
-    outcomes: Mapping[str, int]
-    study: Study | None = None
+    report: CampaignReport
 
     @property
     def title(self) -> str:
         """Name of the campaign, and kind of the study."""
-        return self.name if self.study is None else f"{self.name}, {self.study.kind}"
+        return self.name if self.report.study is None else f"{self.name}, {self.report.study.kind}"
 
     @property
     def tested_names(self) -> str:
         """Names and versions of the algorithm under test; names from the rows if the record contains none."""
-        return format_tested_algorithms(self.tested) or ", ".join(self.algorithms)
+        return format_tested_algorithms(self.report.algorithm_details) or ", ".join(self.algorithms)
 
     @property
-    def finished(self) -> bool:
+    def started(self) -> str:
+        """Start of the campaign (UTC); empty if not recorded."""
+        return str(self.report.started_utc or "")
+
+    @property
+    def commit(self) -> str:
+        """First digits of the commit of the program; empty if not recorded."""
+        return str(self.report.git_commit or "")[:10]
+
+    @property
+    def is_finished(self) -> bool:
         """Whether all cases have run."""
-        return self.state == "finished"
+        return bool(self.report.state == "finished")
 
 
 def find_campaigns(directories: Sequence[Path]) -> list[Path]:
@@ -148,69 +112,41 @@ def _read_entry(path: Path, pages: Path) -> Entry:
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
     name = str(record.get("name") or table(record.get("configuration")).get("name") or path.resolve().name)
     slug = make_slug(path, name)
-    folder = next((folder for folder in (path, pages / slug) if _is_valid(folder, path)), None)
-    if folder is None:
+    report, folder = _read_valid(path, path), path
+    if report is None:
         folder = pages / slug
+        report = _read_valid(folder, path)
+    if report is None:
         folder.mkdir(parents=True, exist_ok=True)
         write_evaluation(evaluate_run(path), folder)
-    report = _read_report(folder)
+        report = read_report((folder / REPORT_JSON).read_bytes())
+    if report is None:
+        raise StoreError(f"{folder / REPORT_JSON} has another layout than this version of Marsyard writes")
     parameters = table(table(record.get("configuration")).get("parameters"))
     system = find_system(str(table(record.get("configuration")).get("scenario")))
-    study = table(report.get("study"))
     return Entry(
         slug=slug,
         directory=path,
-        report=folder,
+        folder=folder,
         name=name,
         system="other" if system is None else system.name,
-        sites=_read_names(report, "sites", parameters, "site"),
-        algorithms=_read_names(report, "algorithms", parameters, "algorithm"),
-        tested=tuple(read_algorithms(record)),
-        commit=str(report.get("git_commit") or "")[:10],
-        evidence=str(table(report.get("evidence")).get("title") or ""),
-        started=str(report.get("started_utc") or ""),
-        state=str(report.get("state") or ""),
-        cases=int(report.get("cases") or 0),
-        crashed=int(report.get("crashed") or 0),
-        verdict=str(report.get("verdict") or ""),
-        sentence=str(report.get("sentence") or ""),
-        requirements=tuple(_read_verdict(table(verdict)) for verdict in report.get("verdicts") or ()),
-        worst=tuple(str(case) for case in report.get("worst_cases") or ()),
-        outcomes={str(key): int(value) for key, value in table(report.get("outcomes")).items()},
-        study=Study(*(str(study.get(name)) for name in ("kind", "requirement", "sentence"))) if study else None,
+        sites=report.sites or _find_names(parameters, "site"),
+        algorithms=report.algorithms or _find_names(parameters, "algorithm"),
+        report=report,
     )
 
 
-def _read_report(folder: Path) -> Mapping[str, Any]:
-    return table(json.loads((folder / REPORT_JSON).read_text(encoding="utf-8")))
-
-
-def _is_valid(folder: Path, path: Path) -> bool:
-    """Whether a folder contains a report that this installation wrote from the rows and the confirmations of today."""
+def _read_valid(folder: Path, path: Path) -> CampaignReport | None:
+    """Read a report that this installation wrote from the rows and the confirmations of today; None for another."""
     if not is_own_report(folder, path):
-        return False
-    report = _read_report(folder)
-    evidence, written_s = table(report.get("evidence")), (folder / REPORT_JSON).stat().st_mtime
-    confirmations = Path(str(evidence.get("record") or ""))
-    if evidence.get("claim") and (not confirmations.is_file() or confirmations.stat().st_mtime > written_s):
-        return False
-    return report.get("schema") == SCHEMA
-
-
-def _read_verdict(verdict: Mapping[str, Any]) -> RequirementVerdict:
-    """Read a verdict of `report.json`."""
-    values: dict[str, Any] = {
-        name: str(verdict.get(name) or "") for name in ("statement", "status", "decide_by", "note")
-    }
-    for name in ("estimate", "lower", "probability", "margin", "confidence"):
-        values[name] = _to_float(verdict.get(name))
-    all_cases = table(verdict.get("all_cases"))
-    values["all_cases"] = f"over all cases {all_cases['failures']:,} of {all_cases['n']:,}" if all_cases else ""
-    if all_cases and all_cases["n"] == verdict.get("n"):
-        values["all_cases"] = ""
-    for name in ("n", "failures"):
-        values[name] = int(verdict.get(name) or 0)
-    return RequirementVerdict(requirement=str(verdict.get("requirement_id") or "?"), **values)
+        return None
+    file = folder / REPORT_JSON
+    report = read_report(file.read_bytes())
+    if report is not None and report.evidence.claim:
+        confirmations = Path(report.evidence.record)
+        if not confirmations.is_file() or confirmations.stat().st_mtime > file.stat().st_mtime:
+            return None
+    return report
 
 
 def make_slug(path: Path, name: str) -> str:
@@ -219,11 +155,9 @@ def make_slug(path: Path, name: str) -> str:
     return f"{safe_name}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
 
 
-def _read_names(report: Mapping[str, Any], key: str, parameters: Mapping[str, Any], parameter: str) -> tuple[str, ...]:
-    """Read names from the report; if there are none, read the name from the parameters."""
-    names = tuple(str(name) for name in report.get(key) or () if str(name))
-    name = _find_text(parameters, parameter)
-    return names or ((name,) if name else ())
+def _find_names(parameters: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    name = _find_text(parameters, key)
+    return (name,) if name else ()
 
 
 def _find_text(parameters: Mapping[str, Any], key: str) -> str:
@@ -235,11 +169,6 @@ def _find_text(parameters: Mapping[str, Any], key: str) -> str:
         if nested_value:
             return nested_value
     return ""
-
-
-def _to_float(value: Any) -> float:
-    """Convert a number to float; NaN for other values."""
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
 
 
 #: Maximum number of other campaigns next to a requirement's verdict.
@@ -267,7 +196,7 @@ class Cell:
     """Verdict of a campaign on a requirement."""
 
     entry: Entry
-    verdict: RequirementVerdict
+    verdict: Verdict
 
 
 @dataclass(frozen=True)
@@ -298,19 +227,19 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
     """Create a row for each requirement of `shared` and of the campaigns, the most severe verdict first."""
     cells: dict[str, list[Cell]] = {name: [] for name in shared}
     for entry in entries:
-        for verdict in entry.requirements:
-            cells.setdefault(verdict.requirement, []).append(Cell(entry, verdict))
-        if entry.study is not None:
-            cells.setdefault(entry.study.requirement, [])
+        for verdict in entry.report.verdicts:
+            cells.setdefault(verdict.requirement_id, []).append(Cell(entry, verdict))
+        if entry.report.study is not None:
+            cells.setdefault(entry.report.study.requirement, [])
     rows = []
     for name, unsorted_cells in cells.items():
-        sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.finished)
+        sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.is_finished)
         latest_by_campaign: dict[str, Cell] = {}
         for cell in sorted_cells:
             latest_by_campaign.setdefault(cell.entry.name, cell)
         latest = list(latest_by_campaign.values())
         history = [
-            cell.verdict for cell in sorted_cells if cell.entry.name == latest[0].entry.name and cell.entry.finished
+            cell.verdict for cell in sorted_cells if cell.entry.name == latest[0].entry.name and cell.entry.is_finished
         ]
         requirement, kind, source = shared.get(name), "", ""
         statement = latest[0].verdict.statement if latest else ""
@@ -319,7 +248,7 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
             kind, source = requirement.kind or "", requirement.source
         studies: dict[str, Entry] = {}
         for entry in entries:
-            if entry.study is not None and entry.study.requirement == name:
+            if entry.report.study is not None and entry.report.study.requirement == name:
                 studies.setdefault(entry.title, entry)
         line = sparkline(history[::-1])
         rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, line, [*studies.values()]))
@@ -341,7 +270,7 @@ def _severity(row: RequirementRow) -> int:
     return _SEVERITY.index(status) if status in _SEVERITY else len(_SEVERITY)
 
 
-def sparkline(verdicts: Sequence[RequirementVerdict]) -> Sparkline | None:
+def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
     """Create the line of observed rates over time and of the required rate; None for fewer than two campaigns."""
     finite = [verdict for verdict in verdicts if all(map(math.isfinite, (verdict.estimate, verdict.probability)))]
     finite = finite[-_MAX_POINTS:]
@@ -372,19 +301,22 @@ def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
 
 
-def evidence_text(verdict: RequirementVerdict) -> str:
+def evidence_text(verdict: Verdict) -> str:
     """Describe the number of cases of a verdict."""
     if not verdict.n:
         return "no case yet"
     text = f"{verdict.failures:,} of {verdict.n:,} failed"
-    return f"{text}; {verdict.all_cases}" if verdict.all_cases else text
+    all_cases = verdict.all_cases
+    if all_cases is None or all_cases.n == verdict.n:
+        return text
+    return f"{text}; over all cases {all_cases.failures:,} of {all_cases.n:,}"
 
 
-def basis_text(verdict: RequirementVerdict) -> str:
+def basis_text(verdict: Verdict) -> str:
     """Describe that a verdict is based on the observed rate; empty for a verdict at a confidence."""
     return "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
 
 
-def margin_text(verdict: RequirementVerdict) -> str:
+def margin_text(verdict: Verdict) -> str:
     """Format the margin of the deciding value relative to the required rate, in percentage points."""
     return NOTHING if math.isnan(verdict.margin) else f"{100.0 * verdict.margin:+.2f} pp".replace("-", "−")

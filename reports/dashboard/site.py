@@ -57,7 +57,7 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
         "Site": {site for entry in entries for site in entry.sites},
         "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
         "Commit": {entry.commit for entry in entries},
-        "Evidence": {entry.evidence for entry in entries},
+        "Evidence": {entry.report.evidence.title for entry in entries},
     }
     index = _render(
         "dashboard.html.j2",
@@ -86,11 +86,11 @@ def read_script() -> str:
 def _write_campaign(folder: Path, entry: Entry) -> None:
     """Write the pages of a campaign into its folder, unless they are newer than its report."""
     page = folder / INDEX
-    if page.is_file() and page.stat().st_mtime > (entry.report / REPORT_JSON).stat().st_mtime:
+    if page.is_file() and page.stat().st_mtime > (entry.folder / REPORT_JSON).stat().st_mtime:
         return
     folder.mkdir(parents=True, exist_ok=True)
-    report = (entry.report / PAGE_FILE).read_text(encoding="utf-8")
-    if entry.report != folder:
+    report = (entry.folder / PAGE_FILE).read_text(encoding="utf-8")
+    if entry.folder != folder:
         write_atomic(folder / PAGE_FILE, report)
     excerpts = read_excerpts(report)
     rows = read_cases(entry.directory, list(excerpts.cases))
@@ -104,16 +104,16 @@ def _write_campaign(folder: Path, entry: Entry) -> None:
         | {"rank": _describe_rank(entry, case)}
         for case in excerpts.cases
     ]
-    multiplicity = multiplicity_text(entry.requirements)
+    multiplicity = multiplicity_text(entry.report.verdicts)
     context = {"entry": entry, "cases": cases, "lists": excerpts.lists, "multiplicity": multiplicity}
     write_atomic(page, _render("dashboard_campaign.html.j2", **context, **_FORMATTERS))
 
 
 def _describe_rank(entry: Entry, case: int) -> str:
     """Describe the rank of a case by its error; empty if the case is not among the largest errors."""
-    if str(case) not in entry.worst:
+    if str(case) not in entry.report.worst_cases:
         return ""
-    return "the largest error" if entry.worst[0] == str(case) else "among the largest errors"
+    return "the largest error" if entry.report.worst_cases[0] == str(case) else "among the largest errors"
 
 
 def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
@@ -124,12 +124,12 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "slug": cell.entry.slug,
                 "name": cell.entry.name,
                 "algorithm": cell.entry.tested_names,
-                "kind": cell.entry.evidence,
+                "kind": cell.entry.report.evidence.title,
                 "status": cell.verdict.status,
                 "margin": margin_text(cell.verdict),
                 "date": cell.entry.started[:10],
                 "evidence": evidence_text(cell.verdict),
-                "finished": cell.entry.finished,
+                "finished": cell.entry.is_finished,
                 "rate": cell.verdict.estimate if math.isfinite(cell.verdict.estimate) else None,
                 "required": cell.verdict.probability if math.isfinite(cell.verdict.probability) else None,
                 "rate_text": percent(cell.verdict.estimate),
@@ -152,8 +152,8 @@ def _create_traceability_csv(rows: Sequence[RequirementRow]) -> str:
             csv_rows.append({**head, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
             verdict = {column: getattr(cell.verdict, name) for column, name in fields.items()}
-            cells = {"campaign": cell.entry.name, "evidence": cell.entry.evidence}
-            csv_rows.append({**head, **cells, **algorithm_cells(cell.entry.tested), **verdict})
+            cells = {"campaign": cell.entry.name, "evidence": cell.entry.report.evidence.title}
+            csv_rows.append({**head, **cells, **algorithm_cells(cell.entry.report.algorithm_details), **verdict})
     return verification_csv(csv_rows)
 
 

@@ -32,6 +32,7 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from marsyard.reports.statistics.clusters import count_sizes, event_scores, max_statistic, number_terrains
+from marsyard.reports.statistics.number import Number
 from marsyard.reports.statistics.proportions import Interval, check_confidence
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
@@ -232,10 +233,10 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
 class Quantile:
     """Quantile of a sample: probability, estimate and one-sided bounds (infinite where n is too small)."""
 
-    probability: float
-    estimate: float
-    lower: float
-    upper: float
+    probability: Number
+    estimate: Number
+    lower: Number
+    upper: Number
 
 
 @dataclass(frozen=True)
@@ -252,18 +253,18 @@ class ErrorSummary:
 
     n: int
     missing: int
-    mean: float
-    mean_lower: float
-    mean_upper: float
-    sd: float
-    sd_lower: float
-    sd_upper: float
-    rms: float
-    median: float
-    robust_sd: float
-    largest: float
+    mean: Number
+    mean_lower: Number
+    mean_upper: Number
+    sd: Number
+    sd_lower: Number
+    sd_upper: Number
+    rms: Number
+    median: Number
+    robust_sd: Number
+    largest: Number
     quantiles: tuple[Quantile, ...]
-    confidence: float
+    confidence: Number
 
 
 def summarize(

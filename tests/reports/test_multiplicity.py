@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,28 +15,26 @@ from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.multiplicity import multiplicity_text
 from marsyard.reports.statistics.proportions import proportion_lower
+from marsyard.reports.verdicts import Verdict
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
 
 
-@dataclass(frozen=True)
-class Decided:
-    confidence: float
-    decide_by: str = "confidence"
-    n: int = 100
+def _make_verdict(confidence: float, decide_by: str = "confidence", n: int = 100) -> Verdict:
+    return Verdict("R", "", "error_m", 1.0, 0.95, confidence, "all", decide_by=decide_by, n=n)
 
 
 def test_risks_of_requirements_are_added() -> None:
-    assert multiplicity_text([]) == multiplicity_text([Decided(0.9)]) == ""
-    text = multiplicity_text([Decided(0.9), Decided(0.9), Decided(0.95)])
+    assert multiplicity_text([]) == multiplicity_text([_make_verdict(0.9)]) == ""
+    text = multiplicity_text([_make_verdict(0.9), _make_verdict(0.9), _make_verdict(0.95)])
     assert text.startswith("3 requirements are decided at a confidence: if none is met, up to 0.25 false PASSes")
     assert text.endswith("Their PASSes hold together with at least 75 % confidence.")
     # requirements without a verdict at a confidence have no risk of a false PASS
-    others = [Decided(0.9, "estimate"), Decided(0.9, n=0), Decided(float("nan")), Decided(1.5)]
-    assert multiplicity_text([*others, Decided(0.9)]) == ""
-    assert multiplicity_text([*others, Decided(0.9), Decided(0.9)]).startswith("2 requirements")
-    assert multiplicity_text([Decided(0.9)] * 10).endswith("A single PASS of these is weak evidence.")
+    others = [_make_verdict(0.9, "estimate"), _make_verdict(0.9, n=0), _make_verdict(float("nan")), _make_verdict(1.5)]
+    assert multiplicity_text([*others, _make_verdict(0.9)]) == ""
+    assert multiplicity_text([*others, _make_verdict(0.9), _make_verdict(0.9)]).startswith("2 requirements")
+    assert multiplicity_text([_make_verdict(0.9)] * 10).endswith("A single PASS of these is weak evidence.")
 
 
 def test_stated_number_bounds_the_false_passes_of_a_simulation() -> None:

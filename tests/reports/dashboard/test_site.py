@@ -21,7 +21,6 @@ from marsyard.campaigns.store import record
 from marsyard.reports import campaign
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.entries import (
-    RequirementVerdict,
     find_campaigns,
     make_slug,
     margin_text,
@@ -33,6 +32,7 @@ from marsyard.reports.dashboard.excerpts import read_excerpts
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sections import script_hash
+from marsyard.reports.verdicts import Status, Verdict
 
 Rows = Callable[..., pd.DataFrame]
 MakeRun = Callable[..., Path]
@@ -257,22 +257,8 @@ def test_folders_with_links_are_refused(
             read(directory)
 
 
-def _make_verdict(estimate: float, margin: float = -0.05) -> RequirementVerdict:
-    return RequirementVerdict(
-        requirement="R",
-        statement="",
-        status="PASS",
-        estimate=estimate,
-        lower=0.9,
-        probability=0.95,
-        margin=margin,
-        n=10,
-        failures=1,
-        confidence=0.9,
-        decide_by="",
-        note="",
-        all_cases="",
-    )
+def _make_verdict(estimate: float, lower: float = 0.9) -> Verdict:
+    return Verdict("R", "", "error_m", 1.0, 0.95, 0.9, "all", Status.PASS, estimate=estimate, lower=lower)
 
 
 def test_sparkline_rises_with_the_rate() -> None:
@@ -287,8 +273,8 @@ def test_sparkline_rises_with_the_rate() -> None:
 
 def test_margin_is_printed_in_percentage_points() -> None:
     assert margin_text(_make_verdict(0.9)) == "−5.00 pp"
-    assert margin_text(_make_verdict(0.9, margin=0.0123)) == "+1.23 pp"
-    assert margin_text(_make_verdict(0.9, margin=float("nan"))) == "–"
+    assert margin_text(_make_verdict(0.9, lower=0.9623)) == "+1.23 pp"
+    assert margin_text(_make_verdict(0.9, lower=float("nan"))) == "–"
 
 
 def test_index_without_campaigns_is_written(tmp_path: Path) -> None:
