@@ -334,17 +334,20 @@ NEES, NEES_DIMENSION = "velocity_nees", 2
 BAND_PROBABILITY = 0.95
 
 
-def evaluate_consistency(nees: Float[np.ndarray, " n"], dimension: int = NEES_DIMENSION) -> dict[str, Any]:
+def evaluate_consistency(
+    nees: Float[np.ndarray, " n"], dimension: int = NEES_DIMENSION, probability: float = BAND_PROBABILITY
+) -> dict[str, Any]:
     """Evaluate from the NEES of estimates whether their errors agree with their covariances.
 
-    Keys: mean NEES with its 95 % band for correct covariances, fraction of errors `inside` their 95 % ellipse with its
-    90 % interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
+    Keys: mean NEES with its band for correct covariances, fraction of errors `inside` their ellipse with its 90 %
+    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic". Band and
+    ellipse have the given probability.
     """
     n, mean = nees.size, float(nees.mean())
-    tail = 0.5 * (1.0 - BAND_PROBABILITY)
+    tail = 0.5 * (1.0 - probability)
     # for correct covariances, the sum of n NEES has a chi-square distribution with n * dimension degrees of freedom
-    lower, upper = (float(stats.chi2.ppf(probability, dimension * n)) / n for probability in (tail, 1.0 - tail))
-    inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, dimension)).sum())
+    lower, upper = (float(stats.chi2.ppf(level, dimension * n)) / n for level in (tail, 1.0 - tail))
+    inside = int((nees <= stats.chi2.ppf(probability, dimension)).sum())
     low, high = proportion_interval(inside, n, CONFIDENCE)
     word = "optimistic" if mean > upper else "pessimistic" if mean < lower else "consistent"
     band = {"n": n, "mean": mean, "lower": lower, "upper": upper}

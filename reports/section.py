@@ -129,16 +129,35 @@ def _hide_frame(axes: Axes) -> None:
     axes.spines[:].set_visible(False)
 
 
+@dataclass(frozen=True)
+class MarkedImage:
+    """An image with its title, and marks at pixels (u, v), each with matplotlib's properties of a line.
+
+    Pixels of shape (n, 2) are n markers, those of shape (2, n, 2) are n segments from the first to the second pixels.
+    """
+
+    title: str
+    image: Float[np.ndarray, "_ _"]
+    marks: Sequence[tuple[Float[np.ndarray, "*n 2"], Mapping[str, Any]]] = ()
+
+
 @in_page_style
+def draw_marked_images(images: Sequence[MarkedImage], size_in: tuple[float, float]) -> Figure:
+    """Draw images with their marks in a row; `size_in` is the size of the figure, inches."""
+    figure = Figure(figsize=size_in, layout="constrained")
+    for axes, item in zip(np.ravel(figure.subplots(1, len(images))), images, strict=True):
+        show_image(axes, item.image)
+        for pixels, style in item.marks:
+            axes.plot(*np.moveaxis(pixels, -1, 0), **style)
+        axes.set_title(item.title, fontsize=9)
+    return figure
+
+
 def draw_images(images: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
     """Draw numbered images in a row, for a case without details of the algorithm."""
     rows, columns = images[0].shape
-    height = 12.0 / len(images) * rows / columns + 0.35
-    figure = Figure(figsize=(12.0, height), layout="constrained")
-    for number, (axes, image) in enumerate(zip(figure.subplots(1, len(images)), images, strict=True), start=1):
-        show_image(axes, image)
-        axes.set_title(f"Image {number}", fontsize=9)
-    return figure
+    numbered = [MarkedImage(f"Image {number}", image) for number, image in enumerate(images, start=1)]
+    return draw_marked_images(numbered, (12.0, 12.0 / len(images) * rows / columns + 0.35))
 
 
 T = TypeVar("T")

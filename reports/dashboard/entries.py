@@ -256,18 +256,14 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
 
 
 #: Order of the requirements by their latest verdict.
-_SEVERITY = tuple(
-    map(
-        str,
-        (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS, Status.PASS),
-    )
-)
+_SEVERITY = (
+    Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS, Status.PASS,
+)  # fmt: skip
 
 
 def _severity(row: RequirementRow) -> int:
     """Return the rank of a row by its latest verdict: failed requirements first, those without a campaign last."""
-    status = "" if row.latest is None else row.latest.verdict.status
-    return _SEVERITY.index(status) if status in _SEVERITY else len(_SEVERITY)
+    return len(_SEVERITY) if row.latest is None else _SEVERITY.index(row.latest.verdict.status)
 
 
 def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
@@ -294,9 +290,7 @@ def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
 def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Count the requirements per latest verdict; requirements without a campaign come last."""
     statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
-    ordered = dict.fromkeys((*_SEVERITY, *statuses))
-    present_statuses = [status for status in ordered if status in statuses]
-    counts = [(status, statuses.count(status)) for status in present_statuses]
+    counts = [(str(status), statuses.count(status)) for status in _SEVERITY if status in statuses]
     n_missing = sum(row.latest is None for row in rows)
     return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
 

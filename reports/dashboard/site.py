@@ -21,7 +21,7 @@ from marsyard.reports.dashboard.excerpts import case_file, read_excerpts
 from marsyard.reports.multiplicity import multiplicity_text
 from marsyard.reports.sections import embed_json, script_hash
 from marsyard.reports.stored import read_cases
-from marsyard.reports.traceability import algorithm_cells, verification_csv
+from marsyard.reports.traceability import requirement_evidence, verification_csv
 from marsyard.reports.wording import NOTHING, percent
 
 INDEX = "index.html"
@@ -144,16 +144,15 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
 def _create_traceability_csv(rows: Sequence[RequirementRow]) -> str:
     """Create the traceability matrix as CSV: the latest verdicts, and requirements without a campaign."""
     csv_rows: list[dict[str, Any]] = []
-    fields = {"verdict": "status", "decided_by": "decide_by", "cases": "n", "rate": "estimate", "lower_bound": "lower"}
-    fields |= {name: name for name in ("probability", "confidence", "failures", "note")}
     for row in rows:
         head = {"requirement": row.requirement, "statement": row.statement, "kind": row.kind, "source": row.source}
         if not row.cells:
             csv_rows.append({**head, "verdict": "NO CAMPAIGN"})
         for cell in row.cells:
-            verdict = {column: getattr(cell.verdict, name) for column, name in fields.items()}
-            cells = {"campaign": cell.entry.name, "evidence": cell.entry.report.evidence.title}
-            csv_rows.append({**head, **cells, **algorithm_cells(cell.entry.report.algorithm_details), **verdict})
+            report = cell.entry.report
+            algorithms, evidence = report.algorithm_details, report.evidence.title
+            (evidence_row,) = requirement_evidence(cell.entry.name, [cell.verdict], algorithms, evidence)
+            csv_rows.append(evidence_row | head)
     return verification_csv(csv_rows)
 
 

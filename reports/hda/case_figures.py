@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.hda import products as stages
 from marsyard.reports.presentation import save_figures
-from marsyard.reports.section import MUTED, in_page_style, show_image
+from marsyard.reports.section import MUTED, MarkedImage, draw_marked_images, in_page_style, show_image
 
 Product = TypeVar("Product")
 
@@ -47,19 +47,34 @@ _MAX_DRAWN_CELLS = 90
 #: Minimum ratio of the drawn relief to the terrain's side; heights are exaggerated up to ten times.
 _MIN_RELIEF = 0.12
 _BACKGROUND = "#15191e"
+#: Size of a figure of both images, inches, and styles of their marks.
+_PAIR_SIZE_IN = (9.0, 3.6)
+_SEGMENT: dict[str, Any] = {"linewidth": 0.8}
+_SQUARE: dict[str, Any] = {
+    "marker": "s", "linestyle": "", "markersize": 2.6, "markerfacecolor": "none", "markeredgewidth": 0.9,
+}  # fmt: skip
+_TRACKED = _SQUARE | {"markersize": 5.5, "markeredgewidth": 1.3, "color": TRACKED_COLOUR, "label": "tracked"}
+_LOST: dict[str, Any] = {
+    "marker": "x", "linestyle": "", "markersize": 5.0, "color": LOST_COLOUR, "markeredgewidth": 1.2,
+    "label": "not tracked",
+}  # fmt: skip
 
 
-@in_page_style
 def draw_tracks(products: Mapping[str, Any]) -> Figure:
     """Draw Fig. 1: features in the first image, their tracks in the second."""
-    figure, left, right = _draw_image_pair(products)
+    images = _require(stages.read_images(products), "images")
     tracks = _require(stages.read_tracked_features(products), "tracks")
-    _draw_features(left, tracks.first, tracks)
-    _draw_segments(right, tracks.first[tracks.accepted], tracks.second[tracks.accepted], TRACKED_COLOUR, alpha=0.9)
-    _draw_features(right, tracks.second, tracks, show_lost=False)
-    left.set_title(f"First image: {len(tracks.first)} features", fontsize=9)
-    right.set_title(f"Second image: {int(tracks.accepted.sum())} tracks", fontsize=9)
-    left.legend(loc="lower left", labelcolor=WHITE, frameon=True, facecolor=BLACK, framealpha=0.5, fontsize=8)
+    is_tracked = tracks.accepted
+    features = [(tracks.first[is_tracked], _TRACKED)]
+    if not is_tracked.all():
+        features.append((tracks.first[~is_tracked], _LOST))
+    segments = np.stack([tracks.first[is_tracked], tracks.second[is_tracked]])
+    left = MarkedImage(f"First image: {len(tracks.first)} features", images[0], features)
+    marks = [(segments, _SEGMENT | {"color": TRACKED_COLOUR, "alpha": 0.9}), (tracks.second[is_tracked], _TRACKED)]
+    right = MarkedImage(f"Second image: {int(is_tracked.sum())} tracks", images[1], marks)
+    figure = draw_marked_images([left, right], _PAIR_SIZE_IN)
+    style: dict[str, Any] = {"frameon": True, "facecolor": BLACK, "framealpha": 0.5, "fontsize": 8}
+    figure.axes[0].legend(loc="lower left", labelcolor=WHITE, **style)
     return figure
 
 
@@ -78,10 +93,9 @@ def draw_motion(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-@in_page_style
 def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     """Draw Fig. 3: structure pixels in the first image, their segments and matches in the second."""
-    figure, left, right = _draw_image_pair(products)
+    images = _require(stages.read_images(products), "images")
     matches = _require(stages.read_matches(products), "matches")
     # draw every `step`-th row and column of the grid, so that at most `_MAX_MATCHES` are drawn
     step, indices = 1, np.arange(len(matches.grid))
@@ -89,16 +103,17 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
     while len(indices) > _MAX_MATCHES:
         step += 1
         indices = np.flatnonzero((v % step == step // 2) & (u % step == step // 2))
-    _draw_squares(left, matches.grid[indices], "#ff4b3e")
-    _draw_segments(right, matches.starts[indices], matches.ends[indices], "#35d46b")
-    _draw_squares(right, matches.matched[indices][matches.accepted[indices]], BLUE)
     n_pixels, n_matches = f"{len(matches.grid):,}", f"{int(matches.accepted.sum()):,}"
     if len(indices) < len(matches.grid):
         n_pixels = f"{len(indices):,} of {n_pixels}"
         n_matches = f"{int(matches.accepted[indices].sum()):,} of {n_matches}"
-    left.set_title(f"First image: {n_pixels} structure pixels", fontsize=9)
-    right.set_title(f"Second image: {n_matches} matches", fontsize=9)
-    return figure
+    segments = np.stack([matches.starts[indices], matches.ends[indices]])
+    matched = matches.matched[indices][matches.accepted[indices]]
+    first_marks = [(matches.grid[indices], _SQUARE | {"color": "#ff4b3e"})]
+    second_marks = [(segments, _SEGMENT | {"color": "#35d46b"}), (matched, _SQUARE | {"color": BLUE})]
+    left = MarkedImage(f"First image: {n_pixels} structure pixels", images[0], first_marks)
+    right = MarkedImage(f"Second image: {n_matches} matches", images[1], second_marks)
+    return draw_marked_images([left, right], _PAIR_SIZE_IN)
 
 
 @in_page_style
@@ -243,33 +258,6 @@ def _require(product: Product | None, name: str) -> Product:
     if product is None:
         raise ValueError(f"the products contain no {name}")
     return product
-
-
-def _draw_features(
-    axes: Axes, pixels: stages.Pixels, tracks: stages.TrackedFeatures, *, show_lost: bool = True
-) -> None:
-    style: dict[str, Any] = {"markersize": 5.5, "markerfacecolor": "none", "markeredgewidth": 1.3}
-    axes.plot(*pixels[tracks.accepted].T, "s", color=TRACKED_COLOUR, label="tracked", **style)
-    if show_lost and not tracks.accepted.all():
-        untracked = pixels[~tracks.accepted]
-        axes.plot(*untracked.T, "x", markersize=5.0, color=LOST_COLOUR, markeredgewidth=1.2, label="not tracked")
-
-
-def _draw_squares(axes: Axes, pixels: stages.Pixels, colour: str) -> None:
-    axes.plot(*pixels.T, "s", markersize=2.6, markerfacecolor="none", color=colour, markeredgewidth=0.9)
-
-
-def _draw_segments(axes: Axes, starts: stages.Pixels, ends: stages.Pixels, colour: str, alpha: float = 1.0) -> None:
-    axes.plot(*np.stack([starts, ends]).transpose(2, 0, 1), color=colour, linewidth=0.8, alpha=alpha)
-
-
-def _draw_image_pair(products: Mapping[str, Any]) -> tuple[Figure, Axes, Axes]:
-    images = _require(stages.read_images(products), "images")
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    show_image(left, images[0])
-    show_image(right, images[1])
-    return figure, left, right
 
 
 def _draw_motion_view(

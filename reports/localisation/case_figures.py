@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
 from marsyard.reports.presentation import check_shape, read_arrays, to_matrix
-from marsyard.reports.section import INK, MUTED, REQUIREMENT, SERIES, in_page_style, show_image
+from marsyard.reports.section import INK, MUTED, REQUIREMENT, SERIES, MarkedImage, draw_marked_images, in_page_style
 
 _AXES = ("east", "north", "up")
 #: Enlargement of the landmarks' residuals.
@@ -72,7 +72,6 @@ def draw_map(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-@in_page_style
 def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
     """Draw the last image with its landmarks and their residuals; None without landmarks."""
     pixels, residuals = (check_shape(products.get(f"landmarks_{name}"), None, 2) for name in ("px", "residual_px"))
@@ -82,16 +81,9 @@ def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
     if not len(pixels) == len(residuals) == len(flags):
         return None
     used = flags > 0.5
-    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
-    axes = figure.add_subplot()
-    show_image(axes, image)
+    marks: list[tuple[Float[np.ndarray, "*n 2"], Mapping[str, Any]]] = []
     for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):
-        axes.plot(*pixels[mask].T, marker=marker, color=colour, linestyle="none", markersize=4.0, fillstyle="none")
-        ends = pixels[mask] + _RESIDUAL_SCALE * residuals[mask]
-        axes.plot(
-            np.stack([pixels[mask, 0], ends[:, 0]]),
-            np.stack([pixels[mask, 1], ends[:, 1]]),
-            color=colour,
-            linewidth=0.8,
-        )
-    return figure
+        style = {"marker": marker, "linestyle": "none", "markersize": 4.0, "fillstyle": "none"}
+        segments = np.stack([pixels[mask], pixels[mask] + _RESIDUAL_SCALE * residuals[mask]])
+        marks += [(pixels[mask], style | {"color": colour}), (segments, {"color": colour, "linewidth": 0.8})]
+    return draw_marked_images([MarkedImage("", image, marks)], (6.0, 6.0))

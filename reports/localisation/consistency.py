@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pandas as pd
-from scipy import stats
 
+from marsyard.reports.common_sections import evaluate_consistency
 from marsyard.reports.rates import finite_values
 from marsyard.reports.section import Block, Grid
 from marsyard.reports.wording import number
@@ -21,20 +20,20 @@ def create_consistency_block(frame: pd.DataFrame) -> Block | None:
     nees = finite_values(frame, "position_nees")
     if nees.size == 0:
         return None
-    tail = 0.5 * (1.0 - _PROBABILITY)
-    # the sum of n independent NEES has the chi-square distribution with 2 n degrees of freedom
-    low, high = (float(stats.chi2.ppf(p, _DEGREES_OF_FREEDOM * nees.size)) / nees.size for p in (tail, 1.0 - tail))
-    inside = float(np.mean(nees <= stats.chi2.ppf(_PROBABILITY, _DEGREES_OF_FREEDOM)))
+    result = evaluate_consistency(nees, _DEGREES_OF_FREEDOM, _PROBABILITY)
     rows = [
         ["Descents with a final position", f"{nees.size:,}"],
-        ["Mean of the normalised squared error", number(float(nees.mean()))],
-        [f"{100 * _PROBABILITY:.0f} % interval of this mean for a correct covariance", f"{low:.2f} to {high:.2f}"],
-        [f"Errors within the {100 * _PROBABILITY:.0f} % ellipse", f"{100.0 * inside:.1f} %"],
+        ["Mean of the normalised squared error", number(result["mean"])],
+        [
+            f"{100 * _PROBABILITY:.0f} % interval of this mean for a correct covariance",
+            f"{result['lower']:.2f} to {result['upper']:.2f}",
+        ],
+        [f"Errors within the {100 * _PROBABILITY:.0f} % ellipse", f"{100.0 * result['inside']:.1f} %"],
     ]
     note = (
         "The normalised squared error is e' P^-1 e with the horizontal error e and its reported covariance P. Its mean "
         "is 2 for a correct covariance; larger values mean that the errors are larger than reported. The interval "
         "assumes independent descents."
     )
-    data = {"nees": {"n": int(nees.size), "mean": float(nees.mean()), "lower": low, "upper": high, "inside": inside}}
+    data = {"nees": {name: result[name] for name in ("n", "mean", "lower", "upper", "inside")}}
     return Block(heading="Consistency of the covariance", grid=Grid(["", ""], rows), note=note, data=data)

@@ -16,7 +16,8 @@ import pytest
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.store.record import describe_machine
-from marsyard.reports.campaign import SCHEMA, write_report
+from marsyard.reports.campaign import write_report
+from marsyard.reports.record import SCHEMA
 from marsyard.reports.sections import script_hash
 from marsyard.sim.cache import hide_folders
 

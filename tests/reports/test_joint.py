@@ -145,7 +145,7 @@ def test_unfinished_campaign_is_insufficient_everywhere(make_run: MakeRun, state
     assert verdict.reason == "The campaign is not finished (60 of 400 cases): a verdict needs all cases."
     assert open_result(directory).verdict == "INSUFFICIENT"
     (entry,), problems = read_entries([directory], directory.parent / "pages")
-    assert (entry.verdict, entry.requirements[0].status, problems) == ("INSUFFICIENT", "INSUFFICIENT", [])
+    assert (entry.report.verdict, entry.report.verdicts[0].status, problems) == ("INSUFFICIENT", "INSUFFICIENT", [])
 
 
 def test_looks_at_an_unfinished_campaign_never_pass(make_run: MakeRun) -> None:
