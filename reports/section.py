@@ -138,7 +138,7 @@ class MarkedImage:
 
     title: str
     image: Float[np.ndarray, "_ _"]
-    marks: Sequence[tuple[Float[np.ndarray, "*n 2"], Mapping[str, Any]]] = ()
+    marks: Sequence[tuple[Float[np.ndarray, "... 2"], Mapping[str, Any]]] = ()
 
 
 @in_page_style

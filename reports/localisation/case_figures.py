@@ -81,7 +81,7 @@ def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
     if not len(pixels) == len(residuals) == len(flags):
         return None
     used = flags > 0.5
-    marks: list[tuple[Float[np.ndarray, "*n 2"], Mapping[str, Any]]] = []
+    marks: list[tuple[Float[np.ndarray, "... 2"], Mapping[str, Any]]] = []
     for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):
         style = {"marker": marker, "linestyle": "none", "markersize": 4.0, "fillstyle": "none"}
         segments = np.stack([pixels[mask], pixels[mask] + _RESIDUAL_SCALE * residuals[mask]])
