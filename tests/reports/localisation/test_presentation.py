@@ -17,8 +17,13 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.products import is_hda_case
 from marsyard.reports.localisation.case_figures import draw_errors, draw_landmarks, draw_map, is_localisation_case
-from marsyard.reports.localisation.consistency import create_consistency_block
-from marsyard.reports.localisation.presentation import LOCALISATION, conditions_section, position_section, view
+from marsyard.reports.localisation.presentation import (
+    LOCALISATION,
+    conditions_section,
+    create_consistency_block,
+    position_section,
+    view,
+)
 from marsyard.reports.presentation import find_case_kind, presentations, write_case_figures
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
