@@ -3,8 +3,6 @@
 The ray of each physical pixel is intersected with the ground; DIMES projects from the ground into the image.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cache
 

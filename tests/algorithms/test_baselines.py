@@ -1,7 +1,5 @@
 """Tests of the baseline velocity estimators on rendered descents, with valid and invalid inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tests of the IMU consistency check of DIMES over combinations of tracks, and of the validity checks of tracks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of DIMES on rendered descents with exact truth: noise-free, noisy and invalid inputs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Tests of the geometry of DIMES: projection between pixels and ground, template candidates and rectification."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

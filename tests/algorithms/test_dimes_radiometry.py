@@ -1,7 +1,5 @@
 """Tests of the radiometric corrections of DIMES against a forward model of each physical row."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the Monte Carlo derivation of the threshold of DIMES' IMU check, and of its stored result."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, fields, replace
 

@@ -1,7 +1,5 @@
 """Tests of the correction of a common tilt by the inclination of the ground: exact tracks, then images with truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

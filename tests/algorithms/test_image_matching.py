@@ -1,7 +1,5 @@
 """Tests of template matching with shift, scale, roll and warp, against the definitions and analytic images."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import ndimage

@@ -1,7 +1,5 @@
 """Tests of correlation, subpixel refinement, peak measures and corner interest, against loops and closed forms."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

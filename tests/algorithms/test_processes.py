@@ -1,7 +1,5 @@
 """Tests of clocks that measure the limits of programs."""
 
-from __future__ import annotations
-
 import os
 import time
 

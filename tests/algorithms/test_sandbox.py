@@ -1,7 +1,5 @@
 """The sandbox of untrusted algorithms: no files, processes, network or variables except their own."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys

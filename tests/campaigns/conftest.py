@@ -1,18 +1,15 @@
 """Fixtures that write and run campaigns of the fake scenario; used by all tests of campaigns."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 
-from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, run, write_campaign
+from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, run, write_campaign
 
 
 @pytest.fixture
-def campaign_file(tmp_path: Path) -> Callable[..., Path]:
+def campaign_file(tmp_path: Path) -> CampaignFile:
     """Return `write_campaign` for the temporary folder: `campaign_file("altitude_m = 1500", dispersions="...")`."""
     return partial(write_campaign, tmp_path)
 

@@ -1,7 +1,6 @@
 """Functions for the tests of campaigns: write and run campaign files of the fake scenario."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,8 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.table import read_rows
 
+#: Writes a campaign file, see `write_campaign`; the folder is given.
+CampaignFile = Callable[..., Path]
 TOP_LEVEL_KEYS = """
 name = "fake"
 scenario = "tests.campaigns.fake_scenario:FakeScenario"

@@ -1,7 +1,5 @@
 """A scenario without rendering for tests of velocity estimators: one descent, with a random inertial error per case."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import ClassVar
 

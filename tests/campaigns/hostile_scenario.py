@@ -1,7 +1,5 @@
 """A scenario for the tests of isolation: cases damage their worker process or return invalid rows."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Check in all scenario tests that rows contain only the columns that `scenarios/columns.toml` declares."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Algorithms and a score for tests: some record their inputs, others write to images, raise or exit."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

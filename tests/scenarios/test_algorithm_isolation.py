@@ -1,7 +1,5 @@
 """Tests of the isolation of algorithms: an algorithm cannot affect the inputs, process or row of another one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,12 +1,14 @@
-"""Test that the requirements of the catalogue's campaigns use columns that their scenarios report."""
+"""Tests of the requirements of the catalogue: each can fail, judges what it states, and uses reported columns."""
 
-from __future__ import annotations
-
+import math
+import re
 from pathlib import Path
 
 import pytest
 
+from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.store.rows import Row
 from marsyard.scenarios.rover.scenario import SharedDriveParameters, SharedDriveScenario
@@ -67,3 +69,69 @@ def test_requirements_use_columns_of_their_scenario(scenario: str) -> None:
     row = _run_small_case(scenario)
     for name in _list_campaigns(scenario):
         check_metrics(load_campaign(name).configuration, row, Path(name))
+
+
+#: Columns that are true only for an answer, or that contain a number only for one.
+AVAILABILITY = {
+    "answered", "tracked", "handed_over", "site_reported", "answer_correct", "fixed_in_time", "coarse_error_m",
+    "relief_error_fraction", "tracked_well",
+}  # fmt: skip
+#: Columns that depend on the answer of an algorithm, and therefore also on its refusals.
+ANSWER_FLAGS = {"valid", "site_reported", "landed", "fixed_in_time", "position_reported", "answered"}
+
+
+def read_campaign_requirements(name: str) -> tuple[Requirement, ...]:
+    return tuple(load_campaign(name).configuration.requirements)
+
+
+def has_all_answers(requirement: Requirement) -> bool:
+    """Whether the population contains the cases without an answer."""
+    return not set(requirement.population.split(" and ")) & ANSWER_FLAGS
+
+
+@pytest.mark.parametrize("name", list(catalogue()))
+def test_each_campaign_requires_answers(name: str) -> None:
+    """Without such a requirement an algorithm that refuses every answer fails none."""
+    requirements = read_campaign_requirements(name)
+    assert requirements
+    assert any(entry.metric in AVAILABILITY and has_all_answers(entry) for entry in requirements)
+
+
+@pytest.mark.parametrize("name", list(catalogue()))
+def test_no_verdict_depends_on_the_run_time_of_the_host(name: str) -> None:
+    for requirement in read_campaign_requirements(name):
+        columns = f"{requirement.metric} {requirement.population}".split()
+        assert not [column for column in columns if re.search(r"_time(_max|_median)?_s$|measured", column)]
+
+
+def test_bounds_of_table_1_are_the_three_sigma_errors_of_the_paper() -> None:
+    """The last column of Table I for a drift of 2.5 px, in cm; 3 sigma of a normal distribution are 99.73 %."""
+    requirements = {entry.id: entry for entry in read_campaign_requirements("vtt-accuracy")}
+    for name, stereo_cm, drift_cm_px in (("VTT-NAVCAM", 1.6, 0.16), ("VTT-PANCAM", 0.4, 0.06)):
+        error_cm = math.hypot(stereo_cm, 2.5 * drift_cm_px)
+        assert requirements[name].bound == pytest.approx(0.01 * error_cm, rel=0.01)
+        assert requirements[name].probability == pytest.approx(math.erf(3.0 / math.sqrt(2.0)), abs=1e-4)
+
+
+def test_statements_on_positions_name_the_errors_that_are_not_included() -> None:
+    """The registration error of the map has a default of 50 m per axis, more than the limit of 40 m."""
+    positions = {
+        name: entry for name, entry in shipped_requirements().items() if name.startswith("LOC-") and entry.bound
+    }
+    assert len(positions) == 4
+    for entry in positions.values():
+        assert "errors of the map's registration are not included" in entry.statement
+
+
+def test_populations_do_not_depend_on_options_of_the_algorithm() -> None:
+    """The population of DIMES-AVAIL contains the criterion of the paper: ground of 110 m in both images."""
+    requirement = shipped_requirements()["DIMES-AVAIL"]
+    assert requirement.population == "feasible_overlap"
+    assert "110 m across" in requirement.statement
+
+
+def test_touchdown_is_compared_with_the_observation_of_the_paper() -> None:
+    """Table II: at most 1.21 m. The true distance does not depend on the fitted time of GPS averaging."""
+    requirement = shipped_requirements()["HDA-POS"]
+    assert (requirement.metric, requirement.bound) == ("touchdown_error_m", 1.21)
+    assert requirement.kind == "observation"

@@ -1,7 +1,5 @@
 """Tests of the conformance suite for algorithms: shipped algorithms pass, and defects are reported."""
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of the field-test scenario: sun position, attitude errors, elevation model, image triples and one case."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Tests of hills on the horizon, of unresolved rocks, and of the rover in hazard-camera images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast

@@ -1,7 +1,5 @@
 """Tests of malicious files: oversized, compressed and blocking files are rejected with a message."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

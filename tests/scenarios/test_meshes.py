@@ -1,7 +1,5 @@
 """Tests of meshes from user files: formats, size and position in scenes, and hazards in the landing truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of undeclared missing values in DTMs: values that are found, and real ground that is not mistaken for them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

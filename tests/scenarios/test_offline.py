@@ -1,7 +1,5 @@
 """Tests of answer tables (CSV files that replace an algorithm), and of exported cases for offline algorithms."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

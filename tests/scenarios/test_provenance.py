@@ -1,7 +1,5 @@
 """Tests of the image hash and backend columns of a row."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the registry of systems: systems of installed packages are registered, invalid systems are omitted."""
 
-from __future__ import annotations
-
 import fnmatch
 import json
 import re

@@ -1,7 +1,5 @@
 """Tests of terrain files from users: valid files pass; invalid files are rejected before their data are read."""
 
-from __future__ import annotations
-
 import io
 import math
 import os

@@ -5,8 +5,6 @@ exposure times, the sun direction (known from the ephemeris) and the mast geomet
 include its errors).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import fields
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of views of a site: camera poses, selection of rocks and rendered scenes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of image statistics on synthetic images with known spectrum, contrast and fall-off."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

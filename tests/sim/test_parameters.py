@@ -1,7 +1,5 @@
 """Tests of parameter tables: a table that changes some values of a preset keeps the other values of the preset."""
 
-from __future__ import annotations
-
 import pytest
 from pydantic import ValidationError
 

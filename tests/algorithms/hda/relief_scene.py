@@ -3,8 +3,6 @@
 The ray of each pixel is intersected with an analytic height function. No epipolar geometry is used.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Tests of the baselines of hazard detection: rectification, semi-global matching, and OpenCV's essential matrix."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Tests of elevation maps built from points with known heights, and of the rotation to the surface frame."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

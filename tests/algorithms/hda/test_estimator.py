@@ -1,7 +1,5 @@
 """Tests of the complete hazard detection on exact scenes: selected site, map coordinates and failure outcomes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

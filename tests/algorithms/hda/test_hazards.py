@@ -1,7 +1,5 @@
 """Tests of slope, roughness and safe landing maps on grounds with analytic solutions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

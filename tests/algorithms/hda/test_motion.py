@@ -1,7 +1,5 @@
 """Tests of two-view structure from motion on projected tracks: exact, noisy, with outliers and degenerate."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation

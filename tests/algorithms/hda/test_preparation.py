@@ -1,6 +1,4 @@
-"""Tests of the preparation of image pairs for matching: common orientation and scale, and band-pass filter."""
-
-from __future__ import annotations
+"""Tests of the preparation of images for hazard detection: radiometry, common orientation and scale, band-pass filter."""
 
 from dataclasses import replace
 
@@ -9,11 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions, Matches
-from marsyard.algorithms.hda.motion import LandingScene, build_scene, project_points
+from marsyard.algorithms.hda.motion import LandingScene, apply_flat_field, build_scene, project_points
 from marsyard.algorithms.hda.preparation import MEAN_WINDOW_PX, filter_view, resample_second
 from marsyard.algorithms.hda.structure import dense_structure
 from marsyard.sim.frames import rigid
-from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_plane, make_pose, measure_pass
+from marsyard.sim.measurements import DetectorImage
+from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
+from marsyard.sim.sensor.optics import OpticsParameters
+from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_camera, make_plane, make_pose, measure_pass
 
 OPTIONS = HdaOptions(grid_px=8)
 PREPARED = replace(OPTIONS, resample_second=True, filter_images=True)
@@ -118,3 +119,37 @@ def test_filtered_image_has_no_local_mean(landing_scene: LandingScene) -> None:
     # a brighter image has the same counts, up to rounding to 1 / 8 count
     brighter = filter_view(replace(view, counts=view.counts + np.uint16(100))).counts
     np.testing.assert_allclose(brighter.astype(np.int64), counts.astype(np.int64), atol=1)
+
+
+def render_detector_image(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, DetectorImage]:
+    """Render a scene with a brightness gradient, and its image, exposed for 4 ms with negligible noise."""
+    optics = make_camera(320)
+    rows, columns = optics.size[1], optics.size[0]
+    rng = np.random.default_rng(3)
+    scene = (0.2 + 0.1 * np.arange(columns) / columns + 0.02 * rng.standard_normal((rows, columns))).astype(np.float32)
+    parameters = DetectorParameters(
+        rows_summed=1,
+        transfer_row_s=transfer_row_s,
+        clear_row_s=clear_row_s,
+        full_well_e=1e9,
+        responsivity_e_s=4e9,
+        gain_e_dn=4000.0,
+        read_noise_e=0.0,
+        calibration_error=0.0,
+        optics=OpticsParameters(diffraction_px=0.0, diffusion_px=0.0, pixel_aperture=False),
+    )
+    detector = Detector.draw(natural_fall_off(optics), parameters, rng)
+    return scene, DetectorImage(detector.expose(scene, rng), 0.0, optics, detector.calibration)
+
+
+@pytest.mark.parametrize("row_times_s", [(0.0, 0.0), (5e-6, 0.0), (5e-6, 1e-6)])
+def test_corrected_counts_match_ideal_image(row_times_s: tuple[float, float]) -> None:
+    scene, image = render_detector_image(*row_times_s)
+    counts = apply_flat_field(image).astype(np.float64)
+    # Ideal counts: 4 ms x 4e9 e/s / 4000 e/DN. Each count is rounded twice, and the response is at least 0.65.
+    expected = 0.004 * 4e9 / 4000.0 * scene
+    assert np.abs(counts - expected).max() < 0.01 * expected.mean()
+    smeared_counts = (image.counts - image.calibration.offset_dn) / image.calibration.flat_field
+    max_smear = np.abs(smeared_counts - expected).max() / expected.mean()
+    # The transfer of 240 rows takes 240 x 5 us = 1.2 ms, 30 % of the exposure time; lens fall-off reduces it.
+    assert (max_smear > 0.2) == (row_times_s[0] > 0.0)

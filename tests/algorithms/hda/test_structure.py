@@ -1,7 +1,5 @@
 """Tests of epipolar search segments, dense matches, triangulation and scale on an exact scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

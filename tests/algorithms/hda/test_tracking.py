@@ -1,7 +1,5 @@
 """Tests of feature selection and tracking: Eqs. 1-5 of the landing paper, and tracks against the exact scene."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ pixels. Images are traced from pixels to the ground with super-sampling, on the 
 in the algorithm.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache
 

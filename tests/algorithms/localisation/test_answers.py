@@ -1,7 +1,5 @@
 """Tests of the validation of position estimates: malformed answers raise BAD_ANSWER, valid ones are copied."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of the parts of the baseline `sift`: features of the map, and matching of descriptors."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import scipy.ndimage

@@ -3,8 +3,6 @@
 Three images with five patches each are matched with the map. All estimated positions are wrong by a common offset.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -3,8 +3,6 @@
 The cases are offsets with the stated errors, a wrong attitude, outliers, and images of the same ground.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

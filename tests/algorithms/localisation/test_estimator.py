@@ -3,8 +3,6 @@
 The matching stages are replaced by functions with given results (`Stages`), or run on a small synthetic map.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache

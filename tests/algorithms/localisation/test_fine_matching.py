@@ -1,7 +1,5 @@
 """Tests of the fine stage of localisation: pixels of landmarks in ray-traced images against the exact projection."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Tests of the navigation filter for localisation on a map: an analytic descent with exact inertial increments."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Tests of external programs as position estimators: exchanged values, answers, separate processes, and faults."""
 
-from __future__ import annotations
-
 import gc
 import io
 import json

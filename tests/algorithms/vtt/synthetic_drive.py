@@ -4,8 +4,6 @@ The ray of each pixel is intersected with the nearest body. The solid texture is
 averaged over the pixel extent in closed form, so that the images have no aliasing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache

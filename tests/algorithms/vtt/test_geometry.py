@@ -1,7 +1,5 @@
 """Tests of target coordinates, mast pointing, image roll and stereo: closed forms and round trips."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

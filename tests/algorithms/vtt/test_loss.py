@@ -1,6 +1,4 @@
-"""Tests of loss criteria, tolerances, tracking states and the hand-off to the arm."""
-
-from __future__ import annotations
+"""Tests of loss criteria, states and hand-off of tracking, of placement, and of the accuracy formulas (Table I)."""
 
 from itertools import pairwise
 
@@ -8,8 +6,22 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt.accuracy import GoalCriterion, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.accuracy import (
+    NAVCAM,
+    PANCAM,
+    GoalCriterion,
+    HandOffOutcome,
+    StereoDesign,
+    accuracy_row,
+    drift_error_m,
+    hand_off,
+    round_half_up,
+    stereo_range_error_m,
+    table_1,
+    tracked_approach_error_m,
+)
 from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.placement import Instrument, PlacementOutcome, place_instrument, tool_overlap_m
 from marsyard.algorithms.vtt.tracker import Distances, Evidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
@@ -126,3 +138,92 @@ def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     assert (lost_target.outcome, lost_target.target) == (HandOffOutcome.NOT_TRACKED, None)
     away_from_goal = hand_off(TargetUpdate(NORMAL, (), np.array([1.6, 0.0, 0.1])), goal, navcam())
     assert (away_from_goal.outcome, away_from_goal.target) == (HandOffOutcome.NOT_AT_GOAL, None)
+
+
+VIEWPOINT = np.array([0.0, 0.0, 1.5])
+TARGET = np.array([2.0, 0.1, 0.3])
+
+
+def make_surface(ridge_m: float = 1.0, ridge_height_m: float = 0.0) -> np.ndarray:
+    """Return level ground around the target every 2 mm, higher by `ridge_height_m` beyond `ridge_m` along x."""
+    steps = np.arange(-0.15, 0.15, 0.002)
+    x, y = (values.ravel() for values in np.meshgrid(steps, steps))
+    heights = np.where(x > ridge_m, ridge_height_m, 0.0)
+    return np.asarray(TARGET + np.column_stack([x, y, heights]))
+
+
+def test_instrument_is_placed_on_flat_ground() -> None:
+    placement = place_instrument(make_surface(), TARGET, VIEWPOINT)
+    assert placement.outcome is PlacementOutcome.PLACED
+    assert placement.position_rover == pytest.approx(TARGET, abs=1e-9)
+    assert placement.normal_rover == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
+
+
+def test_target_next_to_a_step_is_reselected_away_from_it() -> None:
+    """The tools reach 5 cm: with a step of 3 cm at 4.5 cm they collide, 6 mm away they do not."""
+    surface = make_surface(0.045, 0.03)
+    assert tool_overlap_m(surface, TARGET, np.array([0.0, 0.0, 1.0]), Instrument()) == pytest.approx(0.015)
+    placement = place_instrument(surface, TARGET, VIEWPOINT)
+    assert placement.outcome is PlacementOutcome.RESELECTED
+    assert placement.position_rover is not None
+    moved = placement.position_rover - TARGET
+    assert 0.004 <= -moved[0] <= 0.008
+    # the nearest free position is chosen
+    assert np.linalg.norm(moved) == pytest.approx(0.006, abs=0.0021)
+
+
+def test_no_position_within_8_mm_is_a_collision() -> None:
+    # the step is 2.5 cm from the target; the tools would have to move by 2.5 cm
+    assert place_instrument(make_surface(0.025, 0.03), TARGET, VIEWPOINT).outcome is PlacementOutcome.COLLISION
+    # a step lower than the clearance of 1.5 cm is permitted
+    assert place_instrument(make_surface(0.025, 0.01), TARGET, VIEWPOINT).outcome is PlacementOutcome.PLACED
+
+
+def test_too_few_points_are_no_surface() -> None:
+    assert place_instrument(np.empty((0, 3)), TARGET, VIEWPOINT).outcome is PlacementOutcome.NO_SURFACE
+    ring = make_surface()
+    ring = ring[np.linalg.norm(ring - TARGET, axis=1) > 0.035]
+    assert place_instrument(ring, TARGET, VIEWPOINT).outcome is PlacementOutcome.NO_SURFACE
+    assert np.isnan(tool_overlap_m(ring, TARGET, np.array([0.0, 0.0, 1.0]), Instrument()))
+
+
+def test_table_1_matches_printed_digits() -> None:
+    pancam, navcam = table_1()
+    assert (pancam.designation_cm, pancam.untracked_cm) == (9.7, 18.7)
+    assert (navcam.designation_cm, navcam.untracked_cm) == (38.8, 42.0)
+    assert pancam.tracked_formula == "sqrt(0.4^2 + (0.06 N)^2)"
+    assert navcam.tracked_formula == "sqrt(1.6^2 + (0.16 N)^2)"
+
+
+def test_ten_pixel_drift_matches_the_paper() -> None:
+    # "Even with an extreme 10-pixel drift, ... 0.7 cm for pancam and 2.3 cm with navcam."
+    pancam, navcam = table_1()
+    assert round_half_up(pancam.tracked_cm(10.0), 1) == 0.7
+    assert round_half_up(navcam.tracked_cm(10.0), 1) == 2.3
+
+
+def test_table_1_requires_the_specified_pixel_pitch() -> None:
+    # The text of the paper derives a pitch of 4.69 um from the sensor size (4.8 mm / 1024); with this pitch the errors
+    # would be 9.8 and 39.1 cm.
+    designs = [
+        StereoDesign(design.name, design.focal_length_m, 4.8e-3 / 1024, design.baseline_m)
+        for design in (PANCAM, NAVCAM)
+    ]
+    assert [accuracy_row(design).designation_cm for design in designs] == [9.8, 39.1]
+
+
+def test_errors_scale_with_range_and_focal_length() -> None:
+    assert stereo_range_error_m(6.0, 1000.0, 0.2) == pytest.approx(9.0 * stereo_range_error_m(2.0, 1000.0, 0.2))
+    # range^2 x disparity error / (focal length x baseline): 4 m2 x 0.5 px / (1000 px x 0.2 m)
+    assert stereo_range_error_m(2.0, 1000.0, 0.2, 0.5) == pytest.approx(0.01)
+    # A pixel at 2 m: 0.58 mm and 1.55 mm.
+    assert drift_error_m(2.0, PANCAM.focal_px, 1.0) == pytest.approx(0.58e-3, abs=5e-6)
+    assert tracked_approach_error_m(0.03, 0.04) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "expected"),
+    [(38.75, 1, 38.8), (38.749999999999993, 1, 38.8), (1.55, 1, 1.6), (0.155, 2, 0.16), (-0.25, 1, -0.3)],
+)
+def test_half_digits_are_rounded_away_from_zero(value: float, digits: int, expected: float) -> None:
+    assert round_half_up(value, digits) == expected

@@ -1,7 +1,5 @@
 """Tests of the target tracker in the loop of drive, images and update, on exact images of planes and spheres."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

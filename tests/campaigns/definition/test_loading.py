@@ -1,7 +1,5 @@
 """Tests of loading campaign files: each problem is reported with its file or option, key and allowed values."""
 
-from __future__ import annotations
-
 import contextlib
 import tomllib
 from collections.abc import Callable
@@ -14,9 +12,8 @@ from hypothesis import strategies as st
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.scenarios.systems import catalogue
+from tests.campaigns.fake_campaign import CampaignFile
 
-#: Fixture of conftest that writes a campaign file from its parameters, dispersions and other tables.
-CampaignFile = Callable[..., Path]
 #: Module of the fake scenarios.
 FAKE = "tests.campaigns.fake_scenario"
 

@@ -1,7 +1,5 @@
 """Tests of the compilation of kernels before the first case of a campaign."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

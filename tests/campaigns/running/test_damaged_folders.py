@@ -1,7 +1,5 @@
 """Tests of damaged campaign folders: commands use the folder again or report its damage."""
 
-from __future__ import annotations
-
 import errno
 import json
 import shutil
@@ -22,9 +20,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import write_table
 from marsyard.cli.options import handle_user_errors
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, sign_folder
-
-CampaignFile = Callable[..., Path]
+from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run, sign_folder
 
 
 def test_run_killed_before_its_record_can_be_restarted(

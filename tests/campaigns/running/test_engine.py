@@ -1,9 +1,6 @@
 """Tests of the campaign engine: failing cases, stored rows and records, shared inputs and metrics."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +14,7 @@ from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
-from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, read_case_rows, run
-
-CampaignFile = Callable[..., Path]
+from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, read_case_rows, run
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

@@ -1,7 +1,5 @@
 """Tests of cases with invalid rows or closed files: they are recorded as crashed, with reason and conditions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

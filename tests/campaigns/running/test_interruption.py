@@ -1,14 +1,11 @@
 """Tests of interrupted campaigns and of failing cases: no row is lost, and the rows of other cases are unchanged."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,9 +17,7 @@ from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
-
-CampaignFile = Callable[..., Path]
+from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

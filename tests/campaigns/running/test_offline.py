@@ -1,7 +1,5 @@
 """Tests of offline evaluation: measurements are exported, and the answers of an external algorithm are scored."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

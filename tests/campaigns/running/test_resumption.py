@@ -1,12 +1,11 @@
-"""Tests of `resume` and `append`: added and repeated cases, changed programs and configurations."""
-
-from __future__ import annotations
+"""Tests of `resume`, `append` and `replay`: added and repeated cases, changed programs and configurations."""
 
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from marsyard.campaigns.definition.identity import read_versions
@@ -16,9 +15,7 @@ from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import folder_lock
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, sign_folder, write_campaign
-
-CampaignFile = Callable[..., Path]
+from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run, sign_folder, write_campaign
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +126,19 @@ def test_locked_folder_is_rejected(finished_campaign: Path, watch: RecordingWatc
         for command in commands:
             with pytest.raises(StoreError, match="is in use"):
                 command()
+
+
+def test_replay_reports_differing_columns(failing_campaign: Path, tmp_path: Path) -> None:
+    directory = shutil.copytree(failing_campaign, tmp_path / "copy")
+    frame = pd.read_parquet(directory / "cases.parquet")
+    altitudes = frame["altitude_m"].to_numpy(copy=True)
+    altitudes[4] = np.nextafter(altitudes[4], np.inf)
+    frame["altitude_m"] = altitudes
+    frame.to_parquet(directory / "cases.parquet")
+    # without the database, `replay` reads the rows from the table
+    (directory / "cases.sqlite").unlink()
+    assert replay(directory, 4).differing == ("altitude_m",)
+    with pytest.raises(CampaignError, match="has no case 12; allowed: 0 to 11"):
+        replay(directory, 12)
+    with pytest.raises(StoreError, match="does not contain a campaign"):
+        replay(directory / "cases", 0)

@@ -1,12 +1,10 @@
 """Tests of shards: their rows equal those of one run, and incompatible or incomplete shards are not merged."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -21,7 +19,7 @@ from marsyard.campaigns.running.shards import Shard, merge_shards
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.cli.app import app
-from tests.campaigns.fake_campaign import FAILING_CASES, RecordingWatch, read_case_rows, write_campaign
+from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, read_case_rows, write_campaign
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
@@ -89,7 +87,7 @@ def test_interrupted_shard_is_resumed_within_its_cases(
 
 
 def test_incomplete_or_different_shards_are_rejected(
-    shards: list[Path], failing_campaign: Path, campaign_file: Callable[..., Path], tmp_path: Path
+    shards: list[Path], failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path
 ) -> None:
     (other,) = _run_shards(campaign_file("unanswered_cases = [2]"), tmp_path, 1)
     for directories, message in (
@@ -172,7 +170,7 @@ def test_invalid_shards_are_reported(text: str) -> None:
 
 
 def test_commands_run_and_merge_shards(
-    campaign_file: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     path, runner = str(campaign_file("unanswered_cases = [2]")), CliRunner()

@@ -1,10 +1,5 @@
 """Tests of correlated dispersions: correlations, marginal distributions and rejected matrices."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -14,8 +9,8 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.sampling.design import Correlation
+from tests.campaigns.fake_campaign import CampaignFile
 
-CampaignFile = Callable[..., Path]
 N_CASES = 4000
 TOP_LEVEL_KEYS = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = 5\ncases = {cases}\n'
 #: Tolerance in standard errors: a correct sampler exceeds it for one of 16,000 seeds (normal distribution, two-sided).

@@ -1,9 +1,5 @@
 """Tests of sampling designs: stratification, single cases, appended blocks and added dispersions."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +13,8 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.campaigns.sampling.design import build_stratified_design
+from tests.campaigns.fake_campaign import CampaignFile
 
-CampaignFile = Callable[..., Path]
 TOP_LEVEL_KEYS = (
     'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\nseed = {seed}\ncases = {cases}\n'
 )

@@ -1,10 +1,6 @@
 """Tests of dispersions: draws follow their distributions and do not depend on other dispersions."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +14,8 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion, scipy_distributions, scipy_parameters
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_campaign import CampaignFile
 
-CampaignFile = Callable[..., Path]
 N_CASES = 2000
 #: Minimum p-value of a test: a correct sampler fails for one of 1000 seeds. The seeds are fixed.
 MIN_P_VALUE = 1e-3

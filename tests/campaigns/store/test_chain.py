@@ -1,7 +1,5 @@
 """Tests of the chain of hashes: changed, removed, added and reordered rows are reported with their case."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import sqlite3

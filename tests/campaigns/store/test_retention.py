@@ -1,10 +1,7 @@
 """Tests of stored products: the configured cases and the showcase (the case that reports show)."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +14,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import find_showcase, find_worst_cases, write_table
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
-
-CampaignFile = Callable[..., Path]
+from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 

@@ -1,7 +1,5 @@
 """Tests of the files of a campaign folder: rows (SQLite), table of rows (Parquet), record and products."""
 
-from __future__ import annotations
-
 import errno
 import math
 import os

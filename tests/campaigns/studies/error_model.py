@@ -1,7 +1,5 @@
 """A fast scenario for tests of error budgets: its error has known contributions of gyro and radar."""
 
-from __future__ import annotations
-
 import math
 import time
 from typing import ClassVar

@@ -1,7 +1,5 @@
 """Start a study as a program, kill it after some of its cases, and resume it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """A fast scenario with a known probability of a violation: the load is normal, and its limit is a quantile."""
 
-from __future__ import annotations
-
 import math
 import time
 

@@ -1,7 +1,5 @@
 """A fast scenario of an estimator with a planted defect: it fails only with a low sun and a yaw near 90 deg."""
 
-from __future__ import annotations
-
 from pydantic import BaseModel, ConfigDict
 
 from marsyard.scenarios.interface import CaseResult

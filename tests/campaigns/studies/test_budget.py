@@ -5,8 +5,6 @@ interaction of gyro and radar. Gyro and radar are its error sources. By default 
 that of gyro is 9 and that of radar is 4 * 4/3. The source `fan` has no effect, because the fan is off.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

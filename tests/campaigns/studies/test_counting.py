@@ -1,13 +1,25 @@
-"""Tests of the counting bound: textbook numbers, coverage, and cases that share terrains."""
-
-from __future__ import annotations
+"""Tests of the counting bound, of numbers `in-turn`, and of studies on the systems of Marsyard."""
 
 import math
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
+from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
+from marsyard.campaigns.studies.search import SearchSettings, start_search, write_regression_campaigns
+from marsyard.campaigns.studies.subset import NEW_STREAM
+from marsyard.scenarios.systems import systems
+from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, read_case_rows, write_campaign
 
 
 def test_bound_without_violations_is_the_textbook_one() -> None:
@@ -59,3 +71,99 @@ def test_bounds_cover_the_probability_for_any_correlation(cluster_size: int) -> 
     # three standard errors above 5 %: 0.05 + 3 sqrt(0.05 * 0.95 / 1000)
     assert n_too_low <= 70
     assert n_too_high <= 70
+
+
+#: Streams of case 5, blended with new ones.
+BLEND = ((5, 0.8), (NEW_STREAM, 0.6))
+DISPERSIONS = """
+[dispersions]
+altitude_m = {distribution = "normal", mean = 2000, sd = 100, truncate = [1700, 2200]}
+terrain = {distribution = "in-turn", low = 0, high = "HIGH"}
+"""
+
+
+def load_fake_campaign(folder: Path, high: int, bound: float = 5.0) -> Campaign:
+    """Load a campaign whose terrains are the numbers up to `high`, in turn."""
+    dispersions, requirement = DISPERSIONS.replace("HIGH", str(high)), REQUIREMENT.replace("5.0", str(bound))
+    return load_campaign(str(write_campaign(folder, dispersions=dispersions, requirement=requirement)))
+
+
+def test_terrain_follows_the_number_of_the_streams(tmp_path: Path) -> None:
+    campaign = prepare_campaign(load_fake_campaign(tmp_path, 99_999), 20_000)
+    # a new case, a case with blended streams (a step of a Markov chain), and a case with the streams of case 3
+    first, blended, repeated = (
+        candidate.point(17) for candidate in (Candidate((0.0,)), Candidate((0.0,), blend=BLEND), Candidate((0.0,), 3))
+    )
+    assert [campaign.draws_at(point)["terrain"] for point in (first, blended, repeated)] == [17, 17, 3]
+
+
+def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:
+    campaign = load_fake_campaign(tmp_path, 99_999, bound=0.5)
+    settings = SearchSettings("velocity", cases=20, restarts=1, max_failures=1)
+    result = start_search(campaign, settings, 500, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    rows = {int(row["case"]): row for row in read_case_rows(tmp_path / "run")}
+    assert all(row["terrain"] == Point.read(str(row[POINT_COLUMN])).stream for row in rows.values())
+    (failure,) = result.failures
+    assert failure.values["terrain"] == rows[failure.case]["terrain"] == rows[failure.original_case]["terrain"]
+    (path,) = write_regression_campaigns(campaign, result, tmp_path / "run")
+    assert tomllib.loads(path.read_text())["parameters"]["terrain"] == failure.values["terrain"]
+
+
+def test_numbers_that_repeat_within_the_study_are_rejected(tmp_path: Path) -> None:
+    campaign = load_fake_campaign(tmp_path, 9)
+    assert prepare_campaign(campaign, 10).drawn_paths == ("altitude_m",)
+    with pytest.raises(CampaignError, match=r"dispersions\.terrain: the 10 values .* repeat within 11 cases; extend"):
+        prepare_campaign(campaign, 11)
+
+
+@pytest.mark.parametrize("name", ["dimes-gusev", "dimes-smoke", "loc-jezero", "vtt-terrains"])
+def test_campaigns_with_a_terrain_for_each_case_can_be_studied(name: str) -> None:
+    """20,000 is the default limit of `marsyard rare`."""
+    campaign = prepare_campaign(load_campaign(name), 20_000)
+    assert not {"location.terrain", "world.terrain"} & set(campaign.drawn_paths)
+
+
+#: Small campaigns that each render cases of one scenario.
+CAMPAIGNS = {
+    "dimes-smoke": ("terrain.samples=512",),
+    "hda-benign": ("terrain.samples=512",),
+    "vtt-montecarlo": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5"),
+}
+
+
+@pytest.mark.parametrize("system", ["dimes", "vtt", "hda"])
+def test_each_system_has_requirements_with_margins_and_error_sources(system: str) -> None:
+    (names,) = [item.campaigns for item in systems() if item.name == system]
+    n_with_margin = 0
+    for name in names:
+        campaign = load_campaign(name)
+        requirements = campaign.configuration.requirements
+        n_with_margin += any(item.bound is not None or item.margin is not None for item in requirements)
+        assert len(active_sources(campaign)[0]) >= 3, name  # error sources that have an effect in this campaign
+    assert n_with_margin >= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CAMPAIGNS)
+def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
+    """A case at a point is deterministic, has a margin, and changes if all sources of error are removed.
+
+    A small step of its random streams changes it as well.
+    """
+    campaign = load_campaign(name, CAMPAIGNS[name])
+    removed = tuple(source.name for source in active_sources(campaign)[0])
+    requirement = next(item for item in campaign.configuration.requirements if item.bound or item.margin)
+    rows = []
+    step = ((3, 0.995), (4, math.sqrt(1.0 - 0.995**2)))
+    for sources, blend in (((), ()), (removed, ()), ((), ()), ((), step)):
+        point = Point((0.1,) * len(campaign.drawn_paths), 3, (), sources, blend)
+        parameters = campaign.parameters_at(point)
+        for shared_input in campaign.scenario.shared_inputs(parameters):
+            campaign.scenario.prepare(parameters, shared_input)
+        result = campaign.scenario.run(parameters, campaign.streams_at(point))
+        row = {column: value for column, value in result.row.items() if "time" not in column}
+        rows.append({"outcome": str(result.outcome), "answered": result.answered, **row})
+        assert not math.isnan(compute_margin(rows[-1], requirement))
+    assert rows[0] == pytest.approx(rows[2], nan_ok=True)
+    assert rows[0] != rows[1]
+    assert rows[0] != rows[3]

@@ -1,7 +1,5 @@
 """Tests of the verdict on rare violations: gross errors, steps and plateaus give no false PASS and no false FAIL."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of studies of rare violations: estimates, continuation after kill -9, replay, replicates, report and errors."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Tests of the search for violations: a planted defect is found and reduced; continuation, files, report and errors."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

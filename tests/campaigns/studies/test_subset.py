@@ -1,7 +1,5 @@
 """Tests of subset simulation, importance sampling and intervals on limit states with known probabilities."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

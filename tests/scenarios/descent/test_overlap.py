@@ -1,6 +1,4 @@
-"""Tests of the true overlap of descent images: widths of footprints that are known from their geometry."""
-
-from __future__ import annotations
+"""Tests of the true overlap of descent images, of the slopes of the sites over it, and of the touchdown velocity."""
 
 from dataclasses import replace
 
@@ -8,11 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.descent.overlap import ZERO_PHASE_RADIUS_RAD, footprint, overlap_width_m, zero_phase_spot
+from marsyard.scenarios.descent.parameters import LandingParameters
+from marsyard.scenarios.descent.score import compute_touchdown
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.sensor import preset
+from marsyard.sim.terrain import TerrainBank, site
 
 #: Direction to a sun 10 deg above the horizon in the south: its bright spot is outside of images at the nadir.
 LOW_SUN = np.array([0.0, -np.cos(np.radians(10.0)), np.sin(np.radians(10.0))])
@@ -68,3 +70,89 @@ def test_bright_spot_is_excluded() -> None:
     half = half_widths_m(camera).min()
     expected = 2.0 * (np.sqrt(2.0) * half - radius) / (1.0 + np.sqrt(2.0))
     assert width == pytest.approx(expected, rel=0.06)
+
+
+#: Side of the square whose plane is fitted, m: about the overlap of two descent images.
+SIDE_M = 1000.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "sd_deg"), [("gusev", 0.32), ("meridiani", 0.38)])
+def test_slopes_over_a_kilometre_are_below_the_prior(name: str, sd_deg: float) -> None:
+    """The values per axis are those of 60 and 40 descents over 12 terrains (calibration seed 5406)."""
+    terrain = site(name).terrain("descent").model_copy(update={"samples": 2048, "spacing_m": 2.0})
+    bank = TerrainBank(terrain, 1)
+    steps = np.linspace(-0.5 * SIDE_M, 0.5 * SIDE_M, 41)
+    east, north = (grid.ravel() for grid in np.meshgrid(steps, steps))
+    design = np.column_stack([east, north, np.ones(east.size)])
+    slopes = []
+    for number in range(4):
+        surface = bank.terrain(number)
+        for centre_east, centre_north in np.random.default_rng(number).uniform(0.0, 4096.0, (20, 2)):
+            heights = surface.height(centre_east + east, centre_north + north)
+            slopes.append(np.linalg.lstsq(design, heights, rcond=None)[0][:2])
+    rms_deg = np.degrees(np.sqrt(np.mean(np.square(slopes))))
+    # about 16 independent squares of 1 km in each terrain of 4 km: 128 values, and terrains that differ
+    assert rms_deg == pytest.approx(sd_deg, rel=0.3)
+    assert rms_deg < np.degrees(DimesOptions().slope_sd_rad)
+
+
+#: Time from the last image to the firing, s; enough for the computation.
+AVAILABLE_S = 17.0
+IDEAL = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
+#: True horizontal velocity before the firing, m/s, with a magnitude of 15.
+TRUE_VELOCITY = np.array([12.0, -9.0])
+
+
+def make_rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_correct_answer_cancels_the_velocity() -> None:
+    result = compute_touchdown(IDEAL, TRUE_VELOCITY, TRUE_VELOCITY.copy(), AVAILABLE_S, make_rng())
+    np.testing.assert_allclose(result.with_answer, 0.0, atol=1e-12)
+    np.testing.assert_allclose(result.without_answer, TRUE_VELOCITY)
+
+
+def test_steering_is_limited_by_its_capability() -> None:
+    fast_velocity = 2.0 * TRUE_VELOCITY
+    result = compute_touchdown(IDEAL, fast_velocity, fast_velocity.copy(), AVAILABLE_S, make_rng())
+    # the true speed is 30 m/s
+    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - IDEAL.max_steering_m_s)
+
+
+def test_wrong_answer_increases_the_velocity() -> None:
+    """Steering with the negated velocity doubles the velocity."""
+    result = compute_touchdown(IDEAL, TRUE_VELOCITY, -TRUE_VELOCITY, AVAILABLE_S, make_rng())
+    np.testing.assert_allclose(result.with_answer, 2.0 * TRUE_VELOCITY)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "available_s"),
+    [
+        (None, AVAILABLE_S),
+        (TRUE_VELOCITY, IDEAL.computation_s - 0.1),
+        # 5 m/s: the deadband, up to which the burn is not steered
+        (np.array([3.0, -4.0]), AVAILABLE_S),
+    ],
+)
+def test_burn_is_not_steered_without_a_timely_estimate_above_the_deadband(
+    estimate: np.ndarray | None, available_s: float
+) -> None:
+    result = compute_touchdown(IDEAL, TRUE_VELOCITY, estimate, available_s, make_rng())
+    np.testing.assert_array_equal(result.with_answer, result.without_answer)
+    assert result.is_in_time == (available_s >= IDEAL.computation_s)
+
+
+def test_burn_and_steering_errors_have_the_specified_standard_deviation() -> None:
+    parameters = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
+    touchdowns = [
+        compute_touchdown(parameters, TRUE_VELOCITY, TRUE_VELOCITY.copy(), AVAILABLE_S, np.random.default_rng(seed))
+        for seed in range(2000)
+    ]
+    without_answer = np.stack([touchdown.without_answer for touchdown in touchdowns]) - TRUE_VELOCITY
+    steering = np.stack([touchdown.with_answer - touchdown.without_answer for touchdown in touchdowns]) + TRUE_VELOCITY
+    # Relative standard error of a standard deviation from 4000 values: 1 / sqrt(8000) = 1.1 %.
+    # The steering error is 10 % of 15 m/s.
+    assert without_answer.std() == pytest.approx(1.0, rel=0.05)
+    assert steering.std() == pytest.approx(1.5, rel=0.05)

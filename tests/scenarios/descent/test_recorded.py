@@ -1,7 +1,5 @@
 """Tests of recorded flights: a simulated flight that is saved and read back gives the same case."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tests of injected faults of a landing: receiver outages, altimeter faults, lost images and defective pixels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pydantic import ValidationError

@@ -1,7 +1,5 @@
 """Tests of the helicopter: true flight, instruments, navigation filter and landing with estimated state."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

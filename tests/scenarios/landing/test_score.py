@@ -1,7 +1,5 @@
 """Tests of the score of a flight's answer against known ground truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Fixture of one simulated lander flight (parachute and powered descent) for the tests of localisation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

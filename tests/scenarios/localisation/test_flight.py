@@ -1,7 +1,5 @@
 """Tests of the lander's flight: profile, exact derivatives, and inertial navigation along it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Tests of localisation over an imported DTM with an orthoimage."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

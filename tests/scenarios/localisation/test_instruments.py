@@ -1,7 +1,5 @@
 """Tests of the instruments of localisation: camera, detector, radar, and the initial state."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Tests of the sites and the world of the localisation scenario."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

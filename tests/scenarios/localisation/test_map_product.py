@@ -1,7 +1,5 @@
 """Tests of the map product: exact without errors, and with the stated errors otherwise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -3,8 +3,6 @@
 A table is scored like the estimator that wrote it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the conformance suite for position estimators: shipped estimators pass, and defects are reported."""
 
-from __future__ import annotations
-
 import sys
 import textwrap
 from pathlib import Path

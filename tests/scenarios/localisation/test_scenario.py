@@ -3,8 +3,6 @@
 The rows of all cases are checked against `columns.toml` (tests/scenarios/conftest.py).
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of the scores of position estimates: columns and stored products, for a straight flight over a shifted map."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace

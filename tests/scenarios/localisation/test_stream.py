@@ -1,7 +1,5 @@
 """Tests of the measurement stream: order of events, time tags, read-only data, and the run of an estimator."""
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Writers of image folders in the format of `marsyard ingest`, from measurements with known truth, for tests."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the offsets of matched pixels from the epipolar curves of given camera poses, and of their summary."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

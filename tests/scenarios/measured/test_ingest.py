@@ -1,7 +1,5 @@
 """Tests of `ingest`, which reads folders of recorded images: formats, and messages with file and line on errors."""
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

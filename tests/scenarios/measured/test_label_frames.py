@@ -1,6 +1,4 @@
-"""Tests of ingesting products whose camera models are in different frames: each pose is applied once."""
-
-from __future__ import annotations
+"""Tests of the frames of camera models: each pose of a label is applied once, and camera files name their frame."""
 
 from pathlib import Path
 
@@ -8,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.exchange.files import write_case
+from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
-from marsyard.scenarios.measured.store import CasesFile, load_images
-from marsyard.sim.camera import Cahvor, CameraModel, read_pds3, write_cahvor
+from marsyard.scenarios.measured.store import CasesFile, load_images, write_camera
+from marsyard.sim.camera import BODY_FRAME, Cahvor, CameraModel, read_cahvor, read_pds3, write_cahvor
 from marsyard.sim.frames import SITE_FROM_WORLD, world_from_mars_fixed
 from tests.sim.camera.labels import SITE_FROM_ROVER, pds3_label
 
@@ -153,3 +153,13 @@ def test_separate_camera_file_is_in_the_rover_frame(tmp_path: Path, small_camera
     write_folder(folder, ["case,file,camera", "a,0.img,left.cahvor", "a,1.img,"])
     first, second = ingest_cameras(folder, tmp_path / "out")
     assert_poses_agree(first, second)
+
+
+def test_exported_and_ingested_cameras_name_the_body_frame(tmp_path: Path) -> None:
+    measurements = inputs.descent()
+    write_case(tmp_path, measurements)
+    write_camera(tmp_path, 0, measurements.images[0].camera)
+    exported_file, ingested_file = tmp_path / "camera_1.cahvor", tmp_path / "cameras" / "000000.cahvor"
+    for path in (exported_file, ingested_file):
+        assert path.read_text().startswith(f"# Frame: {BODY_FRAME}\n")
+        assert read_cahvor(path) == measurements.images[0].camera

@@ -1,7 +1,5 @@
 """Tests of scenarios with ingested images: answers equal those of the original measurements; pose errors are seen."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

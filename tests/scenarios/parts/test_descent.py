@@ -1,7 +1,5 @@
 """Tests of the descent scenario with user-defined (custom) motions, instruments and scores."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """Tests of custom parts (user-defined motions, instruments and scores): lookup, options, and error messages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

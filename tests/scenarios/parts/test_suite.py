@@ -1,7 +1,5 @@
 """Tests of the conformance suite for custom motions, instruments and scores: examples pass, defects are reported."""
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 

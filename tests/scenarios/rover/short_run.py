@@ -1,7 +1,5 @@
 """Parameters of a short rover run for tests."""
 
-from __future__ import annotations
-
 from typing import Any
 
 #: A short approach to a rock of 0.8 m, from 3.6 m to 3.3 m, over a small terrain with few other rocks.

@@ -1,8 +1,17 @@
-"""Tests of the drive commands that each type of route leg computes from the estimated target position."""
+"""Tests of the route: commands of each type of leg, drive past the target, order of activities, stuck rovers."""
+
+import re
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.vtt import matching
+from marsyard.algorithms.vtt.pointing import mast_angles
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.rover import run as run_module
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     TargetEstimate,
@@ -11,8 +20,14 @@ from marsyard.scenarios.rover.flight_software import (
     plan_drive,
     plan_step,
 )
-from marsyard.scenarios.rover.parameters import LegParameters
+from marsyard.scenarios.rover.parameters import LegParameters, MobilityParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.run import Step, is_stuck, run_case
+from marsyard.scenarios.rover.scenario import RoverScenario
+from marsyard.scenarios.rover.world import Vehicle
+from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand
+from marsyard.sim.streams import Streams
+from tests.scenarios.rover.short_run import SHORT_RUN
 
 
 def make_target(x: float, y: float) -> TargetEstimate:
@@ -93,3 +108,129 @@ def test_incomplete_or_inconsistent_legs_are_rejected() -> None:
         LegParameters(motion="straight")
     with pytest.raises(ValueError, match="autonav needs a leg of motion 'approach'"):
         LegParameters(motion="turn", autonav=True)
+
+
+def test_drive_past_the_target_rolls_the_image_by_30_deg_in_few_steps() -> None:
+    """The two images of the paper, at 6.8 m and 1.8 m, differ by 30 deg; one step rolls the image by over 5 deg."""
+    p = RoverScenario().check_parameters(load_campaign("vtt-roll").parameters(0))
+    mast, azimuth = p.camera.mast(), np.radians(p.start.target_azimuth_deg)
+    # the rover drives along x; the start distance is that of the mast's base
+    ahead = p.start.distance_m * np.array([np.cos(azimuth), -np.sin(azimuth)]) + mast.geometry.base_m[:2]
+    target_world = np.array([*ahead, 0.5 * float(p.target.height_m or 0.0)])
+    steps_m = [float(leg.step_m or 0.0) for leg in p.legs for _ in range(leg.steps)]
+    assert len(steps_m) <= 6
+    heads, positions = [], []
+    for x in np.cumsum([0.0, *steps_m]):
+        world_from_rover = rigid(Rotation.identity(), np.array([x, 0.0, 0.0]))
+        angles = mast_angles(target_world - [x, 0.0, 0.0], mast)
+        assert angles is not None
+        heads.append(world_from_rover * mast.geometry.rover_from_head(*angles))
+        positions.append(np.asarray(heads[-1].inv().apply(target_world.copy())))
+
+    def compute_roll_deg(first: int, second: int) -> float:
+        new_from_old: RigidTransform = matching.pose_change(heads[first], heads[second])
+        points = matching.roll_points(positions[first], mast.left, mast.left, new_from_old, 0.05)
+        assert points is not None
+        return abs(float(np.degrees(matching.roll_angle(points))))
+
+    assert compute_roll_deg(0, len(steps_m)) == pytest.approx(30.0, abs=4.0)
+    rolls_deg = [compute_roll_deg(*pair) for pair in pairwise(range(len(heads)))]
+    # 5.7 deg is the roll that the paper calls noticeable (section 4.3.3)
+    assert max(rolls_deg) > 5.7
+    distances = [
+        float(np.linalg.norm((target_world - [x, 0.0, 0.0])[:2] - mast.geometry.base_m[:2]))
+        for x in (0.0, sum(steps_m))
+    ]
+    assert distances == pytest.approx([6.8, 1.8], abs=0.06)
+
+
+def test_tracked_and_false_track_have_separate_limits() -> None:
+    """A drift above the limit of a tracked target, but below that of a false track, is neither."""
+
+    def run(tracked_px: float) -> dict[str, object]:
+        score = {"tracked_px": tracked_px, "false_track_px": 10.0}
+        p = RoverScenarioParameters.model_validate({**SHORT_RUN, "score": score})
+        return dict(RoverScenario().run(p, Streams(1, "limits", 0)).row)
+
+    row = run(5.0)
+    drift_px = float(str(row["drift_px"]))
+    assert 0.0 < drift_px < 5.0
+    assert (row["tracked"], row["no_false_track"]) == (True, True)
+    row = run(0.5 * drift_px)
+    assert (row["tracked"], row["target_held"], row["no_false_track"]) == (False, False, True)
+    assert row["track_margin_px"] == pytest.approx(10.0 - float(str(row["worst_error_px"])))
+
+
+#: 95 % slip on level ground; visual odometry measures it.
+SLIPPING: dict[str, Any] = {
+    **SHORT_RUN,
+    "slip": {"flat": 0.95, "soil_spread": 0.0, "step_spread": 0.0},
+    "navigation": {"odometry": "oracle-motion"},
+    "legs": [{"motion": "approach", "goal_m": 3.0, "visual_odometry": True, "steps": 12}],
+}
+
+
+def run_slipping_rover(**changes: object) -> Any:
+    return RoverScenario().run(
+        RoverScenarioParameters.model_validate({**SLIPPING, **changes}), Streams(1, "stuck rovers", 0)
+    )
+
+
+def test_stuck_rover_is_no_failure_of_the_tracker() -> None:
+    result = run_slipping_rover()
+    assert (result.outcome, result.answered) == ("STUCK", False)
+    # five steps of 95 % slip end the run, before the maximum of 12 steps
+    assert result.row["updates"] == 6
+    assert (result.row["stuck"], result.row["mobile"], result.row["tracked"]) == (True, False, False)
+    assert result.row["target_held"]
+    assert result.row["slip_mean"] == pytest.approx(0.95, abs=0.01)
+
+
+def test_loss_by_the_tracker_of_a_slipping_rover_is_lost() -> None:
+    result = run_slipping_rover(algorithm="tests.scenarios.rover.trackers:LosingTracker")
+    assert result.outcome == "LOST"
+    assert (result.row["stuck"], result.row["mobile"], result.row["target_held"]) == (False, True, False)
+
+
+def test_too_few_steps_are_not_at_the_goal() -> None:
+    result = run_slipping_rover(slip={"flat": 0.5, "soil_spread": 0.0, "step_spread": 0.0})
+    assert result.outcome == "COMPLETED"
+    legs = [{"motion": "approach", "goal_m": 3.0, "visual_odometry": True, "steps": 1}]
+    result = run_slipping_rover(legs=legs)
+    assert (result.outcome, result.row["mobile"]) == ("NOT_AT_GOAL", True)
+
+
+def test_stuck_is_the_slip_over_successive_steps() -> None:
+    mobility = MobilityParameters(stuck_slip=0.8, stuck_steps=3)
+    slipping, moving = Step(1.0, 0.1), Step(1.0, 0.5)
+    assert not is_stuck([slipping] * 2, mobility)
+    assert is_stuck([moving, *[slipping] * 3], mobility)
+    # (0.1 + 0.1 + 0.5) / 3 = 0.23 of the commanded path, more than 0.2
+    assert not is_stuck([slipping, slipping, moving], mobility)
+
+
+def test_each_step_maps_then_drives_then_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
+    activities: list[str] = []
+
+    def record_calls(owner: object, name: str, activity: str) -> None:
+        original = getattr(owner, name)
+
+        def call_and_record(*args: object, **kwargs: object) -> object:
+            activities.append(activity)
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, call_and_record)
+
+    record_calls(run_module, "map_terrain", "map")
+    record_calls(Vehicle, "drive", "drive with visual odometry")
+    record_calls(run_module, "visit_stop", "track")
+    leg = {"motion": "approach", "goal_m": 3.0, "step_fraction": 0.08, "autonav": True, "visual_odometry": True}
+    run = run_case(RoverScenarioParameters.model_validate({**SHORT_RUN, "legs": [leg]}), Streams(1, "rover tests", 0))
+    # Each activity is represented by its first letter. Consecutive drives count as one drive.
+    steps = re.sub("d( d)+", "d", " ".join(activity[0] for activity in activities))
+    # The run starts with tracking. Then each step maps, drives with visual odometry, and tracks.
+    assert steps.split(" m d t")[0] == "t"
+    assert set(steps.split(" m d t")[1:]) == {""}
+    assert run.autonav_updates == activities.count("map") >= 2
+    assert run.visual_odometry_updates == activities.count("drive with visual odometry")
+    assert len(run.stops) == activities.count("track")

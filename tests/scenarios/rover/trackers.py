@@ -1,7 +1,5 @@
 """Custom trackers for tests: a biased tracker, a tracker that loses the target, and a tracker without answers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Fixtures of the camera tests: Opportunity's cameras with the values of their PDS labels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

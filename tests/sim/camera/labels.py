@@ -1,7 +1,5 @@
 """Labels with a camera model in a given frame, in the formats of PDS3 and PDS4, for tests."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

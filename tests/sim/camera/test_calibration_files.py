@@ -1,7 +1,5 @@
 """Tests of calibrations that are not YAML, against OpenCV's projection, and of files in formats that are not read."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

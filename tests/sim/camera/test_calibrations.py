@@ -1,7 +1,5 @@
 """Tests of reading calibration files of OpenCV, ROS, Kalibr and EuRoC, against OpenCV's projection."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of operations on cameras: rigid motion, binning, scaling, cropping, construction and immutability."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import math

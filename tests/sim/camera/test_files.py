@@ -1,7 +1,5 @@
 """Tests of camera files: PDS3 labels, JPL's CAHVOR text files, round trips and error messages."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from pathlib import Path

@@ -3,8 +3,6 @@
 The expected cameras are the model of the label in the rover's frame, moved with SciPy's transforms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

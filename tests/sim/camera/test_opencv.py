@@ -1,7 +1,5 @@
 """Tests of the conversion of OpenCV camera models, against OpenCV's projection."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

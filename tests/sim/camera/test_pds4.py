@@ -1,7 +1,5 @@
 """Tests of PDS4 labels: the camera model of a Mars 2020 navcam and error messages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

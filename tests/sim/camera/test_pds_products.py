@@ -1,7 +1,5 @@
 """Tests of reading images and poses from PDS3 products of Opportunity and from synthetic products."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

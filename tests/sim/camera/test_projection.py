@@ -1,7 +1,5 @@
 """Tests of projection and rays: inversion, the scalar reference formulas, Jacobians and invisible points."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Analytic grounds for rover tests, on which the pose of a rover at rest has a closed form: planes and mounds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of rover motion for drive commands: kinematics without slip, slip on slopes, and random soil."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tests of the field test helicopter: kinematic consistency and the flight described in the paper (III.C)."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of recorded motions: pose files of TUM, EuRoC and pandas are read, and splines match closed-form motions."""
 
-from __future__ import annotations
-
 from decimal import Decimal
 from pathlib import Path
 

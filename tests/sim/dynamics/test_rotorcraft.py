@@ -1,7 +1,5 @@
 """Tests of the small helicopter: kinematic consistency and the flight described in the landing paper (section V)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

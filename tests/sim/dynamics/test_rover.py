@@ -1,7 +1,5 @@
 """Tests of the static stance of a rover on the ground with its suspension."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

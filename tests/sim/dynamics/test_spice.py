@@ -1,7 +1,5 @@
 """Tests of flights read from SPICE kernels, which NAIF's library writes for a closed-form motion."""
 
-from __future__ import annotations
-
 import shutil
 import textwrap
 from pathlib import Path

@@ -3,8 +3,6 @@
 In the slow mode the line below the canopy cones; in the fast mode the lander nods on its bridle.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

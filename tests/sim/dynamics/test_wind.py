@@ -1,7 +1,5 @@
 """Tests of the wind profile over height and of gust statistics."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import quad

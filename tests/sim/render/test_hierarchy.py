@@ -1,4 +1,7 @@
-"""Tests of the triangle hierarchy against exhaustive search."""
+"""Tests of the renderer's data structures: triangle hierarchy, levels of the ground, strips of pixels and freed memory."""
+
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -7,7 +10,11 @@ from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects
 from marsyard.sim.render.kernels.hierarchy import list_in_beam, nearest_hit
+from marsyard.sim.render.kernels.strips import ROW, STRIP, allocate_cells, fetch_levels, spline
 from marsyard.sim.render.kernels.structs import Ray
+from marsyard.sim.render.renderer import LEVELS, NO_CEILING, ground_struct
+from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.kernels import sample
 
 EYE = np.array([0.3, -0.2, 1.1])
 
@@ -82,3 +89,79 @@ def _list_hits(objects: Objects, ray: np.ndarray, max_distance_m: float) -> set[
     columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
     u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T
     return set(np.flatnonzero((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0) & (t < max_distance_m)).tolist())
+
+
+@pytest.mark.parametrize("side", [16, 128])
+def test_kernels_receive_a_constant_number_of_levels(side: int) -> None:
+    surface = Surface.from_samples(np.zeros((side, side, 2), dtype=np.float32), 1.0)
+    ground = ground_struct(surface, (0.0, 1.0, 0.0, 1.0, 2.0), ceilings=True)
+    levels, top_level = ground.levels, ground.top_level
+    assert len(levels) == len(ground.ceilings) == LEVELS
+    assert levels[top_level].shape[0] == 16
+    assert all(level is expected for level, expected in zip(levels, surface.levels, strict=False))
+    # Kernels are compiled for levels of the same array type.
+    assert {(level.dtype.str, level.flags.writeable, level.flags.c_contiguous) for level in levels} == {
+        ("<f4", False, True)
+    }
+    assert all(ceiling is expected for ceiling, expected in zip(ground.ceilings, surface.ceilings, strict=False))
+    ground_without_ceilings = ground_struct(surface, ground.extent, ceilings=False)
+    assert all(ceiling is NO_CEILING for ceiling in ground_without_ceilings.ceilings)
+
+
+SIDE, SPACING_M = 64, 0.5
+SAMPLES = np.random.default_rng(3).normal(size=(SIDE, SIDE, 2)).astype(np.float32)
+SURFACE = Surface.from_samples(SAMPLES, SPACING_M)
+
+
+def test_vectorised_spline_equals_single_evaluation() -> None:
+    rng = np.random.default_rng(4)
+    # Positions inside the terrain, on its border and in other periods.
+    x, y = rng.uniform(-40.0, 40.0, (2, ROW))
+    x[:4], y[:4] = [0.0, -0.25, 31.75, 32.0], [31.9, 0.0, -0.1, 16.0]
+    level_of = rng.integers(0, len(SURFACE.levels), STRIP)
+    indices = np.sort(rng.permutation(STRIP)[:100])
+    cells = allocate_cells()
+    fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, indices, indices.size, x, y, cells)
+    for index in indices:
+        scale = 1.0 / SPACING_M / 2.0 ** level_of[index]
+        height, slope_x, slope_y, albedo = spline(cells[0], cells[1], int(index))
+        expected = sample(SURFACE.levels[level_of[index]], scale, x[index], y[index])
+        np.testing.assert_allclose((height, slope_x * scale, slope_y * scale, albedo), expected, rtol=0.0, atol=1e-14)
+
+
+#: Size of the block, bytes.
+SIZE = 20_000_000
+#: Allocates and frees a large block. Prints the bytes still in use before and after the memory is returned.
+SCRIPT = f"""
+import os, sys
+from marsyard.sim.render.renderer import keep_freed_memory, return_freed_memory
+
+def resident_bytes():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+if sys.argv[1] == "keep":
+    keep_freed_memory()
+before = resident_bytes()
+block = b"1" * {SIZE}
+del block
+after_free = resident_bytes()
+return_freed_memory()
+print(after_free - before, resident_bytes() - before)
+"""
+
+
+def _measure_memory(mode: str) -> tuple[int, int]:
+    """Return the bytes in use after the block is freed, and after the memory is returned to the system."""
+    result = subprocess.run([sys.executable, "-c", SCRIPT, mode], capture_output=True, text=True, check=True)
+    bytes_after_free, bytes_after_return = map(int, result.stdout.split())
+    return bytes_after_free, bytes_after_return
+
+
+@pytest.mark.slow
+def test_process_retains_freed_memory_until_it_is_returned() -> None:
+    bytes_after_free, bytes_after_return = _measure_memory("keep")
+    assert bytes_after_free > 0.9 * SIZE
+    assert bytes_after_return < 0.1 * SIZE
+    # By default the C library returns freed memory at once.
+    assert _measure_memory("default")[0] < 0.1 * SIZE

@@ -1,7 +1,5 @@
 """Tests of relief finer than the terrain's samples: spectrum, shading, and unchanged geometric truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

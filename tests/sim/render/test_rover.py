@@ -1,7 +1,5 @@
 """Tests of the rendered rover: shape, pose and shadow."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Tests of the division of pixels among threads: each pixel is computed once, and images are bitwise equal."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

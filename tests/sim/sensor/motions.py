@@ -1,7 +1,5 @@
 """Closed-form motions for the tests of instruments: a swaying body, and uniform motion of an image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

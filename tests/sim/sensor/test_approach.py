@@ -1,7 +1,5 @@
 """Tests of inertial errors from cruise to the start of the descent, against propagation at the unit's full rate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of custom cameras in campaigns: mounting preserves all angles, and a stored camera replaces its file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

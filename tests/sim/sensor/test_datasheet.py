@@ -1,7 +1,5 @@
 """Tests of detectors from datasheets, against manual calculation and the presets."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the inertial measurement unit: random walk, bias, scale, rounding and temperature."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from jaxtyping import Float64

@@ -1,7 +1,5 @@
 """Tests of inertial navigation with errors of the inertial unit and of time tags."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

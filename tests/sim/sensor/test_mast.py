@@ -1,7 +1,5 @@
 """Tests of the mast: pointing errors, and range errors caused by errors of the stereo calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tests of the navigation filter: errors consistent with its covariance, and robust to instrument faults."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Tests of rover odometry: the estimated pose against the true pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform

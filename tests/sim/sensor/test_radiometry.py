@@ -1,12 +1,13 @@
-"""Tests of the radiometry of detectors against published values."""
+"""Tests of the radiometry of detectors against published values, of automatic exposure, and of replaced bad pixels."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from marsyard.sim.sensor import DetectorParameters, preset
-from marsyard.sim.sensor.detector import dark_seconds
+from marsyard.sim.sensor import AutoExposureParameters, Detector, DetectorParameters, auto_expose, preset
+from marsyard.sim.sensor.detector import dark_seconds, fill_bad_pixels
 from marsyard.sim.sensor.optics import DARK_E_S, DARKEST_RADIANCE_FACTOR, LightPath, solar_photons
 
 FLIGHT_CAMERA, FIELD_CAMERA = preset("mer-descent-flown"), preset("mer-descent-field")
@@ -84,3 +85,78 @@ def test_responsivity_depends_on_aperture_pixel_area_band_and_distance() -> None
     assert LightPath(6.0, 12.0, (400.0, 1100.0)).responsivity_e_s(1.0) == pytest.approx(4.0 * rate)
     assert LightPath(12.0, 6.0, (400.0, 1100.0)).responsivity_e_s(1.0) == pytest.approx(rate / 4.0)
     assert LightPath(12.0, 12.0, (600.0, 800.0)).responsivity_e_s(1.0) < rate
+
+
+#: Radiance factors, mean 0.11.
+GROUND = (0.1 + 0.02 * np.random.default_rng(0).random((128, 96))).astype(np.float32)
+OPTIONS = AutoExposureParameters()
+
+
+def _make_detector(exposure_s: float) -> Detector:
+    parameters = DetectorParameters(exposure_s=exposure_s, rows_summed=1, transfer_row_s=0.0, clear_row_s=0.0)
+    return Detector.draw(np.ones_like(GROUND), parameters, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize("start_s", [0.0005, 0.02, 0.5])
+def test_auto_exposure_converges_from_dark_and_bright(start_s: float) -> None:
+    result = auto_expose(_make_detector(start_s), GROUND, OPTIONS, np.random.default_rng(2))
+    assert result.converged
+    assert len(result.exposures_s) <= 5
+    # By default the 98th percentile of the counts is at 75 % of full scale.
+    image = result.detector.expose(GROUND, np.random.default_rng(3))
+    assert np.percentile(image, 98.0) == pytest.approx(0.75 * 4095, rel=OPTIONS.tolerance + 0.01)
+    assert result.detector.calibration.exposure_s == result.exposures_s[-1]
+
+
+def test_exposure_can_use_a_part_of_the_image() -> None:
+    """Under a bright sky the ground is underexposed, unless the exposure uses only the ground."""
+    scene = GROUND.copy()
+    scene[:40] = 0.6
+    full_image = auto_expose(_make_detector(0.01), scene, OPTIONS, np.random.default_rng(2))
+    ground_region = auto_expose(
+        _make_detector(0.01), scene, OPTIONS, np.random.default_rng(2), region=(slice(60, 110), slice(20, 70))
+    )
+    assert full_image.converged
+    assert ground_region.converged
+    # The controlled radiance is that of the sky, 0.6, or the maximum of the ground, 0.12.
+    assert ground_region.exposures_s[-1] / full_image.exposures_s[-1] == pytest.approx(0.6 / 0.12, rel=0.12)
+
+
+def test_unreachable_exposure_is_reported() -> None:
+    short_exposure = AutoExposureParameters(max_exposure_s=0.001)
+    result = auto_expose(_make_detector(0.001), GROUND, short_exposure, np.random.default_rng(2))
+    assert not result.converged
+    assert result.exposures_s == (0.001,)
+    one_image = auto_expose(_make_detector(0.5), GROUND, AutoExposureParameters(images=1), np.random.default_rng(2))
+    assert not one_image.converged
+    assert one_image.detector.parameters.exposure_s < 0.5
+
+
+def test_invalid_parameters_are_rejected() -> None:
+    with pytest.raises(ValidationError, match="is greater than max_exposure_s"):
+        AutoExposureParameters(min_exposure_s=0.1, max_exposure_s=0.01)
+    with pytest.raises(ValueError, match="region is empty"):
+        auto_expose(_make_detector(0.01), GROUND, OPTIONS, np.random.default_rng(0), region=(slice(0, 0), slice(0, 0)))
+
+
+def test_bad_pixels_are_replaced_by_the_mean_of_good_neighbours() -> None:
+    counts = (10 * np.arange(6)[:, None] + np.arange(8)[None]).astype(np.uint16)
+    is_bad = np.zeros(counts.shape, dtype=bool)
+    is_bad[2, 3] = is_bad[2, 4] = is_bad[0, 0] = True
+    corrupted = counts.copy()
+    corrupted[is_bad] = 4000
+    corrected = fill_bad_pixels(corrupted, is_bad)
+    np.testing.assert_array_equal(corrected[~is_bad], counts[~is_bad])
+    # Pixel (2, 3) has seven good neighbours: (2, 4) is bad.
+    neighbours = [counts[i, j] for i in (1, 2, 3) for j in (2, 3, 4) if (i, j) not in ((2, 3), (2, 4))]
+    assert corrected[2, 3] == np.rint(np.mean(neighbours))
+    assert corrected[0, 0] == np.rint(np.mean([counts[0, 1], counts[1, 0], counts[1, 1]]))
+
+
+def test_pixel_without_good_neighbours_is_unchanged() -> None:
+    is_bad = np.zeros((5, 5), dtype=bool)
+    is_bad[1:4, 1:4] = True
+    counts = np.full((5, 5), 7, dtype=np.uint16)
+    counts[2, 2] = 99
+    assert fill_bad_pixels(counts, is_bad)[2, 2] == 99
+    assert fill_bad_pixels(counts, is_bad)[1, 1] == 7

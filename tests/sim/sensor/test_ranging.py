@@ -1,7 +1,5 @@
 """Tests of radar altimeter, laser altimeter and satellite receiver: errors, time tags and measured ranges."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

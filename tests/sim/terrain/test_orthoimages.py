@@ -1,7 +1,5 @@
 """Tests of orthoimages: position relative to the DTM, scaled integers, palettes, colours and transparency."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,11 +1,15 @@
-"""Tests of terrain surfaces: height, gradient and resolution levels against SciPy's cubic B-spline; height bounds."""
+"""Tests of terrain surfaces against SciPy's B-spline, and of synthetic terrain: statistics, albedo and craters."""
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from scipy.ndimage import map_coordinates
 
-from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
+from marsyard.sim.terrain.landforms.ground import Spectrum
+from marsyard.sim.terrain.landforms.kernels import stamp_craters
+from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 
 
 @pytest.fixture(scope="module")
@@ -85,3 +89,107 @@ def test_resolution_levels_are_aligned() -> None:
 def test_shapes_that_cannot_be_halved_are_rejected(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="power of two"):
         Surface.from_samples(np.zeros(shape, dtype=np.float32), 1.0)
+
+
+def test_equal_seeds_produce_equal_bytes() -> None:
+    parameters = TerrainParameters(samples=128)
+    first = synthesise(parameters, np.random.default_rng(3))
+    same_seed = synthesise(parameters, np.random.default_rng(3))
+    other_seed = synthesise(parameters, np.random.default_rng(4))
+    for level, same_level in zip(first.levels, same_seed.levels, strict=True):
+        assert level.tobytes() == same_level.tobytes()
+    assert first.levels[0].tobytes() != other_seed.levels[0].tobytes()
+
+
+def test_random_fields_have_the_specified_mean_variance() -> None:
+    # The standard error of the mean variance is about 3 % for 200 draws of about ten independent large-scale modes.
+    spectrum = Spectrum.power_law(128, 1.0, 0.5, 60.0)
+    variances = [spectrum.draw_field(np.random.default_rng(seed), 2.0).var() for seed in range(200)]
+    assert np.mean(variances) == pytest.approx(4.0, rel=0.04)
+
+
+@pytest.mark.parametrize("hurst", [0.5, 0.8])
+def test_structure_function_has_specified_slope_and_exponent(hurst: float) -> None:
+    """The structure function has the specified RMS slope at the baseline and grows with the Hurst exponent."""
+    parameters = TerrainParameters(
+        samples=1024, hurst=hurst, rms_slope_deg=3.0, slope_baseline_m=30.0, outer_scale_m=20000.0, craters_per_km2=0.0
+    )
+    lags = np.array([4, 8, 20])
+    roughness = np.zeros(3)
+    for seed in range(6):
+        heights = synthesise(parameters, np.random.default_rng(seed)).levels[0][..., 0].astype(np.float64)
+        roughness += [
+            np.mean((np.roll(heights, -lag, axis=1) - heights) ** 2 + (np.roll(heights, -lag, axis=0) - heights) ** 2)
+            for lag in lags
+        ]
+    # The sum has 12 terms: six terrains and two axes.
+    rms = np.sqrt(roughness / 12.0)
+    slope_deg = np.degrees(np.arctan(rms[2] / (lags[2] * parameters.spacing_m)))
+    assert slope_deg == pytest.approx(3.0, rel=0.1)
+    measured_hurst = np.polyfit(np.log(lags), np.log(rms), 1)[0]
+    # The band limits of the grid change the exponent by a few hundredths.
+    assert measured_hurst == pytest.approx(hurst, abs=0.05)
+
+
+def test_albedo_has_the_specified_mean_and_contrast() -> None:
+    parameters = TerrainParameters(samples=1024, albedo=0.25, albedo_contrast=0.1, outer_scale_m=200.0)
+    albedo = synthesise(parameters, np.random.default_rng(1)).levels[0][..., 1]
+    assert albedo.mean() == pytest.approx(0.25, rel=0.02)
+    assert np.log(albedo).std() == pytest.approx(0.1, rel=0.1)
+
+
+def test_crater_sizes_follow_the_power_law() -> None:
+    parameters = TerrainParameters(craters_per_km2=200.0, crater_diameter_min_m=10.0, crater_exponent=2.0)
+    area_km2 = (parameters.samples * parameters.spacing_m / 1000.0) ** 2
+    diameters = 2 * draw_craters(parameters, np.random.default_rng(2))[:, 2]
+    expected = 200.0 * area_km2
+    assert diameters.size == pytest.approx(expected, abs=4 * np.sqrt(expected))
+    # With an exponent of 2, a quarter of the craters have twice the minimum diameter.
+    large_craters = np.count_nonzero(diameters > 20.0)
+    assert large_craters == pytest.approx(expected / 4, abs=4 * np.sqrt(expected / 4))
+    assert diameters.min() >= 10.0
+    assert diameters.max() <= parameters.crater_diameter_max_m
+
+
+def test_crater_depths_range_from_degraded_to_fresh() -> None:
+    craters = draw_craters(TerrainParameters(craters_per_km2=100.0), np.random.default_rng(3))
+    depth_ratio = (craters[:, 3] + craters[:, 4]) / (2.0 * craters[:, 2])
+    assert depth_ratio.min() == pytest.approx(DEGRADED_DEPTH, rel=0.02)
+    assert depth_ratio.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
+
+
+def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
+    height, log_albedo = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
+    radius, depth, rim = 20.0, 6.4, 1.6
+    # A crater with a sharp rim and a round outline, centred on the corner of the grid. Columns: see `stamp_craters`.
+    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(7), 0.3]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
+    centred = np.roll(height, (128, 128), axis=(0, 1))
+    assert centred[128, 128] == pytest.approx(-depth)
+    assert tuple(map(int, np.unravel_index(centred.argmin(), centred.shape))) == (128, 128)
+    assert centred[128, 128 + 20] == pytest.approx(rim)
+    assert centred[128 - 20, 128] == pytest.approx(rim)
+    assert np.count_nonzero(centred[:, :60]) == 0
+    assert np.roll(log_albedo, 128, axis=1)[0, 128] == pytest.approx(0.1)
+
+
+def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
+    height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
+    # A crater of radius 30 m and depth 3 m, filled up to a flat floor. Columns: see `stamp_craters`.
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(7), 0.0]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
+    assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
+    assert np.ptp(height[64, 56:73]) < 0.15
+    assert not log_albedo.any()
+
+
+def test_unordered_crater_sizes_are_rejected() -> None:
+    parameters = TerrainParameters(samples=64, crater_diameter_min_m=50.0, crater_diameter_max_m=20.0)
+    with pytest.raises(ValueError, match="must be larger than crater_diameter_min_m"):
+        synthesise(parameters, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("invalid", [{"samples": 4}, {"spacing_m": -1.0}, {"hurst": 1.5}, {"relief": 3.0}])
+def test_invalid_parameters_are_rejected(invalid: dict[str, float]) -> None:
+    with pytest.raises(ValidationError):
+        TerrainParameters.model_validate(invalid)
