@@ -1,4 +1,4 @@
-"""Tests of the preparation of images for hazard detection: radiometry, common orientation and scale, band-pass filter."""
+"""Tests of the preparation of images for hazard detection: radiometry, common orientation and scale, band-pass."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Tests of the renderer's data structures: triangle hierarchy, levels of the ground, strips of pixels and freed memory."""
+"""Tests of the renderer's data structures: triangle hierarchy, levels of the ground, strips of pixels, freed memory."""
 
 import subprocess
 import sys
