@@ -51,15 +51,13 @@ def make_pair(*tracks: Track) -> PairDetails:
     return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))
 
 
-def combine_tracks(
-    first: list[np.ndarray], second: list[np.ndarray], interval_velocities: np.ndarray
-) -> VelocityEstimate:
+def combine_tracks(first: list[np.ndarray], second: list[np.ndarray], velocities: np.ndarray) -> VelocityEstimate:
     """Combine valid tracks with these velocities in the first and the second pair, for these IMU velocities."""
     pairs = [
         make_pair(*(make_track(pair, index, velocity) for index, velocity in enumerate(velocities)))
         for pair, velocities in enumerate((first, second))
     ]
-    return combine_pairs((pairs[0], pairs[1]), interval_velocities, THRESHOLD)
+    return combine_pairs((pairs[0], pairs[1]), velocities, THRESHOLD)
 
 
 def test_combinations_are_sorted_by_consistency() -> None:

@@ -39,9 +39,7 @@ def get_details(estimate: VelocityEstimate) -> DimesDetails:
     return estimate.details
 
 
-def compute_track_errors(
-    flights: list[Flight], estimates: list[VelocityEstimate], valid_only: bool = True
-) -> np.ndarray:
+def track_errors(flights: list[Flight], estimates: list[VelocityEstimate], valid_only: bool = True) -> np.ndarray:
     """Compute estimated minus true horizontal velocities of the tracks of all flights, shape (tracks, 2)."""
     return np.array(
         [
@@ -69,7 +67,7 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
     )
     assert compute_rms(errors) < 0.05
     # at least 90 % of the tracks, two templates in each of two pairs, are valid
-    assert len(compute_track_errors(flights, estimates)) >= 0.9 * 4 * len(flights)
+    assert len(track_errors(flights, estimates)) >= 0.9 * 4 * len(flights)
 
 
 def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
@@ -77,7 +75,7 @@ def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
     flights = [draw_flight(rng) for _ in range(6)]
     estimates = [DimesEstimator().estimate(render(flight)) for flight in flights]
     # The fit is biased by up to 0.12 px of 5.6 m in 3.75 s (0.18 m/s) on each axis.
-    assert 0.03 < compute_rms(compute_track_errors(flights, estimates)) < 0.18
+    assert 0.03 < compute_rms(track_errors(flights, estimates)) < 0.18
 
 
 @pytest.mark.slow
@@ -123,7 +121,7 @@ def test_subpixel_refinement_reduces_velocity_error() -> None:
 
     def rms_error(options: DimesOptions) -> float:
         estimates = [DimesEstimator(options).estimate(measurements) for measurements in inputs]
-        return compute_rms(compute_track_errors(flights, estimates, valid_only=False))
+        return compute_rms(track_errors(flights, estimates, valid_only=False))
 
     whole_pixel, fitted = (rms_error(DimesOptions(subpixel=subpixel)) for subpixel in (False, True))
     # Whole pixels: uniform errors of +-0.5 px of 5.6 m and 4.7 m on both axes in 3.75 s are 0.57 m/s rms.
@@ -272,7 +270,7 @@ def test_wrong_attitude_gives_no_velocity(measurements: DescentMeasurements) -> 
 @pytest.mark.parametrize(
     "times", [(0.0, 0.0, 0.0), (2.0, 1.0, 0.0), (0.0, 1e9, 2e9), (0.0, np.nan, 1.0), (0.0, 60.0, 120.0)]
 )
-def test_wrong_image_times_give_no_template_area(
+def test_wrong_times_give_no_template_area(
     measurements: DescentMeasurements, times: tuple[float, float, float]
 ) -> None:
     images = tuple(replace(image, time_s=t) for image, t in zip(measurements.images, times, strict=True))
@@ -284,9 +282,7 @@ def test_wrong_image_times_give_no_template_area(
 @pytest.mark.parametrize(
     "sun", [np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.full(3, np.nan)]
 )
-def test_any_sun_direction_gives_a_velocity_or_no_template_area(
-    measurements: DescentMeasurements, sun: np.ndarray
-) -> None:
+def test_any_sun_gives_a_velocity_or_no_template_area(measurements: DescentMeasurements, sun: np.ndarray) -> None:
     answer = ESTIMATOR.estimate(replace(measurements, sun_direction=sun))
     assert answer.outcome in (VelocityOutcome.VALID, VelocityOutcome.NO_TEMPLATE_AREA)
 

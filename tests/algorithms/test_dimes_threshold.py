@@ -84,16 +84,14 @@ def test_confirmation_seed_has_similar_availability(confirmation_errors: np.ndar
 
 @pytest.mark.slow
 @pytest.mark.parametrize("tracks_per_pair", [1, 2])
-@pytest.mark.parametrize("track_error_range_m_s", [(10.0, 10.0), (10.0, 60.0)])
+@pytest.mark.parametrize("range_m_s", [(10.0, 10.0), (10.0, 60.0)])
 def test_one_wrong_track_rarely_causes_a_wrong_velocity(
-    confirmation_errors: np.ndarray, tracks_per_pair: int, track_error_range_m_s: tuple[float, float]
+    confirmation_errors: np.ndarray, tracks_per_pair: int, range_m_s: tuple[float, float]
 ) -> None:
     # With one track wrong by at least 10 m/s, 99.5 % of cases report a correct velocity or none.
     rng = np.random.default_rng(5)
     tracks = np.concatenate([confirmation_errors[:, :, :tracks_per_pair]] * 8)
-    fractions = simulate_wrong_track(
-        tracks, track_error_range_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng
-    )
+    fractions = simulate_wrong_track(tracks, range_m_s, STORED["threshold_m_s"], ThresholdInputs().imu_sd_m_s, rng)
     assert fractions.correct + fractions.rejected >= 0.995
     assert fractions.correct + fractions.rejected + fractions.wrong == pytest.approx(1.0)
     # With a second track in the pair, the correct velocity is almost always reported.

@@ -243,9 +243,7 @@ def format_double_answers(version: int, pause_s: float = 0.05) -> str:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_late_second_answer_is_not_used_for_the_next_case(
-    measurements: DescentMeasurements, tmp_path: Path, version: int
-) -> None:
+def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements, tmp_path: Path, version: int) -> None:
     spec = f"serve:{write_program(tmp_path, format_double_answers(version))}"
     first = run_program(spec, measurements).velocity_m_s
     assert first is not None
@@ -279,7 +277,7 @@ def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements
         ('{"exchange": 2, "id": "1", "outcome": "NO_VALID_TRACK"}', "the answer's id is '1'; allowed: 1"),
     ],
 )
-def test_answer_must_contain_the_request_id(
+def test_answer_needs_the_request_id(
     measurements: DescentMeasurements, tmp_path: Path, reply: str, message: str
 ) -> None:
     body = (

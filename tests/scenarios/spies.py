@@ -34,7 +34,6 @@ class VelocitySpy:
     """Velocity estimator that records its inputs and has no valid answer."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         RECORDED_INPUTS.append(measurements)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
@@ -43,39 +42,43 @@ class SiteSpy:
     """Site estimator that records its inputs and does not converge."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
-        """See `SiteEstimator`."""
         RECORDED_INPUTS.append(measurements)
         return SiteEstimate(SiteOutcome.NO_STRUCTURE, np.array(measurements.apriori_site_world))
 
 
-class TrackerSpy:
-    """The paper's tracker; records (pose, mast) of each `aim` call and the measurements of each update."""
+class WrappedTracker:
+    """The paper's tracker; subclasses change some of its methods."""
 
     def __init__(self) -> None:
         self.paper_tracker = VisualTargetTracker()
 
     @property
     def state(self) -> TrackingState:
-        """See `TargetTracker`."""
         return self.paper_tracker.state
 
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """See `TargetTracker`."""
         self.paper_tracker.designate(target, world_from_rover)
 
     def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
-        """See `TargetTracker`."""
-        RECORDED_INPUTS.append((world_from_rover, mast))
         return self.paper_tracker.aim(world_from_rover, mast)
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """See `TargetTracker`."""
-        RECORDED_INPUTS.append(measurements)
         return self.paper_tracker.update(measurements)
 
     def clear(self) -> None:
-        """See `TargetTracker`."""
         self.paper_tracker.clear()
+
+
+class TrackerSpy(WrappedTracker):
+    """Tracker that records (pose, mast) of each `aim` call and the measurements of each update."""
+
+    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> MastAim | None:
+        RECORDED_INPUTS.append((world_from_rover, mast))
+        return super().aim(world_from_rover, mast)
+
+    def update(self, measurements: RoverMeasurements) -> TargetUpdate:
+        RECORDED_INPUTS.append(measurements)
+        return super().update(measurements)
 
 
 def record_case(case: ScoredVelocity | ScoredSite) -> dict[str, float]:
@@ -94,7 +97,6 @@ class VelocityWriter(VelocitySpy):
     """Velocity estimator that writes to its read-only image."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         _set_counts_to_zero(measurements.images[0], make_writable=False)
         return super().estimate(measurements)
 
@@ -103,7 +105,6 @@ class ForcedVelocityWriter(VelocitySpy):
     """Velocity estimator that makes an image writable and overwrites it."""
 
     def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         _set_counts_to_zero(measurements.images[0], make_writable=True)
         return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 
@@ -112,7 +113,6 @@ class ForcedSiteWriter(SiteSpy):
     """Site estimator that makes an image writable and overwrites it."""
 
     def estimate(self, measurements: LandingMeasurements) -> SiteEstimate:
-        """See `SiteEstimator`."""
         _set_counts_to_zero(measurements.images[0], make_writable=True)
         return SiteEstimate(SiteOutcome.NO_STRUCTURE, np.array(measurements.apriori_site_world))
 
@@ -121,7 +121,6 @@ class ForcedTrackerWriter(TrackerSpy):
     """Tracker that makes an image writable and overwrites it."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """See `TargetTracker`."""
         update = self.paper_tracker.update(measurements)
         _set_counts_to_zero(measurements.left, make_writable=True)
         return update
@@ -131,7 +130,6 @@ class RaisingTracker(TrackerSpy):
     """Tracker that raises an exception at the second stop."""
 
     def update(self, measurements: RoverMeasurements) -> TargetUpdate:
-        """See `TargetTracker`."""
         if any(isinstance(inputs, RoverMeasurements) for inputs in RECORDED_INPUTS):
             raise RuntimeError("the tracker raised")
         return super().update(measurements)

@@ -63,10 +63,8 @@ def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), ca
             "targets": [{"across": 0.0, "up": 0.5}],
         },
     }
-    selected_scenario = scenario(name)
-    return selected_scenario.run(
-        selected_scenario.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case)
-    )
+    selected = scenario(name)
+    return selected.run(selected.parameters_type.model_validate(parameters[name]), Streams(1, "handover", case))
 
 
 def list_image_counts(inputs: Any) -> list[np.ndarray]:
@@ -130,7 +128,6 @@ class ZeroDifferenceEstimator:
     """Returns a wrong velocity in an array whose difference to the truth is zero."""
 
     def estimate(self, _: object) -> VelocityEstimate:
-        """See `VelocityEstimator`."""
         return VelocityEstimate(VelocityOutcome.VALID, np.array([400.0, 0.0]).view(ZeroDifferenceArray))
 
 
@@ -140,9 +137,7 @@ def test_answers_are_converted_to_numpy_arrays_and_floats() -> None:
     assert type(answer.velocity_m_s) is np.ndarray
     assert (answer.velocity_m_s - np.array([1.0, 0.0])).tolist() == [399.0, 0.0]
     position, matrix = np.arange(3, dtype=np.float32).view(ZeroDifferenceArray), np.eye(2).view(ZeroDifferenceArray)
-    velocity = VelocityEstimate(
-        VelocityOutcome.VALID, np.zeros(2), covariance_m2_s2=matrix, span_s=(np.float64(0.0), 1.0)
-    )
+    velocity = VelocityEstimate(VelocityOutcome.VALID, np.zeros(2), None, matrix, (np.float64(0.0), 1.0))
     arrays = (
         check_velocity(velocity).covariance_m2_s2,
         check_site(SiteEstimate(SiteOutcome.SAFE_SITE, position)).site_world,

@@ -115,9 +115,7 @@ def test_bounds_of_table_1_are_the_three_sigma_errors_of_the_paper() -> None:
 
 def test_statements_on_positions_name_the_errors_that_are_not_included() -> None:
     """The registration error of the map has a default of 50 m per axis, more than the limit of 40 m."""
-    positions = {
-        name: entry for name, entry in shipped_requirements().items() if name.startswith("LOC-") and entry.bound
-    }
+    positions = {name: entry for name, entry in shipped_requirements().items() if name[:4] == "LOC-" and entry.bound}
     assert len(positions) == 4
     for entry in positions.values():
         assert "errors of the map's registration are not included" in entry.statement

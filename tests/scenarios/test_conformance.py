@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.running.replay import run_conformance_checks
-from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, inputs, run_check, trackers
+from marsyard.scenarios.conformance import Subject, determine_task, inputs, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
 from marsyard.sim.camera import Cahv
+from tests.scenarios.suites import run_suite, write_module
 
 MODULE_HEADER = """
 import os, random, signal, sys
@@ -21,13 +22,6 @@ NO_ANSWER = VelocityEstimate(Outcome.NO_VALID_TRACK, None)
 def has_texture(m):
     return m.images[0].counts.std() > 5
 """
-
-
-def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
-    """Run the given checks, or all checks, of an algorithm; return the findings by name of the check."""
-    subject = Subject(spec, determine_task(spec), 60.0)
-    names = [name for name, _ in check_names(subject)]
-    return {name: run_check(subject, names.index(name)) for name in (checks or names)}
 
 
 @pytest.mark.parametrize(
@@ -52,15 +46,8 @@ def test_shipped_algorithms_conform(spec: str, monkeypatch: pytest.MonkeyPatch) 
 
 
 def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """Write a module with a class `Defective` and make its folder current; its name is unique (Python caches modules).
-
-    Return the import path of the class.
-    """
-    name = f"bad_{abs(hash(body))}"
-    (folder / f"{name}.py").write_text(MODULE_HEADER + textwrap.dedent(body))
-    monkeypatch.chdir(folder)
-    monkeypatch.syspath_prepend(str(folder))
-    return f"{name}:Defective"
+    """Write a module with a class `Defective` and return the import path of the class."""
+    return f"{write_module(folder, monkeypatch, MODULE_HEADER + textwrap.dedent(body))}:Defective"
 
 
 def format_estimator(lines: str) -> str:
@@ -197,11 +184,7 @@ def test_estimator_with_state_from_earlier_cases_is_reported(tmp_path: Path, mon
             "after clear and a second designation of the target, its answer differs",
         ),
         ("inputs", "def update(self, m): m.left.counts[:] = 0; return super().update(m)", "it changed its input"),
-        (
-            "truth",
-            "def update(self, m): import marsyard.sim.terrain; return super().update(m)",
-            "access to the truth: bad_",
-        ),
+        ("truth", "def update(self, m): import marsyard.sim.terrain; return super().update(m)", "to the truth: bad_"),
     ],
 )
 def test_tracker_defects_are_reported(
@@ -221,9 +204,7 @@ def test_tracker_defects_are_reported(
         ("signal.signal(signal.SIGTERM, signal.SIG_IGN)", "it changed the state of its process: "),
     ],
 )
-def test_changed_process_state_is_reported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: str, problem: str
-) -> None:
+def test_changed_process_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lines: str, problem: str) -> None:
     """Each check runs in its own process; the suite compares the state of the process before and after."""
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     spec = write_defective_module(tmp_path, monkeypatch, format_estimator(f"{lines}\nreturn NO_ANSWER"))

@@ -173,10 +173,8 @@ def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, mon
     for spec in ("stream_module:Mine", "stream_module:make", "installed", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)
-    accepts_stream = {
-        spec: VELOCITY.accepts_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")
-    }
-    assert accepts_stream == {"installed": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
+    accepts = {spec: VELOCITY.accepts_stream(spec) for spec in ("installed", "serve-stream:cat", "exec:cat", "dimes")}
+    assert accepts == {"installed": True, "serve-stream:cat": True, "exec:cat": False, "dimes": False}
     # The result of a factory function is unknown without a call.
     assert VELOCITY.accepts_stream("stream_module:make") is None
     with pytest.raises(ValueError, match="is not a valid velocity estimator: missing members: finish"):

@@ -19,9 +19,11 @@ from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_inges
 from marsyard.scenarios.measured.store import CasesFile
 from marsyard.scenarios.meshes import MAX_BYTES, MeshFileError, read_mesh
 from marsyard.scenarios.offline import VELOCITY_FORMAT, read_answers
+from marsyard.scenarios.terrain_files import check_source
 from marsyard.sim.camera import read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
+from marsyard.sim.terrain.rasters import RealTerrain
 
 
 def test_calibration_with_aliases_is_rejected(tmp_path: Path) -> None:
@@ -110,6 +112,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "flight.csv": read_poses,
     "flight.spice.toml": read_poses,
     "rock.stl": lambda path: read_mesh(str(path)),
+    "dtm.tif": lambda path: check_source(RealTerrain(dtm=path)),
+    "dtm.npz": lambda path: check_source(RealTerrain(dtm=path)),
     "answers.csv": lambda path: read_answers(path, VELOCITY_FORMAT),
     "ingest.toml": lambda path: read_ingest_file(path.parent),
     "images.csv": lambda path: read_table(path, VELOCITY),

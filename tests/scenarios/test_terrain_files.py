@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 import re
 import warnings
 import zipfile
@@ -252,13 +251,6 @@ def test_oversized_archive_is_rejected_from_its_headers(tmp_path: Path) -> None:
             archive.writestr(f"{name}.npy", header.getvalue() + np.ones(1).tobytes())
     with pytest.raises(TerrainFileError, match=r"dem has a grid of shape \(20000, 20000\)"):
         check_source(RealTerrain(dtm=path))
-
-
-@pytest.mark.parametrize("name", ["pipe.tif", "pipe.npz"])
-def test_named_pipe_is_rejected(tmp_path: Path, name: str) -> None:
-    os.mkfifo(tmp_path / name)
-    with pytest.raises(TerrainFileError, match=f"{name}: is a named pipe; a regular file is needed"):
-        check_source(RealTerrain(dtm=tmp_path / name))
 
 
 def test_missing_nodata_is_detected_from_implausible_heights(tmp_path: Path) -> None:

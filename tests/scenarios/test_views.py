@@ -44,11 +44,6 @@ def test_each_camera_has_a_default_mounting() -> None:
     assert set(CAMERA_MOUNTINGS) == set(PRESETS)
 
 
-def test_site_without_terrain_at_a_scale_is_rejected() -> None:
-    with pytest.raises(ValueError, match="no terrain at the scale 'descent'"):
-        SiteGround.from_site(site("mars-yard"), "descent")
-
-
 @pytest.mark.parametrize("name", sorted(PRESETS))
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0.0, -90.0), (70.0, -40.0), (200.0, -10.0)])
 def test_camera_has_the_specified_direction(ground: SiteGround, name: str, azimuth: float, elevation: float) -> None:

@@ -29,9 +29,7 @@ def test_stream_depends_only_on_its_key() -> None:
     cases=st.sets(st.integers(0, 2**31), min_size=2, max_size=2),
     names=st.sets(st.text(max_size=5), min_size=2, max_size=2),
 )
-def test_each_key_part_selects_another_stream(
-    seeds: set[int], campaigns: set[str], cases: set[int], names: set[str]
-) -> None:
+def test_key_parts_select_other_streams(seeds: set[int], campaigns: set[str], cases: set[int], names: set[str]) -> None:
     first_numbers = {
         _draw_first_numbers(Streams(seed, campaign, case), name)
         for seed in seeds

@@ -56,9 +56,8 @@ def test_rectified_points_have_equal_rows_and_inverse_depth_disparity(landing_sc
 @pytest.mark.slow
 def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> None:
     features = select_features(landing_scene.views[0].counts, OPTIONS)
-    tracks = track_features(
-        landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, 40, OPTIONS
-    )
+    first, second = (view.counts for view in landing_scene.views)
+    tracks = track_features(first, second, features, features, 40, OPTIONS)
     motion = motion_from_tracks(landing_scene, tracks, OPTIONS)
     scene = make_scene()
     # Scale the baseline, whose length is not determined by images, to its true length.
@@ -78,9 +77,8 @@ def test_semi_global_depths_match_exact_scene(landing_scene: LandingScene) -> No
 @pytest.mark.slow
 def test_essential_matrix_motion_matches_exact_scene(landing_scene: LandingScene) -> None:
     features = select_features(landing_scene.views[0].counts, OPTIONS)
-    tracks = track_features(
-        landing_scene.views[0].counts, landing_scene.views[1].counts, features, features, 40, OPTIONS
-    )
+    first, second = (view.counts for view in landing_scene.views)
+    tracks = track_features(first, second, features, features, 40, OPTIONS)
     result = essential_motion(landing_scene, tracks, OPTIONS)
     assert result is not None
     true_motion = make_scene().second_from_first

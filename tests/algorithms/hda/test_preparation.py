@@ -80,9 +80,9 @@ def test_opposite_direction_of_view_is_not_resampled(landing_scene: LandingScene
 def test_matches_after_rotation_and_descent_are_exact_with_resampling(scene: Pass, landing_scene: LandingScene) -> None:
     without, resampled = (
         dense_structure(
-            landing_scene.views, scene.second_from_first, (9.0, 11.0), replace(OPTIONS, resample_second=is_resampled)
+            landing_scene.views, scene.second_from_first, (9.0, 11.0), replace(OPTIONS, resample_second=resample)
         )
-        for is_resampled in (False, True)
+        for resample in (False, True)
     )
     errors = match_errors_px(scene, resampled)
     # biquadratic fit: up to 0.09 px towards whole pixels, and the relief of the bumps

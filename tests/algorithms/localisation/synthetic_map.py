@@ -31,18 +31,16 @@ class Scene:
     map_product: MapProduct
 
 
-def random_field(
-    size: int, slope: float, rng: np.random.Generator, low_cycles: float, max_frequency: float = 0.4
-) -> np.ndarray:
+def random_field(size: int, slope: float, rng: np.random.Generator, low_cycles: float, high: float = 0.4) -> np.ndarray:
     """Draw a random field with amplitudes proportional to frequency**-slope and standard deviation 1.
 
     - size: pixels along each side
-    - low_cycles, max_frequency: lowest frequency, cycles per side, and highest frequency, cycles per pixel
+    - low_cycles, high: lowest frequency, cycles per side, and highest frequency, cycles per pixel
     """
     n = fft.next_fast_len(size, real=True)
     frequency = np.hypot(*np.meshgrid(fft.fftfreq(n), fft.rfftfreq(n), indexing="ij")).astype(np.float32)
     amplitude = np.zeros_like(frequency)
-    band = (frequency >= low_cycles / n) & (frequency < max_frequency)
+    band = (frequency >= low_cycles / n) & (frequency < high)
     amplitude[band] = frequency[band] ** np.float32(-slope)
     noise = rng.standard_normal((n, n), dtype=np.float32)
     values = fft.irfft2(amplitude * fft.rfft2(noise), (n, n))[:size, :size]
@@ -62,7 +60,7 @@ def make_scene(seed: int = 1, size: int = 1536, relief_m: float = 80.0, contrast
     """Create terrain with texture of all scales down to 7.5 m, and relief of `relief_m` (standard deviation)."""
     rng = np.random.default_rng(seed)
     texture = random_field(fine * size, 1.2, rng, 8.0)
-    elevation = relief_m * random_field(size, 2.5, rng, 2.0, max_frequency=0.04)
+    elevation = relief_m * random_field(size, 2.5, rng, 2.0, high=0.04)
     appearance = (1.0 + contrast * texture).astype(np.float32)
     return Scene(appearance, fine, map_from_fine(appearance, fine, elevation))
 

@@ -54,7 +54,7 @@ def find_offsets(state_errors: np.ndarray, height_errors_m: np.ndarray) -> np.nd
     return np.asarray(position + hits - patches.lines_m[:, :2])
 
 
-def draw_offsets(
+def draw(
     rng: np.random.Generator, attitude_rad: np.ndarray | None = None, state: np.ndarray | None = None
 ) -> np.ndarray:
     """Draw errors with the stated standard deviations, with other errors of attitude or state if they are given."""
@@ -71,7 +71,7 @@ def test_offsets_with_the_stated_errors_are_chi_square() -> None:
     """The ray geometry is exact in the drawn offsets: the linear model has the right signs and derivatives."""
     rng = np.random.default_rng(1)
     weights = np.linalg.inv(COVARIANCE)
-    squares = np.array([o @ weights @ o for o in (draw_offsets(rng).ravel() for _ in range(400))])
+    squares = np.array([o @ weights @ o for o in (draw(rng).ravel() for _ in range(400))])
     # 15 patches x 2 axes: the mean is 30, with a standard deviation of sqrt(60 / 400) for 400 draws; the tolerance is
     # 4 sigma plus 1 % for the effect of linearisation
     assert squares.mean() == pytest.approx(30.0, abs=4.0 * np.sqrt(60.0 / 400.0) + 0.3)
@@ -85,7 +85,7 @@ def test_position_error_is_estimated_with_its_covariance() -> None:
     squares, errors, mean_errors = [], [], []
     for _ in range(400):
         state = STATE_SD * rng.standard_normal(9)
-        offsets = draw_offsets(rng, state=state)
+        offsets = draw(rng, state=state)
         estimate, covariance = estimate_position_error(offsets, patches, state_covariance, ERRORS)
         errors.append(estimate - state[:2])
         mean_errors.append(offsets.mean(axis=0) - state[:2])
@@ -97,7 +97,7 @@ def test_position_error_is_estimated_with_its_covariance() -> None:
 
 def test_stated_errors_are_accepted() -> None:
     rng = np.random.default_rng(2)
-    results = [check_offsets(draw_offsets(rng), COVARIANCE, 0, TEST) for _ in range(200)]
+    results = [check_offsets(draw(rng), COVARIANCE, 0, TEST) for _ in range(200)]
     assert all(result.is_consistent for result in results)
     # 200 x 15 patches, of which 3 are expected to be removed: outlier_probability is 1e-3
     assert sum(np.count_nonzero(~result.members) for result in results) <= 12
@@ -109,19 +109,19 @@ def test_a_wrong_attitude_is_inconsistent(seed: int) -> None:
     rng = np.random.default_rng(seed)
     azimuth = rng.uniform(-np.pi, np.pi)
     tilt = np.radians(10.0) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    result = check_offsets(draw_offsets(rng, tilt), COVARIANCE, 0, TEST)
+    result = check_offsets(draw(rng, tilt), COVARIANCE, 0, TEST)
     assert not result.is_consistent
 
 
 def test_a_wrong_heading_is_inconsistent() -> None:
     """2 deg of heading: 57 m at a distance of 1.6 km, in opposite directions on both sides."""
-    offsets = draw_offsets(np.random.default_rng(3), np.radians([0.0, 0.0, 2.0]))
+    offsets = draw(np.random.default_rng(3), np.radians([0.0, 0.0, 2.0]))
     result = check_offsets(offsets, COVARIANCE, 0, TEST)
     assert not result.is_consistent
 
 
 def test_an_outlier_is_removed() -> None:
-    offsets = draw_offsets(np.random.default_rng(4))
+    offsets = draw(np.random.default_rng(4))
     offsets[7] += [80.0, -40.0]  # ten standard deviations
     result = check_offsets(offsets, COVARIANCE, 0, TEST)
     assert result.is_consistent

@@ -199,9 +199,7 @@ def test_no_position_before_three_images(make_stages: Callable[..., Stages]) -> 
     np.testing.assert_allclose(details.coarse_position_m, _true_position(3.0)[:2], atol=1e-6)
 
 
-def test_altitudes_before_the_fix_refer_to_the_ground_below_the_corrected_position(
-    make_stages: Callable[..., Stages],
-) -> None:
+def test_altitudes_before_the_fix_refer_to_the_ground_below_the_fix(make_stages: Callable[..., Stages]) -> None:
     """A step of 100 m lies between the initial and the true positions."""
     elevation = np.zeros((300, 300), np.float32)
     east_m = FLAT_MAP.origin_m[0] + FLAT_MAP.pixel_m * np.arange(300)

@@ -282,9 +282,7 @@ def test_left_jacobian_is_the_derivative_of_a_composed_rotation() -> None:
 
 
 @pytest.mark.parametrize("pending", [False, True])
-def test_delayed_updates_equal_updates_in_the_order_of_time(
-    truth: Descent, exact: ImuIncrements, pending: bool
-) -> None:
+def test_delayed_updates_equal_updates_in_order_of_time(truth: Descent, exact: ImuIncrements, pending: bool) -> None:
     """An image of 1.2343 s arrives at 2 s, after an altitude of 1.7 s; `pending`: its tag is after the last increment.
 
     A pending update uses an extrapolated state; it is repeated when the increments arrive.
@@ -420,9 +418,7 @@ def test_systematically_wrong_landmarks_are_inconsistent(truth: Descent, exact: 
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 6.0])
-def test_rigid_landmarks_of_a_wrong_attitude_are_inconsistent(
-    truth: Descent, exact: ImuIncrements, tilt_deg: float
-) -> None:
+def test_landmarks_of_a_wrong_attitude_are_inconsistent(truth: Descent, exact: ImuIncrements, tilt_deg: float) -> None:
     """Exact pixels; the state's attitude is wrong by the tilt, and its position such that the nadir fits.
 
     Without the test of all landmarks the robust estimation keeps those near the nadir, and rejects the others.

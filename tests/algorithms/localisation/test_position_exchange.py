@@ -219,13 +219,10 @@ IF_IMAGE = "if request['do'] == 'image': "
     ("body", "fault", "message"),
     [
         ("if request['do'] == 'start': sys.exit(3)", Fault.CRASHED, "status 3"),
-        ("if request['do'] == 'imu': os.abort()", Fault.CRASHED, "SIGABRT"),
         ("if request['do'] == 'altitude': raise ValueError", Fault.CRASHED, "status 1"),
         (f"{IF_IMAGE}sys.exit(0)", Fault.CRASHED, "its output ended without an answer"),
         (f"{IF_IMAGE}time.sleep(60)", Fault.TIMED_OUT, "no answer within 0.5 s"),
         ("if request['do'] == 'imu': time.sleep(60)", Fault.TIMED_OUT, "no answer within 0.5 s"),
-        (f"{IF_IMAGE}x = bytearray(400_000_000); time.sleep(60)", Fault.OUT_OF_MEMORY, "0.2 GB"),
-        (f"{IF_IMAGE}print('x' * 2_000_000)", Fault.TOO_MUCH_OUTPUT, "1 MB"),
         (f"{IF_IMAGE}print('position unknown')", Fault.BAD_ANSWER, "one line|not one JSON object"),
         (f"{IF_IMAGE}request['id'] = 1", Fault.BAD_ANSWER, "the answer's id is 1; allowed: "),
         ("if request['do'] == 'start': answer = ANSWER", Fault.BAD_ANSWER, "unknown key 'time_s'"),
@@ -246,7 +243,6 @@ def test_failures_of_a_program_are_faults(tmp_path: Path, body: str, fault: Faul
     spec = f"serve:{write_plain(tmp_path, body)}"
     start_s = time.monotonic()
     limits = {"time_s": 0.5} if fault is Fault.TIMED_OUT else {}
-    limits |= {"memory_gb": 0.2} if fault is Fault.OUT_OF_MEMORY else {}
     with pytest.raises(AlgorithmError, match=message) as error:
         run(spec, **limits)
     assert error.value.fault is fault
@@ -259,12 +255,6 @@ def test_a_failure_in_a_case_is_recorded_as_an_outcome(tmp_path: Path) -> None:
     assert algorithm_run.failure is not None
     assert algorithm_run.failure.outcome == "CRASHED"
     assert algorithm_run.row["stderr"] == "['start']\n"
-
-
-def test_program_without_greeting_is_rejected(tmp_path: Path) -> None:
-    with pytest.raises(AlgorithmError, match="its first line is") as error:
-        run(f"serve:{write_program(tmp_path, 'print({})')}")
-    assert error.value.fault is Fault.BAD_ANSWER
 
 
 def test_streams_of_frames_are_not_accepted() -> None:

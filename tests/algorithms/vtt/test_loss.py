@@ -46,9 +46,7 @@ TOLERANCES = Tolerances(distance_m=0.2, position_m=0.4)
         ("position_correction_m", 0.41, TargetLoss.POSITION_JUMP),
     ],
 )
-def test_target_is_lost_if_one_criterion_exceeds_its_limit(
-    criterion: str, value: float, expected: TargetLoss | None
-) -> None:
+def test_target_is_lost_if_one_criterion_is_exceeded(criterion: str, value: float, expected: TargetLoss | None) -> None:
     result = find_losses(Evidence(**(GOOD | {criterion: value})), TOLERANCES, OPTIONS)
     assert result == (() if expected is None else (expected,))
 

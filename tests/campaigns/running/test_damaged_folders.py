@@ -23,7 +23,7 @@ from marsyard.cli.options import handle_user_errors
 from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run, sign_folder
 
 
-def test_run_killed_before_its_record_can_be_restarted(
+def test_run_killed_at_its_start_can_be_restarted(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     directory = tmp_path / "run"
@@ -57,7 +57,7 @@ def test_run_killed_before_its_record_can_be_restarted(
         ("changes", None, "changes is not a list"),
     ],
 )
-def test_record_with_wrong_types_is_rejected(
+def test_record_of_wrong_types_is_rejected(
     failing_campaign: Path, tmp_path: Path, key: str, value: Any, message: str
 ) -> None:
     stored_record = json.loads((failing_campaign / "campaign.json").read_text())

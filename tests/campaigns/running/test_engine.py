@@ -147,9 +147,7 @@ def test_sum_of_times_is_accepted_as_metric(campaign_file: CampaignFile) -> None
     check_metrics(configuration, row, Path("runs"))
 
 
-def test_metric_column_exists_if_all_cases_crash(
-    campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
-) -> None:
+def test_metric_exists_if_all_cases_crash(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     directory = run(campaign_file("raising_cases = [0, 1]"), tmp_path / "run", watch, "cases=2", jobs=1)
     frame = pd.read_parquet(directory / "cases.parquet")
     assert frame["velocity_error_m_s"].isna().all()

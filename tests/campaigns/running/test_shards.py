@@ -48,7 +48,7 @@ def test_shards_contain_each_case_once(total: int, count: int) -> None:
     assert max(map(len, ranges)) - min(map(len, ranges)) <= 1
 
 
-def test_merged_shards_equal_one_run(
+def test_shards_equal_one_run(
     shards: list[Path], failing_campaign: Path, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     target = tmp_path / "merged"
@@ -67,9 +67,7 @@ def test_merged_shards_equal_one_run(
     assert stored == {path.name for path in (failing_campaign / "cases").iterdir()}
 
 
-def test_interrupted_shard_is_resumed_within_its_cases(
-    shards: list[Path], tmp_path: Path, watch: RecordingWatch
-) -> None:
+def test_stopped_shard_is_resumed_within_its_cases(shards: list[Path], tmp_path: Path, watch: RecordingWatch) -> None:
     copy = tmp_path / "shard"
     shutil.copytree(shards[1], copy)
     with RowStore(copy / ROWS_FILE) as store:
@@ -169,9 +167,7 @@ def test_invalid_shards_are_reported(text: str) -> None:
         Shard.parse(text)
 
 
-def test_commands_run_and_merge_shards(
-    campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_merge_shards(campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path, runner = str(campaign_file("unanswered_cases = [2]")), CliRunner()
     result = runner.invoke(app, ["run", path, "--shard", "1/1", "--jobs", "1", "--out", "a"])

@@ -67,18 +67,18 @@ def rank_standard_error(rank: float, cases: int) -> float:
 def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile, design: str, cases: int) -> None:
     campaign = load_correlated(campaign_file, SKEWED, design, cases)
     draws = draw_table(campaign, cases)
-    estimated_ranks = np.atleast_2d(stats.spearmanr(draws).statistic)
+    estimated = np.atleast_2d(stats.spearmanr(draws).statistic)
     ranks = campaign.configuration.correlations[0].rank
     assert ranks is not None
     for row in range(3):
         for column in range(row):
             rank = ranks[row][column]
-            assert abs(estimated_ranks[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases), (
+            assert abs(estimated[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases), (
                 row,
                 column,
             )
     # the parameter outside the group is uncorrelated
-    assert np.abs(estimated_ranks[3, :3]).max() < MAX_STANDARD_ERRORS / np.sqrt(cases - 1)
+    assert np.abs(estimated[3, :3]).max() < MAX_STANDARD_ERRORS / np.sqrt(cases - 1)
 
 
 @pytest.mark.parametrize("design", ["random", "latin-hypercube"])
@@ -102,9 +102,7 @@ def test_correlated_parameters_have_their_marginal_distributions(campaign_file: 
         (", sd = 2", ", sd = 3", "correlation = [[1.0, -0.75], [-0.75, 1.0]]"),
     ],
 )
-def test_normal_groups_have_the_specified_covariance(
-    campaign_file: CampaignFile, east: str, north: str, matrix: str
-) -> None:
+def test_normal_groups_have_their_covariance(campaign_file: CampaignFile, east: str, north: str, matrix: str) -> None:
     """Draws multiplied by the inverse Cholesky factor are independent standard normal numbers (whitening)."""
     draws = draw_table(load_correlated(campaign_file, NORMAL.format(east=east, north=north, matrix=matrix)))
     covariance = np.array([[4.0, -4.5], [-4.5, 9.0]])

@@ -123,9 +123,7 @@ def test_single_case_equals_case_of_full_design(campaign_file: CampaignFile, kin
 @pytest.mark.parametrize("kind", ["random", "latin-hypercube", "sobol"])
 @given(name=st.sampled_from(["wind.east_m_s", "heights_m.0", "lowest_altitude_m"]), case=st.integers(0, 63))
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_added_dispersion_does_not_change_other_draws(
-    campaign_file: CampaignFile, kind: str, name: str, case: int
-) -> None:
+def test_added_dispersion_changes_no_other_draw(campaign_file: CampaignFile, kind: str, name: str, case: int) -> None:
     """The new dispersion can be anywhere in the file, except in a Sobol design, where it must be the last."""
     other_dispersions = DISPERSIONS.replace('"wind.east_m_s" = {distribution = "uniform", low = 0, high = 1}', "")
     entry = f'"{name}" = {{distribution = "uniform", low = 0, high = 1}}\n'

@@ -67,7 +67,7 @@ def test_showcase_follows_the_configuration(campaign_file: CampaignFile, tmp_pat
     assert find_worst_cases(time_sum, table, 2) == []
 
 
-def test_unsupported_products_do_not_stop_the_campaign(
+def test_unsupported_products_stop_no_campaign(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     directory = run(campaign_file(), tmp_path / "run", watch, "products=bad", "cases=2", jobs=1)

@@ -231,7 +231,7 @@ def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
         ({"confidence": 1.0}, "--confidence 1.0"),
     ],
 )
-def test_unsuitable_settings_are_rejected(
+def test_invalid_settings_are_rejected(
     campaign_path: Path, tmp_path: Path, settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CampaignError, match=message):
@@ -256,9 +256,7 @@ def test_sources_of_all_scenarios_have_valid_values() -> None:
 
 
 @pytest.mark.slow
-def test_study_ends_if_all_first_cases_crash(
-    campaign_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_study_ends_if_first_cases_crash(campaign_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(budget, "_BATCH", 1)
     monkeypatch.setattr(runner, "_MAX_FIRST_CRASHES", 5)
     with pytest.raises(CampaignError, match=r"none of the first \d+ cases finished: ValueError: math domain error"):

@@ -87,7 +87,7 @@ def test_campaign_without_violation_reports_the_smallest_margin(tmp_path: Path) 
     path.write_text(limit_state.CAMPAIGN)
     campaign = load_campaign(str(path), ["beta=20.0"])
     result = start_search(
-        campaign, SearchSettings("LOAD", 60), 1000, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
+        campaign, SearchSettings("LOAD", 60), 999, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
     )
     assert (result.violations, result.failures, result.exit_code) == (0, (), 0)
     # the evolution strategies approach the corner (4, 4) of the allowed coordinates, at a margin of 20 - 8 / sqrt(2)

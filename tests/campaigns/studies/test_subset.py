@@ -14,9 +14,7 @@ from marsyard.campaigns.studies.subset import SubsetEnd, SubsetResult
 from marsyard.sim.streams import Blend
 
 
-def run_with_random_seed(
-    margins: LimitState, dimension: int, samples: int, rng: np.random.Generator
-) -> tuple[SubsetResult, int]:
+def run_seeded(margins: LimitState, dimension: int, samples: int, rng: np.random.Generator) -> tuple[SubsetResult, int]:
     """Run one subset simulation of `samples` cases per level with a random seed; also return its number of cases."""
     return run_subset(margins, dimension, int(rng.integers(2**31)), samples)
 
@@ -28,7 +26,7 @@ def run_with_random_seed(
 def test_estimates_are_unbiased(dimension: int, probability: float, noise_fraction: float) -> None:
     rng = np.random.default_rng(1)
     margins = linear_margin(dimension, probability, noise_fraction)
-    estimates = [run_with_random_seed(margins, dimension, 300, rng)[0].probability for _ in range(40)]
+    estimates = [run_seeded(margins, dimension, 300, rng)[0].probability for _ in range(40)]
     ratio = np.array(estimates) / probability
     # tolerance: three standard errors of the mean
     assert abs(ratio.mean() - 1.0) < 3.0 * ratio.std(ddof=1) / math.sqrt(len(ratio))
@@ -40,7 +38,7 @@ def test_intervals_of_replicates_cover_the_probability() -> None:
     rng, n_covering = np.random.default_rng(2), 0
     margins = linear_margin(10, 1e-3)
     for _ in range(100):
-        results = [run_with_random_seed(margins, 10, 100, rng)[0] for _ in range(4)]
+        results = [run_seeded(margins, 10, 100, rng)[0] for _ in range(4)]
         interval = replicate_interval([result.probability for result in results], 0.9)
         n_covering += interval.lower <= 1e-3 <= interval.upper
     # coverage of 90 %: mean 90 of 100, standard deviation sqrt(100 * 0.9 * 0.1) = 3
@@ -49,7 +47,7 @@ def test_intervals_of_replicates_cover_the_probability() -> None:
 
 def test_simulation_needs_fewer_cases_than_counting() -> None:
     rng = np.random.default_rng(3)
-    results = [run_with_random_seed(linear_margin(20, 1e-4), 20, 300, rng) for _ in range(40)]
+    results = [run_seeded(linear_margin(20, 1e-4), 20, 300, rng) for _ in range(40)]
     estimates = np.array([result.probability for result, _ in results])
     mean_cases = np.mean([cases for _, cases in results])
     # counting with n cases has the relative variance 1 / (n p)
@@ -63,7 +61,7 @@ def test_cases_outside_the_population_do_not_bias_the_estimate() -> None:
         return np.where(coordinates[:, 0] > 1.645, 2.5 - coordinates[:, 1], np.inf)
 
     rng = np.random.default_rng(4)
-    estimates = [run_with_random_seed(margins, 2, 300, rng)[0].probability for _ in range(30)]
+    estimates = [run_seeded(margins, 2, 300, rng)[0].probability for _ in range(30)]
     assert np.mean(estimates) == pytest.approx(0.05 * norm.sf(2.5), rel=0.4)
 
 
@@ -71,9 +69,7 @@ def test_cases_outside_the_population_do_not_bias_the_estimate() -> None:
 def test_plateau_ends_the_simulation_without_an_estimate(plateau: float) -> None:
     """All cases of the first level have the same margin; a margin of 0 is no violation."""
     rng = np.random.default_rng(5)
-    result, cases = run_with_random_seed(
-        lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, plateau), 2, 100, rng
-    )
+    result, cases = run_seeded(lambda coordinates, _: np.where(coordinates[:, 0] > 8.0, -1.0, plateau), 2, 100, rng)
     assert result.end is SubsetEnd.PLATEAU
     assert not result.reached
     assert cases == 100
@@ -82,7 +78,7 @@ def test_plateau_ends_the_simulation_without_an_estimate(plateau: float) -> None
 def test_few_cases_below_a_plateau_give_no_estimate() -> None:
     """2 of 200 cases are below the plateau on average; their number is too uncertain for an estimate."""
     rng = np.random.default_rng(15)
-    ends = [run_with_random_seed(plateau_margin(0.99, 1e-4), 2, 200, rng)[0].end for _ in range(50)]
+    ends = [run_seeded(plateau_margin(0.99, 1e-4), 2, 200, rng)[0].end for _ in range(50)]
     # 5 or more of 200 cases have the probability 5 %: 2.6 of 50 simulations continue on average
     assert ends.count(SubsetEnd.PLATEAU) >= 40
 
@@ -90,9 +86,7 @@ def test_few_cases_below_a_plateau_give_no_estimate() -> None:
 def test_step_with_a_tenth_of_a_level_is_an_estimate() -> None:
     """Violations are the only cases below a plateau, and have the probability 7 % (1.476: 93 % quantile)."""
     rng = np.random.default_rng(16)
-    result, cases = run_with_random_seed(
-        lambda coordinates, _: np.where(coordinates[:, 0] > 1.476, -1.0, 0.0), 2, 400, rng
-    )
+    result, cases = run_seeded(lambda coordinates, _: np.where(coordinates[:, 0] > 1.476, -1.0, 0.0), 2, 400, rng)
     assert result.reached
     assert result.probability == pytest.approx(0.07, abs=0.04)
     assert cases == 400
@@ -100,7 +94,7 @@ def test_step_with_a_tenth_of_a_level_is_an_estimate() -> None:
 
 def test_levels_count_violations_whose_parent_is_safe() -> None:
     rng = np.random.default_rng(17)
-    result, _ = run_with_random_seed(linear_margin(5, 1e-3), 5, 200, rng)
+    result, _ = run_seeded(linear_margin(5, 1e-3), 5, 200, rng)
     first, *later = result.levels
     assert (first.probability, first.drawn) == (1.0, 200)
     assert len(later) == len(result.thresholds)
@@ -113,7 +107,7 @@ def test_levels_count_violations_whose_parent_is_safe() -> None:
 def test_importance_sampling_is_unbiased_and_precise(dimension: int) -> None:
     rng = np.random.default_rng(6)
     margins = linear_margin(dimension, 1e-4)
-    violations = np.concatenate([run_with_random_seed(margins, dimension, 200, rng)[0].violations for _ in range(4)])
+    violations = np.concatenate([run_seeded(margins, dimension, 200, rng)[0].violations for _ in range(4)])
     density = fit_density(violations)
     assert density is not None
     coordinates, weights = density.draw(4000, rng)
@@ -144,12 +138,10 @@ def test_interval_needs_two_replicates() -> None:
 
 def test_more_replicates_are_needed_near_the_limit() -> None:
     interval = replicate_interval([0.8e-4, 0.5e-4, 1.2e-4, 0.7e-4], 0.9)
-    near_limit, far_from_limit = (
-        additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4)
-    )
-    assert near_limit is not None
-    assert far_from_limit is not None
-    assert near_limit > far_from_limit >= 1
+    near, far = (additional_replicates(interval, 4, max_probability) for max_probability in (1e-4, 2e-4))
+    assert near is not None
+    assert far is not None
+    assert near > far >= 1
 
 
 def test_interval_without_violations_is_0_to_1() -> None:

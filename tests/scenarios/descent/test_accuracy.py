@@ -78,7 +78,7 @@ def test_relief_errors_match_geometric_prediction() -> None:
             case, terrain=RELIEF, location={"bank": 1, "east_m": 511.0 * case}
         )
         track_errors.append(_compute_velocity_errors(tracks, states))
-        track_predictions += [_predict_error(track, states, measurements, surface) for track in tracks]
+        track_predictions += [_predict(track, states, measurements, surface) for track in tracks]
     simulated_errors, predicted_errors = np.concatenate(track_errors), np.array(track_predictions)
     assert len(simulated_errors) >= 3 * N_CASES
     assert np.sqrt(np.mean(np.sum((simulated_errors - predicted_errors) ** 2, axis=1))) < 0.2
@@ -86,9 +86,7 @@ def test_relief_errors_match_geometric_prediction() -> None:
     assert np.sqrt(np.mean(np.sum(simulated_errors**2, axis=1))) > 0.4
 
 
-def _predict_error(
-    track: Track, states: list[State], measurements: DescentMeasurements, surface: Surface
-) -> np.ndarray:
+def _predict(track: Track, states: list[State], measurements: DescentMeasurements, surface: Surface) -> np.ndarray:
     """Return the predicted velocity error of a track, m/s; the test of relief errors defines the formula."""
     first, second = states[track.pair], states[track.pair + 1]
     altitude_1, altitude_2 = altitudes_at_images(measurements)[track.pair : track.pair + 2]

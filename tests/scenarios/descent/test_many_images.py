@@ -8,7 +8,6 @@ import pytest
 
 from marsyard.algorithms.exchange import read_case
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
-from marsyard.campaigns.running.replay import differing_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
 from tests.scenarios.descent.settings import DESCENT, IDEAL_INSTRUMENTS, make_parameters, run_descent
@@ -94,10 +93,8 @@ def test_span_between_images_is_interpolated() -> None:
     """The span starts a quarter of the descent after the first image: the truth is interpolated between the images."""
     spec = "tests.scenarios.descent.test_many_images:LastThreeQuartersEstimator"
     first, second = (
-        run_descent(
-            algorithm=spec, images=images, descent=DESCENT | {"interval_s": 4.0 / (images - 1)}, **IDEAL_INSTRUMENTS
-        )
-        for images in (2, 9)
+        run_descent(algorithm=spec, images=n, descent=DESCENT | {"interval_s": 4.0 / (n - 1)}, **IDEAL_INSTRUMENTS)
+        for n in (2, 9)
     )
     # Both cases have the same flight and span, but different images.
     for axis in "xy":
@@ -105,13 +102,6 @@ def test_span_between_images_is_interpolated() -> None:
         assert first.row[name] == pytest.approx(second.row[name], abs=1e-9)
     assert "feasible_overlap" not in first.row
     assert "velocity_change_error_m_s" not in first.row
-
-
-@pytest.mark.slow
-def test_many_image_case_is_deterministic() -> None:
-    settings: dict[str, Any] = {"images": 4, "descent": DESCENT | {"interval_s": 1.0}, "algorithm": STREAM_ESTIMATOR}
-    first_case, repeated_case = run_descent(**settings), run_descent(**settings)
-    assert differing_columns(dict(first_case.row), dict(repeated_case.row)) == ()
 
 
 def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
@@ -141,7 +131,7 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
         ({"triple": [1, 3, 2]}, "three in ascending order, 1 to 3"),
         (
             {"algorithm": STREAM_ESTIMATOR, "images": 2, "faults": {"black_image": 3}},
-            "a fault affects image 3, but the descent",
+            "a fault affects image 3, but the",
         ),
     ],
 )

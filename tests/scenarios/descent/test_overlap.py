@@ -136,7 +136,7 @@ def test_wrong_answer_increases_the_velocity() -> None:
         (np.array([3.0, -4.0]), AVAILABLE_S),
     ],
 )
-def test_burn_is_not_steered_without_a_timely_estimate_above_the_deadband(
+def test_burn_is_steered_only_by_a_timely_estimate_above_the_deadband(
     estimate: np.ndarray | None, available_s: float
 ) -> None:
     result = compute_touchdown(IDEAL, TRUE_VELOCITY, estimate, available_s, make_rng())

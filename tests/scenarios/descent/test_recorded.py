@@ -129,9 +129,7 @@ def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
         with pytest.raises(ValidationError, match=match):
             DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"} | settings})
 
-    expect_error(
-        "at image 1 the camera looks up, 60.0 deg above the horizon", _write_vertical_fall(tmp_path, tilt_deg=150.0)
-    )
+    expect_error("at image 1 the camera looks up, 60.0 deg above", _write_vertical_fall(tmp_path, tilt_deg=150.0))
     expect_error("at image 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")
     expect_error(r"at image 3 the camera is 5.0 m below the ground", _write_vertical_fall(tmp_path, height_m=870.0))
     expect_error(r"covers 0.000 to 24.900 s; images from 23.000 to", _write_vertical_fall(tmp_path), first_image_s=23.0)

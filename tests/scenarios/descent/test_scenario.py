@@ -151,11 +151,11 @@ def test_attitude_error_causes_predicted_velocity_error() -> None:
     The velocity error is ``b x v`` to first order in the attitude error b. Tolerance: for a template 20 deg from
     nadir the contribution of the vertical velocity is 13 % larger.
     """
-    steady_descent = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
+    steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0}
     errors, expected = [], []
     for case in range(4):
         row = run_descent(
-            case, **IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=steady_descent, faults={"attitude_error_deg": 0.8}
+            case, **IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=steady, faults={"attitude_error_deg": 0.8}
         ).row
         descent_m = float(row["altitude_2_m"]) - float(row["altitude_3_m"])
         velocity = [float(row["velocity_true_x_m_s"]), float(row["velocity_true_y_m_s"]), -descent_m / 3.75]
@@ -171,10 +171,8 @@ def test_attitude_error_causes_predicted_velocity_error() -> None:
 
 def test_common_altitude_error_scales_the_velocity() -> None:
     """An altitude error of +2 % makes displacements and velocity 2 % too large."""
-    steady_descent = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
-    row = run_descent(
-        **IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=steady_descent, faults={"altitude_error": 0.02}
-    ).row
+    steady = DESCENT | {"cone_angle_deg": 0.0, "nod_rate_deg_s": 0.0, "wind_east_m_s": 25.0}
+    row = run_descent(**IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN, descent=steady, faults={"altitude_error": 0.02}).row
     assert row["velocity_error_x_m_s"] == pytest.approx(0.02 * float(row["velocity_true_x_m_s"]), abs=0.12)
     assert row["altitude_error_common"] == pytest.approx(0.02, abs=1e-4)
 
@@ -249,14 +247,6 @@ def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
     assert result.row["image_hash"] != without_source.row["image_hash"]
     # The imported relief has an amplitude of 30 m within 500 m.
     assert float(result.row["velocity_error_m_s"]) < 4.0
-
-
-def test_custom_algorithm_receives_the_measurements() -> None:
-    result = run_descent(algorithm="tests.scenarios.descent.inertial_estimators:InertialEstimator")
-    assert result.outcome == "VALID"
-    # the wind of 14 m/s, with errors of the inertial velocity of a few m/s
-    assert result.row["velocity_estimated_x_m_s"] == pytest.approx(14.0, abs=8.0)
-    assert "tracks" not in result.products
 
 
 def test_exact_instruments_have_no_instrument_errors() -> None:

@@ -67,13 +67,9 @@ def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
 
 def test_bad_pixel_faults_set_the_fraction_and_the_list() -> None:
     detector = preset("xc-55").detector
-    unlisted_defects, listed_defects = (
+    unlisted, listed = (
         add_detector_faults(Faults.model_validate({name: 0.01}), detector).defects
         for name in ("bad_pixels", "listed_bad_pixels")
     )
-    assert (unlisted_defects.dead_fraction, unlisted_defects.hot_fraction, unlisted_defects.listed) == (
-        0.01,
-        0.01,
-        False,
-    )
-    assert (listed_defects.dead_fraction, listed_defects.hot_fraction, listed_defects.listed) == (0.01, 0.01, True)
+    assert (unlisted.dead_fraction, unlisted.hot_fraction, unlisted.listed) == (0.01, 0.01, False)
+    assert (listed.dead_fraction, listed.hot_fraction, listed.listed) == (0.01, 0.01, True)

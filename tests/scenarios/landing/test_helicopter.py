@@ -97,14 +97,12 @@ def test_landing_iteration_converges_to_a_consistent_flight() -> None:
         transit, touchdown = _fly_landing(case)
         assert touchdown.iterations < 8
         assert touchdown.path_change_m < 1e-3
-        path, landing_navigation = touchdown.flight.path, touchdown.navigation_leg
+        path, after = touchdown.flight.path, touchdown.navigation_leg
         errors = np.zeros((len(path.rows), 9))
-        transit_navigation = transit.navigation_leg
+        before = transit.navigation_leg
         for column in range(9):
-            times = np.concatenate([transit_navigation.boundaries_s, landing_navigation.boundaries_s[1:]])
-            values = np.concatenate(
-                [transit_navigation.errors(transit.flight.path), landing_navigation.errors(path)[1:]]
-            )
+            times = np.concatenate([before.boundaries_s, after.boundaries_s[1:]])
+            values = np.concatenate([before.errors(transit.flight.path), after.errors(path)[1:]])
             errors[:, column] = np.interp(path.knots_s, times, values[:, column])
         assert np.all(np.abs(errors[-1, :2]) < 3.0)
         step = round((touchdown.time_s - path.start_s) / path.step_s)

@@ -80,9 +80,7 @@ def test_each_flight_is_in_exactly_one_population(n_safe: int, population: str) 
         (SiteOutcome.NO_MOTION, SAFE_SITE, False),
     ],
 )
-def test_safe_site_or_no_site_is_a_correct_answer(
-    outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool
-) -> None:
+def test_safe_site_or_no_site_is_correct(outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool) -> None:
     row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(3))
     assert row["safe_or_no_site_reported"] is is_correct
     assert row["site_safe"] is (outcome is SITE_REPORTED and site is SAFE_SITE)
@@ -187,9 +185,7 @@ def test_unknown_cells_of_a_map_are_counted() -> None:
     safety = np.full((20, 30), Safety.SAFE, dtype=np.uint8)
     safety[:5], safety[-3:] = Safety.UNKNOWN, Safety.HAZARD
     maps = HazardMaps(np.zeros((1, 1, 3)), elevation_m, elevation_m, elevation_m, safety)
-    ground = Ground(
-        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), site_cell=None
-    )
+    ground = Ground(Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), None)
     camera = preset("xc-55").cameras()[0]
     view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
     row = stage_row(HdaDetails((view, view), ground=ground))

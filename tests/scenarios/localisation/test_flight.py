@@ -17,15 +17,15 @@ GRAVITY_M_S2 = 3.72
 def test_flight_follows_the_simulated_parachute_descent(flight: LanderFlight) -> None:
     """The spline equals the solution of the equations of motion until separation."""
     times = np.linspace(-0.99 * LEAD_S, flight.separation_s - 1e-6, 5003)
-    spline, simulated = flight.motion(times), flight.parachute.motion(times)
-    np.testing.assert_allclose(spline.positions_m, simulated.positions_m, rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(spline.velocities_m_s, simulated.velocities_m_s, rtol=0.0, atol=1e-5)
-    assert (spline.attitudes.inv() * simulated.attitudes).magnitude().max() < 1e-5
+    spline, parachute = flight.motion(times), flight.parachute.motion(times)
+    np.testing.assert_allclose(spline.positions_m, parachute.positions_m, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(spline.velocities_m_s, parachute.velocities_m_s, rtol=0.0, atol=1e-5)
+    assert (spline.attitudes.inv() * parachute.attitudes).magnitude().max() < 1e-5
     # the angular acceleration is free at the start of the spline, and steps at separation
     inner = (times > -LEAD_S + 0.1) & (times < flight.separation_s - 0.1)
-    np.testing.assert_allclose(spline.body_rates_rad_s[inner], simulated.body_rates_rad_s[inner], rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(spline.body_rates_rad_s[inner], parachute.body_rates_rad_s[inner], rtol=0.0, atol=1e-4)
     np.testing.assert_allclose(
-        spline.specific_forces_m_s2[inner], simulated.specific_forces_m_s2[inner], rtol=0.0, atol=1e-3
+        spline.specific_forces_m_s2[inner], parachute.specific_forces_m_s2[inner], rtol=0.0, atol=1e-3
     )
 
 

@@ -17,8 +17,7 @@ from marsyard.scenarios.localisation.instruments import (
     measure_altitudes,
     true_camera,
 )
-from marsyard.sim.sensor import Detector, Imu, RadarAltimeter
-from marsyard.sim.sensor.imu import LN200, MEMS
+from marsyard.sim.sensor import Detector, RadarAltimeter
 from marsyard.sim.terrain import Surface
 
 #: Height of the level ground, and gravity of Mars.
@@ -163,11 +162,3 @@ def test_initial_state_without_errors_is_exact(flight: LanderFlight) -> None:
     assert (state.world_from_body.inv() * truth.attitude).magnitude() < 1e-12
     assert state.time_s == 0.001
     assert isinstance(state.world_from_body, Rotation)
-
-
-@pytest.mark.parametrize("parameters", [LN200, MEMS])
-def test_inertial_units_can_be_drawn(parameters: object, flight: LanderFlight) -> None:
-    """Both units measure a second of the flight at 400 Hz."""
-    rng = np.random.default_rng(0)
-    imu = Imu.draw(parameters, (0.0, 2.0), rng)  # type: ignore[arg-type]
-    assert imu.increments(flight, 0.0, 1.0, rng).delta_angles_rad.shape == (400, 3)

@@ -76,10 +76,8 @@ def _render_under_map_sun(
 ) -> Frame:
     """Render with a scene that differs from that of the map: the scene of a site from the orbiter's height."""
     sun = sun_at(world.air, EXACT.sun_azimuth_deg, sun_elevation_deg)
-    viewpoint = Viewpoint(
-        float(CENTRE[0]), float(CENTRE[1]), EXACT.orbit_height_m, EXACT.pixel_m / EXACT.orbit_height_m
-    )
-    scene = replace(site_scene(world.ground, viewpoint, sun), mesh_finest_m=100.0)
+    view = Viewpoint(float(CENTRE[0]), float(CENTRE[1]), EXACT.orbit_height_m, EXACT.pixel_m / EXACT.orbit_height_m)
+    scene = replace(site_scene(world.ground, view, sun), mesh_finest_m=100.0)
     return process_renderer(default_backend()).render(scene, rays, rigid(Rotation.identity(), position))
 
 

@@ -2,6 +2,7 @@
 
 import sys
 import textwrap
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 
 from marsyard.algorithms.localisation.navigation_filter import NavigationFilter
 from marsyard.campaigns.running.replay import create_subject
-from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, run_check, subject_kinds
+from marsyard.scenarios.conformance import Subject, check_names, determine_task, subject_kinds
 from marsyard.scenarios.localisation import conformance_inputs as inputs
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+from tests.scenarios import suites
 
 MODULE_HEADER = """
 import numpy as np
@@ -20,11 +22,7 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 """
 
 
-def run_suite(spec: str, *checks: str, limit_s: float = 60.0) -> dict[str, Finding]:
-    """Run the given checks, or all checks, of an estimator; return the findings by name of the check."""
-    subject = Subject(spec, "localisation", limit_s)
-    names = [name for name, _ in check_names(subject)]
-    return {name: run_check(subject, names.index(name)) for name in (checks or names)}
+run_suite = partial(suites.run_suite, task="localisation")
 
 
 @pytest.mark.parametrize(
@@ -46,12 +44,9 @@ def test_shipped_estimators_conform(spec: str, checks: tuple[str, ...]) -> None:
 
 
 def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """Write a module with a class `Defective`; its name is unique (Python caches modules). Return the class's path."""
-    name = f"bad_position_{abs(hash(body))}"
-    (folder / f"{name}.py").write_text(f"{MODULE_HEADER}class Defective(InertialEstimator):\n{body}\n")
-    monkeypatch.chdir(folder)
-    monkeypatch.syspath_prepend(str(folder))
-    return f"{name}:Defective"
+    """Write a module with a class `Defective` and return the import path of the class."""
+    source = f"{MODULE_HEADER}class Defective(InertialEstimator):\n{body}\n"
+    return f"{suites.write_module(folder, monkeypatch, source)}:Defective"
 
 
 @pytest.mark.parametrize(

@@ -14,14 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.definition.requirements import read_requirements
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conditions import contrast_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationFaults, LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LEAD_S, LocalisationScenario, LocalisedDescent
-from marsyard.scenarios.localisation.system import SYSTEM
-from marsyard.scenarios.systems import catalogue, row_columns
+from marsyard.scenarios.systems import catalogue
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from marsyard.sim.streams import Streams
@@ -303,23 +301,6 @@ def test_fault_name_and_size_are_reported(name: str) -> None:
         "fault_size": size,
         "fault_free": False,
     }
-
-
-def test_requirements_use_declared_columns() -> None:
-    requirements = read_requirements(Path(str(SYSTEM.requirements)))
-    assert {"LOC-POS", "LOC-FINAL", "LOC-HARM", "LOC-AVAIL"} <= {entry.id for entry in requirements}
-    declared = row_columns("localisation")
-    assert declared is not None
-    for entry in requirements:
-        table = entry.to_table()
-        is_declared = declared.has_flag if table["bound"] is None else declared.has_number
-        assert is_declared(table["metric"]), entry.id
-
-
-def test_catalogue_has_the_campaigns() -> None:
-    assert {"loc-smoke", "loc-jezero", "loc-light", "loc-map-error", "loc-faults", "loc-sensitivity"} <= set(
-        LOC_CAMPAIGNS
-    )
 
 
 @pytest.mark.parametrize("name", LOC_CAMPAIGNS)

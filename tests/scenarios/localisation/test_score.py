@@ -69,22 +69,22 @@ def _make_descent(**changes: Any) -> Any:
 
 
 def _estimate(
-    true_time_s: float, error_m: Sequence[float], covariance: np.ndarray = COVARIANCE, details: object = None
+    time_s: float, error_m: Sequence[float], covariance: np.ndarray = COVARIANCE, details: object = None
 ) -> PositionEstimate:
     """Return a valid estimate with this error relative to the map; its time tag is on the inertial unit's clock.
 
     The velocity error is 0.5 m/s, the attitude error 0.2 deg.
     """
-    position = START_M + VELOCITY_M_S * true_time_s + np.append(SHIFT_M, 0.0) + np.asarray(error_m)
+    position = START_M + VELOCITY_M_S * time_s + np.append(SHIFT_M, 0.0) + np.asarray(error_m)
     velocity = VELOCITY_M_S + np.array([0.3, 0.0, -0.4])
     attitude = Rotation.from_rotvec([np.radians(0.2), 0.0, 0.0]) * ATTITUDE
     return PositionEstimate(
-        PositionOutcome.VALID, true_time_s + IMU_OFFSET_S, position, velocity, attitude, covariance, details
+        PositionOutcome.VALID, time_s + IMU_OFFSET_S, position, velocity, attitude, covariance, details
     )
 
 
-def _refusal(true_time_s: float, outcome: PositionOutcome = PositionOutcome.NO_COARSE_FIX) -> PositionEstimate:
-    return PositionEstimate(outcome, true_time_s + IMU_OFFSET_S, details=LocalisationDetails("coarse"))
+def _refusal(time_s: float, outcome: PositionOutcome = PositionOutcome.NO_COARSE_FIX) -> PositionEstimate:
+    return PositionEstimate(outcome, time_s + IMU_OFFSET_S, details=LocalisationDetails("coarse"))
 
 
 def _answers(*estimates: PositionEstimate) -> StreamAnswers:

@@ -40,19 +40,15 @@ def test_offset_is_perpendicular_to_the_epipolar_line() -> None:
     second_camera = pinhole.transform(rigid(Rotation.identity(), np.array([5.0, 0.0, 0.0])))
     points = np.array([[0.0, 0.0, -100.0], [10.0, -6.0, -120.0], [-4.0, 7.0, -90.0]])
     first_px, second_px = pinhole.project(points)[0], second_camera.project(points)[0]
-    offsets_after_perpendicular_shift = epipolar_offsets_px(
-        pinhole, second_camera, first_px, second_px + np.array([0.0, 2.0])
-    )
-    offsets_after_parallel_shift = epipolar_offsets_px(
-        pinhole, second_camera, first_px, second_px + np.array([3.0, 0.0])
-    )
+    perpendicular = epipolar_offsets_px(pinhole, second_camera, first_px, second_px + np.array([0.0, 2.0]))
+    parallel = epipolar_offsets_px(pinhole, second_camera, first_px, second_px + np.array([3.0, 0.0]))
     # Tolerance: the nearest point of the line is that with the smallest angular distance, not pixel distance.
-    assert np.allclose(offsets_after_perpendicular_shift, [0.0, 2.0], atol=0.05)
-    assert np.allclose(offsets_after_parallel_shift, 0.0, atol=1e-6)
+    assert np.allclose(perpendicular, [0.0, 2.0], atol=0.05)
+    assert np.allclose(parallel, 0.0, atol=1e-6)
     # The epipolar line ends at the image of an infinitely distant point; beyond this end, offsets are measured from it.
     infinity_px = second_camera.project(1e9 * pinhole.rays(first_px)[1])[0]
-    offsets_beyond_infinity = epipolar_offsets_px(pinhole, second_camera, first_px, infinity_px + np.array([4.0, 0.0]))
-    assert np.allclose(offsets_beyond_infinity, [4.0, 0.0], atol=0.05)
+    beyond = epipolar_offsets_px(pinhole, second_camera, first_px, infinity_px + np.array([4.0, 0.0]))
+    assert np.allclose(beyond, [4.0, 0.0], atol=0.05)
 
 
 def test_offsets_after_a_pure_rotation_are_measured_from_the_predicted_pixel() -> None:

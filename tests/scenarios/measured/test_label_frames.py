@@ -85,7 +85,7 @@ def test_every_frame_gives_the_same_camera_in_the_world(
 
 
 @pytest.mark.parametrize("reference", ["MCMF_FRAME", None])
-def test_mars_fixed_models_are_in_the_world_of_the_first_image(
+def test_mars_fixed_models_are_in_the_first_image_frame(
     tmp_path: Path, small_camera: Cahvor, reference: str | None
 ) -> None:
     """The second camera is 30 m above the first, and rotated by 0.1 rad about the vertical."""

@@ -114,10 +114,8 @@ def test_landings_are_compared_with_measured_and_true_poses(tmp_path: Path) -> N
     assert np.isclose(row["score_site_distance_m"], row["max_translation_m"])
 
 
-@pytest.mark.parametrize(("error_deg", "min_residual_px", "max_residual_px"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
-def test_attitude_errors_are_detected(
-    tmp_path: Path, error_deg: float, min_residual_px: float, max_residual_px: float
-) -> None:
+@pytest.mark.parametrize(("error_deg", "min_px", "max_px"), [(0.0, 0.0, 0.5), (0.5, 3.0, 12.0)])
+def test_attitude_errors_are_detected(tmp_path: Path, error_deg: float, min_px: float, max_px: float) -> None:
     """A rotation about the direction of motion moves each match away from its epipolar line."""
     folder = write_landing_folder(tmp_path / "in", inputs.landing(), "matching")
     rows = read_rows(folder)
@@ -127,7 +125,7 @@ def test_attitude_errors_are_detected(
     write_text_rows(folder, rows)
     result = run_ingested(folder, tmp_path / "out")
     assert result.outcome == "MATCHED"
-    assert min_residual_px <= float(result.row["residual_median_px"]) <= max_residual_px
+    assert min_px <= float(result.row["residual_median_px"]) <= max_px
     table = result.products["matches_1"]
     assert table.shape[1] == 7
 

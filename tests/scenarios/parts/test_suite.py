@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, run_check
+from marsyard.scenarios.conformance import determine_task
 from marsyard.scenarios.conformance import parts as part_checks
+from tests.scenarios.suites import run_suite, write_module
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"
 #: Beginning of a module with a defective part; `poses` returns a valid descent (times, positions, quaternions).
@@ -23,13 +24,6 @@ def poses(inputs, east=0.0):
 """
 
 
-def run_suite(spec: str, *checks: str) -> dict[str, Finding]:
-    """Run the given checks, or all checks, of a part; return the findings by name of the check."""
-    subject = Subject(spec, determine_task(spec), 60.0)
-    names = [name for name, _ in check_names(subject)]
-    return {name: run_check(subject, names.index(name)) for name in (checks or names)}
-
-
 @pytest.mark.parametrize(
     ("name", "kind"),
     [("Glider", "dynamics"), ("PulsedLidar", "instrument"), ("StarTracker", "instrument"), ("lateral_impact", "score")],
@@ -40,14 +34,6 @@ def test_examples_of_the_documentation_conform(name: str, kind: str, monkeypatch
     result = run_suite(f"custom_parts:{name}")
     assert {check: finding.problem for check, finding in result.items() if not finding.passed} == {}
     assert ("random" in result) == (kind != "score")
-
-
-def write_defective_part(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> str:
-    """Write a module with a unique name (Python caches modules) and return the name."""
-    name = f"bad_part_{abs(hash(body))}"
-    (folder / f"{name}.py").write_text(MODULE_HEADER + textwrap.dedent(body))
-    monkeypatch.syspath_prepend(str(folder))
-    return name
 
 
 @pytest.mark.parametrize(
@@ -97,7 +83,7 @@ def test_motion_defects_are_reported(
 ) -> None:
     header = f"class Defective:\n    random = {random}\n    def fly(self, inputs, rng):\n"
     body = header + textwrap.indent(lines, " " * 8)
-    name = write_defective_part(tmp_path, monkeypatch, body)
+    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + textwrap.dedent(body))
     (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
     assert result.next_step
@@ -132,7 +118,7 @@ def test_instrument_defects_are_reported(
     check: str, quantity: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     header = f"class Defective:\n    random = False\n    quantity = '{quantity}'\n    def read(self, truth, rng):\n"
-    name = write_defective_part(tmp_path, monkeypatch, header + textwrap.indent(lines, " " * 8))
+    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + header + textwrap.indent(lines, " " * 8))
     (result,) = run_suite(f"{name}:Defective", check).values()
     assert problem in result.problem
 
@@ -156,7 +142,7 @@ def test_score_defects_are_reported(
     check: str, annotation: str, lines: str, problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     body = f"def bad(case: {annotation}):\n" + textwrap.indent(lines, " " * 4)
-    name = write_defective_part(tmp_path, monkeypatch, body)
+    name = write_module(tmp_path, monkeypatch, MODULE_HEADER + textwrap.dedent(body))
     (result,) = run_suite(f"{name}:bad", check).values()
     assert problem in result.problem
 

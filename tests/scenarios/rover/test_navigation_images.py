@@ -116,9 +116,7 @@ SENSOR_DATASHEET = (
 @pytest.mark.parametrize(
     ("name", "baseline_m", "toe_in_deg"), [("mer-navcam", 0.20, 0.0), ("research-pancam", 0.30, 1.0)]
 )
-def test_pair_from_preset_files_equals_the_preset(
-    name: str, baseline_m: float, toe_in_deg: float, tmp_path: Path
-) -> None:
+def test_pair_from_files_equals_the_preset(name: str, baseline_m: float, toe_in_deg: float, tmp_path: Path) -> None:
     """The pose of the pair in the files does not matter: only the relative pose of the two cameras is used."""
     file_pose = rigid(Rotation.from_euler("xyz", [20.0, -50.0, 130.0], degrees=True), np.array([3.0, -8.0, 1.5]))
     for side, camera in zip(("left", "right"), preset(name).cameras(), strict=True):
@@ -164,10 +162,7 @@ def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
     ("settings", "message"),
     [
         ({"custom": {"left": "none.cahvor", "baseline_m": 0.2}}, "none.cahvor"),
-        (
-            {"custom": {"left": "small.yaml", "right": "large.yaml", "baseline_m": 0.2}},
-            "640 x 480 pixels, the right one",
-        ),
+        ({"custom": {"left": "small.yaml", "right": "large.yaml", "baseline_m": 0.2}}, "640 x 480 pixels, the right"),
         ({"detector": {"preset": "mer-descent-flown"}}, "rows_summed is 4; allowed for cameras on a mast: 1"),
     ],
 )

@@ -88,10 +88,7 @@ def test_circle_keeps_target_distance_and_bearing() -> None:
 
 def test_turn_back_off_and_straight_legs_have_their_commands() -> None:
     turn_leg = LegParameters(motion="turn", step_deg=10.0, steps=7, shuffle_m=0.1)
-    first, second = (
-        list(plan_step(turn_leg, 0, make_target(3.0, 0.0))),
-        list(plan_step(turn_leg, 1, make_target(3.0, 0.0))),
-    )
+    first, second = (list(plan_step(turn_leg, number, make_target(3.0, 0.0))) for number in (0, 1))
     assert np.degrees(first[0].turn_left_rad) == pytest.approx(-10.0)
     # the short drives alternate between forward and backward
     assert first[1].forward_m + second[1].forward_m == 0.0

@@ -188,9 +188,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
         SharedDriveParameters.model_validate({**settings, "skipped_stops": skipped_stops}) for skipped_stops in (0, 1)
     )
     assert (small_steps.step, large_steps.step) == (5.0, 10.0)
-    results = [
-        scenario.run(parameters, make_streams(case)) for case, parameters in enumerate((small_steps, large_steps))
-    ]
+    results = [scenario.run(p, make_streams(case)) for case, p in enumerate((small_steps, large_steps))]
     assert [result.row["updates"] for result in results] == [3, 2]
     assert [result.row["at_10_deg"] for result in results] == [False, True]
     assert all(result.row["tracked"] for result in results)

@@ -162,10 +162,8 @@ def compute_max_opencv_distance_px(
     points = camera.c + 1e5 * camera.rays(pixels)[1]
     pose = RigidTransform.identity() if pose is None else pose
     rotation, translation = pose.rotation.as_rotvec(), np.asarray(pose.translation)
-    expected_pixels, _ = cv2.projectPoints(
-        points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion)
-    )
-    return float(np.max(np.linalg.norm(expected_pixels.reshape(-1, 2) - pixels, axis=1)))
+    expected_px, _ = cv2.projectPoints(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
+    return float(np.max(np.linalg.norm(expected_px.reshape(-1, 2) - pixels, axis=1)))
 
 
 def make_camera_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
@@ -345,14 +343,14 @@ def test_equidistant_lens_projects_like_opencv_fisheye(tmp_path: Path) -> None:
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     points = 1e5 * calibration.camera.rays(pixels)[1]
     data = yaml.safe_load(EQUIDISTANT)["cam0"]
-    expected_pixels, _ = cv2.fisheye.projectPoints(
+    expected_px, _ = cv2.fisheye.projectPoints(
         points.reshape(-1, 1, 3),
         np.zeros(3),
         np.zeros(3),
         make_camera_matrix(*data["intrinsics"]),
         np.array(data["distortion_coeffs"]),
     )
-    distances_px = np.linalg.norm(expected_pixels.reshape(-1, 2) - pixels, axis=1)
+    distances_px = np.linalg.norm(expected_px.reshape(-1, 2) - pixels, axis=1)
     assert distances_px.max() < 1.1 * calibration.residual.max_px
 
 
@@ -372,14 +370,14 @@ def test_fisheye_pose_is_applied() -> None:
     matrix, size = make_camera_matrix(300.0, 310.0, 320.0, 240.0), (640, 480)
     camera, _ = from_opencv_fisheye(matrix, np.array([0.01, -0.002, 0.0, 0.0]), size, pose)
     point = pose.inv().apply([0.3, -0.2, 1.0])
-    expected_pixels, _ = cv2.fisheye.projectPoints(
+    expected_px, _ = cv2.fisheye.projectPoints(
         point.reshape(1, 1, 3),
         pose.rotation.as_rotvec(),
         np.asarray(pose.translation),
         matrix,
         np.array([0.01, -0.002, 0.0, 0.0]),
     )
-    assert np.allclose(camera.project(point)[0], expected_pixels.ravel(), rtol=0, atol=1e-6)
+    assert np.allclose(camera.project(point)[0], expected_px.ravel(), rtol=0, atol=1e-6)
 
 
 #: File, text that is replaced, its replacement, and the expected message.

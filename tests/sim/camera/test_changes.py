@@ -54,9 +54,7 @@ def test_motions_compose(first: RigidTransform, second: RigidTransform) -> None:
         rtol=0,
         atol=1e-11,
     )
-    assert np.allclose(
-        stack_cahv(camera.transform(first).transform(first.inv())), stack_cahv(camera), rtol=0, atol=1e-11
-    )
+    assert np.allclose(stack_cahv(camera.transform(first).transform(first.inv())), stack_cahv(camera), 0, 1e-11)
 
 
 def test_motion_rotates_the_lens(hazcam: Cahvore) -> None:

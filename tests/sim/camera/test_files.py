@@ -348,12 +348,12 @@ def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
 @given(
     st.sampled_from([CMOD_TEXT, LABEL]), st.integers(0, 1700), st.binary(min_size=0, max_size=12), st.integers(0, 30)
 )
-def test_damaged_files_raise_camera_file_errors(
-    tmp_path: Path, text: str, position: int, insertion: bytes, n_removed: int
+def test_damaged_files_raise_file_errors(
+    tmp_path: Path, text: str, position: int, insertion: bytes, removed: int
 ) -> None:
     original = text.encode("latin-1")
     path = tmp_path / "damaged"
-    path.write_bytes(original[:position] + insertion + original[position + n_removed :])
+    path.write_bytes(original[:position] + insertion + original[position + removed :])
     with contextlib.suppress(CameraFileError):
         assert len(read_cameras(path)) == 1
 

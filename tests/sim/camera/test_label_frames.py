@@ -65,9 +65,7 @@ END_GROUP = LOCAL_LEVEL_COORDINATE_SYSTEM
 
 
 @pytest.mark.parametrize("write_label", [pds3_label, pds4_label])
-def test_rover_pose_in_the_mars_fixed_frame_is_used(
-    tmp_path: Path, navcam: CameraModel, write_label: Callable[..., Path]
-) -> None:
+def test_rover_pose_on_mars_is_used(tmp_path: Path, navcam: CameraModel, write_label: Callable[..., Path]) -> None:
     """The model and the rover's pose are both in the Mars-fixed frame, whose vectors have a resolution of 1e-3 m."""
     mars_from_rover = RigidTransform.from_components(
         np.array([701403.2, 3145680.62, 1075894.36]), SITE_FROM_ROVER.rotation

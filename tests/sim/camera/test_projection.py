@@ -321,9 +321,7 @@ def test_jacobian_on_the_optical_axis_matches_finite_differences(navcam: Cahvor,
 
 
 @given(cameras, arrays(float, (4, 2), elements=st.floats(0.1, 0.9)), st.floats(5, 50))
-def test_jacobian_of_random_cameras_matches_finite_differences(
-    camera: CameraModel, uv: np.ndarray, distance_m: float
-) -> None:
+def test_jacobian_of_random_cameras_matches_differences(camera: CameraModel, uv: np.ndarray, distance_m: float) -> None:
     origins, directions = camera.rays(pixels_from_fractions(camera, uv))
     points = origins + distance_m * directions
     analytic = camera.projection_jacobian(points)

@@ -22,7 +22,7 @@ COMMANDS = [
 ]
 
 
-def _make_rng() -> np.random.Generator:
+def _rng() -> np.random.Generator:
     return np.random.default_rng(5)
 
 
@@ -32,7 +32,7 @@ def test_motion_without_slip_follows_the_command(command: DriveCommand, slope_de
     # On a plane the motion in rover axes has no vertical component, for any slope.
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 1.0, 2.0, 0.4)
-    result = drive(MER, ground, NO_SLIP_SOIL, start, command, _make_rng())
+    result = drive(MER, ground, NO_SLIP_SOIL, start, command, _rng())
     motion = start.world_from_rover.inv() * result.end.world_from_rover
     assert motion.translation == pytest.approx([*command.displacement_m, 0.0], abs=1e-8)
     assert motion.rotation.as_rotvec() == pytest.approx([0.0, 0.0, command.turn_left_rad], abs=1e-7)
@@ -56,7 +56,7 @@ def test_target_stays_ahead_when_the_rover_circles_it() -> None:
     distance_m, turn_rad = 7.0, np.radians(10.0)
     command = DriveCommand(left_m=-distance_m * turn_rad, turn_left_rad=turn_rad)
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
-    end = drive(MER, Plane(), NO_SLIP_SOIL, start, command, _make_rng()).end
+    end = drive(MER, Plane(), NO_SLIP_SOIL, start, command, _rng()).end
     target = end.world_from_rover.inv().apply(np.array([distance_m, 0.0, 0.0]))
     assert target == pytest.approx([distance_m, 0.0, 0.0], abs=1e-7)
     # A left turn around the target moves the rover right of its initial heading.
@@ -69,7 +69,7 @@ def test_slip_of_one_half_halves_the_distance() -> None:
     assert slip == pytest.approx(0.5, abs=0.01)
     ground = uphill_east(15.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    result = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=2.0), _make_rng())
+    result = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=2.0), _rng())
     distance_m = np.linalg.norm(result.end.world_from_rover.translation - start.world_from_rover.translation)
     assert distance_m == pytest.approx(2.0 * (1.0 - slip), rel=1e-9)
     assert result.slip == pytest.approx(slip, rel=1e-9)
@@ -79,13 +79,13 @@ def test_slip_of_one_half_halves_the_distance() -> None:
 def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
     ground = uphill_east(slope_deg)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    uphill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.5), _make_rng())
+    uphill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.5), _rng())
     assert uphill.slip == pytest.approx(slip, abs=0.005)
     # Reverse driving uphill has the same slip. Downhill the rover gains 0.3 of the path that the slope costs uphill.
     facing_downhill = settle(MER, ground, 0.0, 0.0, -EAST)
-    reverse = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=-0.5), _make_rng())
+    reverse = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=-0.5), _rng())
     assert reverse.slip == pytest.approx(uphill.slip, abs=1e-9)
-    downhill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=0.5), _make_rng())
+    downhill = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), facing_downhill, DriveCommand(forward_m=0.5), _rng())
     assert downhill.slip == pytest.approx(0.01 - 0.3 * (uphill.slip - 0.01), abs=1e-9)
 
 
@@ -93,7 +93,7 @@ def test_uphill_slip_increases_to_one(slope_deg: float, slip: float) -> None:
 def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, azimuth_rad)
-    result = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=1.0), _make_rng())
+    result = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=1.0), _rng())
     motion_m = result.end.world_from_rover.translation - start.world_from_rover.translation
     lateral_slip_m = 0.5 * (NO_RANDOM_SLIP.slip_fraction(np.radians(10.0)) - NO_RANDOM_SLIP.flat)
     # The ground falls to the west.
@@ -104,16 +104,12 @@ def test_rover_slides_downhill_across_a_slope(azimuth_rad: float) -> None:
 def test_slip_reduces_the_turn_angle() -> None:
     """The default lost fraction of a turn is 0.03, plus half of the path fraction lost uphill by the slope."""
     start = settle(MER, Plane(), 0.0, 0.0, EAST)
-    result = drive(
-        MER, Plane(), Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _make_rng()
-    )
+    result = drive(MER, Plane(), Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(40.0)), _rng())
     assert np.degrees(start.azimuth_rad - result.end.azimuth_rad) == pytest.approx(40.0 * 0.97)
     assert np.isnan(result.slip)
-    steep_ground = uphill_east(15.0)
-    start = settle(MER, steep_ground, 0.0, 0.0, EAST)
-    result = drive(
-        MER, steep_ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _make_rng()
-    )
+    steep = uphill_east(15.0)
+    start = settle(MER, steep, 0.0, 0.0, EAST)
+    result = drive(MER, steep, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(turn_left_rad=np.radians(10.0)), _rng())
     assert 1.0 - result.turn_left_rad / np.radians(10.0) == pytest.approx(
         0.03 + 0.5 * (NO_RANDOM_SLIP.slip_fraction(np.radians(15.0)) - 0.01), rel=1e-6
     )
@@ -126,8 +122,8 @@ def test_soil_step_and_heading_errors_have_the_specified_deviation() -> None:
     assert np.std(factors) == pytest.approx(0.3, abs=0.042)
     ground = uphill_east(10.0)
     start = settle(MER, ground, 0.0, 0.0, EAST)
-    slippery = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.5), start, DriveCommand(forward_m=0.3), _make_rng())
-    nominal = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.3), _make_rng())
+    slippery = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.5), start, DriveCommand(forward_m=0.3), _rng())
+    nominal = drive(MER, ground, Soil(NO_RANDOM_SLIP, 1.0), start, DriveCommand(forward_m=0.3), _rng())
     assert slippery.slip == pytest.approx(1.5 * nominal.slip, rel=1e-9)
     # The relative standard error of a deviation from 120 draws is 1 / sqrt(240); the tolerance is four times that.
     rng = np.random.default_rng(1)

@@ -215,9 +215,7 @@ def test_times_since_1970_add_no_acceleration(tmp_path: Path, kind: str) -> None
 def test_times_rounded_by_the_file_are_refused(tmp_path: Path, kind: str) -> None:
     """The error is 0.5^0.5 x 2.4e-7 s x 80 m/s / (2.5 ms)^2 = 2.2 m/s^2."""
     path = _write_epoch_flight(tmp_path, kind)
-    with pytest.raises(
-        TrajectoryFileError, match=r"rounded to 2e-07 s: an acceleration error of 2.2 m/s\^2; allowed: integers"
-    ):
+    with pytest.raises(TrajectoryFileError, match=r"rounded to 2e-07 s: an acceleration error of 2.2 m/s\^2; allowed:"):
         read_poses(path)
 
 

@@ -174,15 +174,15 @@ def test_phases_start_at_the_heights_of_the_paper() -> None:
     assert np.hypot(*(state[Phase.DESCENT].position_m[:2] - SITE_XY)) == pytest.approx(2.0, abs=0.25)
     flare_start = state[Phase.FLARE].position_m
     assert flare_start[2] - 2.0 - 0.1 * (flare_start[0] - SITE_XY[0]) == pytest.approx(1.5, abs=0.1)
-    touchdown = state[Phase.ON_GROUND]
-    assert touchdown.position_m[2] - 2.0 - 0.1 * (touchdown.position_m[0] - SITE_XY[0]) == pytest.approx(
+    landed = state[Phase.ON_GROUND]
+    assert landed.position_m[2] - 2.0 - 0.1 * (landed.position_m[0] - SITE_XY[0]) == pytest.approx(
         CRAFT.gear_m, abs=0.01
     )
-    assert touchdown.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
+    assert landed.velocity_m_s[2] == pytest.approx(-GUIDANCE.flare_m_s, abs=0.05)
     at_rest = flight.path.state(flight.path.span_s[1])
     np.testing.assert_allclose(at_rest.velocity_m_s, 0.0, atol=1e-9)
     np.testing.assert_allclose(at_rest.attitude.as_matrix()[:, 2], [0.0, 0.0, 1.0], atol=1e-9)
-    assert at_rest.time_s - touchdown.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
+    assert at_rest.time_s - landed.time_s == pytest.approx(GUIDANCE.rest_s, abs=0.05)
 
 
 def test_stuck_altimeter_prevents_deceleration() -> None:

@@ -101,9 +101,7 @@ def kernels(tmp_path_factory: pytest.TempPathFactory) -> Path:
         spiceypy.spkcls(spk)
         ticks = [spiceypy.sce2c(LANDER, begin + time) for time in times]
         # C matrices transform vectors from J2000 to camera axes; SPICE quaternions have the scalar first.
-        quaternions = [
-            spiceypy.m2q(np.ascontiguousarray((rotation @ attitude.as_matrix()).T)) for attitude in attitudes
-        ]
+        quaternions = [spiceypy.m2q(np.ascontiguousarray((rotation @ turn.as_matrix()).T)) for turn in attitudes]
         ck = spiceypy.ckopn(str(folder / "lander.bc"), "descent", 0)
         rates = np.zeros((len(times), 3))
         tick_span = (ticks[0], ticks[-1])
@@ -182,9 +180,7 @@ def test_meta_kernels_are_read_from_any_folder(
 
 
 @pytest.mark.parametrize("values", [("a", "b"), ("{folder}/a", "{folder}/b")])
-def test_paths_in_meta_kernels_may_be_absolute_or_relative_to_the_flight(
-    meta_kernel: Path, values: tuple[str, str]
-) -> None:
+def test_paths_in_meta_kernels_may_be_absolute_or_relative(meta_kernel: Path, values: tuple[str, str]) -> None:
     # strings of text kernels have at most 80 characters; a plus sign continues a string
     folder = meta_kernel.parent.as_posix()
     first, second = (value.format(folder="+'\n'".join(textwrap.wrap(folder, 50))) for value in values)
@@ -211,11 +207,7 @@ def test_hash_covers_kernels_in_meta_kernels(meta_kernel: Path, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (
-            "lander.bc",
-            "absent.bc",
-            r"flight.tm: names the kernel \$K/absent.bc, but .*mk/../a/absent.bc .*do not exist",
-        ),
+        ("lander.bc", "absent.bc", r"flight.tm: names the kernel \$K/no.bc, but .*mk/../a/no.bc .*do not exist"),
         ("'K', 'KERNELS'", "'KERNELS'", "has 1 PATH_SYMBOLS and 2 PATH_VALUES"),
         ("$K/lander.bc", "flight.tm", "names the meta-kernel flight.tm"),
         ("KERNELS_TO_LOAD =", "KERNELS_TO_LOAD", "SPICE: "),

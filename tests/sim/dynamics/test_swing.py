@@ -56,7 +56,7 @@ def _make_calm_wind() -> WindField:
     return WindField(GROUND_M, 0.0, 0.0, 500.0, 0.03, np.zeros((0, 7)))
 
 
-def _list_body_states(
+def _list_bodies(
     y: np.ndarray, chain: Chain, parameters: SwingParameters
 ) -> list[tuple[float, np.ndarray, np.ndarray]]:
     """Return (mass, position, velocity) of the centres of mass of canopy, backshell and lander.
@@ -78,14 +78,14 @@ def _list_body_states(
 
 def _compute_energy(y: np.ndarray, chain: Chain, parameters: SwingParameters) -> float:
     """Compute kinetic plus potential energy, J. `y[21]` is the spin of the lander."""
-    translational = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _list_body_states(y, chain, parameters))
+    translational = sum(0.5 * m * v @ v + m * GRAVITY * r[2] for m, r, v in _list_bodies(y, chain, parameters))
     rotational = chain.transverse_inertia * y[15:18] @ y[15:18] + chain.axial_inertia * y[21] ** 2
     return float(translational + 0.5 * rotational)
 
 
 def _compute_angular_momentum(y: np.ndarray, chain: Chain, parameters: SwingParameters) -> np.ndarray:
     """Compute the angular momentum about the world origin."""
-    orbital = sum(m * np.cross(r, v) for m, r, v in _list_body_states(y, chain, parameters))
+    orbital = sum(m * np.cross(r, v) for m, r, v in _list_bodies(y, chain, parameters))
     e, de = y[12:15], y[15:18]
     return np.asarray(orbital + chain.transverse_inertia * np.cross(e, de) + chain.axial_inertia * y[21] * e)
 
@@ -125,14 +125,14 @@ def test_energy_and_momentum_balance_of_drag_and_friction(seed: int) -> None:
         _compute_angular_momentum(y + step_s * rates, chain, parameters)
         - _compute_angular_momentum(y - step_s * rates, chain, parameters)
     ) / (2.0 * step_s)
-    gravity_torque = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _list_body_states(y, chain, parameters))
+    gravity_torque = sum(np.cross(r, -m * GRAVITY * UP) for m, r, _ in _list_bodies(y, chain, parameters))
     np.testing.assert_allclose(torque, np.cross(y[:3], force) + gravity_torque, atol=1e-2)
     momentum_rate = sum(
         m * dv
         for (m, _, _), dv in zip(
-            _list_body_states(y, chain, parameters),
-            np.array([v for _, _, v in _list_body_states(y + step_s * rates, chain, parameters)])
-            - np.array([v for _, _, v in _list_body_states(y - step_s * rates, chain, parameters)]),
+            _list_bodies(y, chain, parameters),
+            np.array([v for _, _, v in _list_bodies(y + step_s * rates, chain, parameters)])
+            - np.array([v for _, _, v in _list_bodies(y - step_s * rates, chain, parameters)]),
             strict=True,
         )
     ) / (2.0 * step_s)
@@ -400,9 +400,7 @@ def test_error_messages_contain_the_allowed_values() -> None:
         SwingDescent.simulate(
             SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
         )
-    with pytest.raises(
-        ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1 .*; allowed: nodding much"
-    ):
+    with pytest.raises(ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1.*; allowed: nodding"):
         _fly(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
         SwingDescent.simulate(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)

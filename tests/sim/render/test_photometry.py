@@ -61,11 +61,9 @@ def test_reflectance_law_is_reciprocal(renderer: Renderer, flat: Surface, law: P
 @with_each_law
 def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
     """For sun and eye directions with a cosine density, the mean of (I/F) / cos i is the spherical albedo."""
-    sin2_i, sin2_e, azimuth_turns = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
+    sin2_i, sin2_e, turns = qmc.Sobol(3, rng=np.random.default_rng(1)).random_base2(17).T
     cos_i, cos_e = np.sqrt(1.0 - sin2_i), np.sqrt(1.0 - sin2_e)
-    phase_angle = np.arccos(
-        np.clip(cos_i * cos_e + np.sqrt(sin2_i * sin2_e) * np.cos(2.0 * np.pi * azimuth_turns), -1.0, 1.0)
-    )
+    phase_angle = np.arccos(np.clip(cos_i * cos_e + np.sqrt(sin2_i * sin2_e) * np.cos(2.0 * np.pi * turns), -1.0, 1.0))
     surge = 1.0 + law.surge_amplitude / (1.0 + np.tan(0.5 * phase_angle) / law.surge_width)
     disc = 2.0 * law.lunar_fraction * cos_i / (cos_i + cos_e) + (1.0 - law.lunar_fraction) * cos_i
     assert law.normalisation() * np.mean(surge * disc / cos_i) == pytest.approx(1.0, rel=0.01)
@@ -115,7 +113,7 @@ def _make_surface(heights: np.ndarray, albedo: float = 0.2) -> Surface:
 FLAT = _make_surface(np.zeros((256, 256)))
 
 
-def _render_scene(
+def _render_ground(
     renderer: Renderer, camera: CameraModel, surface: Surface, sun: Sun, law: Photometry, pose: RigidTransform = NADIR
 ) -> np.ndarray:
     radiance: np.ndarray = renderer.render(
@@ -127,7 +125,7 @@ def _render_scene(
 def test_lambert_plane_follows_the_cosine_law(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     sun = Sun(direction(np.radians(70.0), np.radians(35.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
-    radiance = _render_scene(renderer, descent_camera(128), FLAT, sun, law)
+    radiance = _render_ground(renderer, descent_camera(128), FLAT, sun, law)
     np.testing.assert_allclose(radiance, 0.2 * np.sin(np.radians(35.0)), rtol=1e-5)
 
 
@@ -147,14 +145,14 @@ def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: C
 
     disc = 0.6 * 2 * cos_i / (cos_i + cos_e) + 0.4 * cos_i
     expected = 0.2 * (law.normalisation() * compute_surge(phase) * disc + 0.2)
-    np.testing.assert_allclose(_render_scene(renderer, camera, FLAT, sun, law), expected, rtol=1e-4)
+    np.testing.assert_allclose(_render_ground(renderer, camera, FLAT, sun, law), expected, rtol=1e-4)
 
 
 def test_opposition_spot_is_at_the_antisolar_point(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     camera = descent_camera()
     sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
-    radiance = _render_scene(renderer, camera, FLAT, sun, law)
+    radiance = _render_ground(renderer, camera, FLAT, sun, law)
     expected, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
     assert visible
     peak = np.unravel_index(radiance.argmax(), radiance.shape)
@@ -168,9 +166,9 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: 
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     camera = descent_camera(256)
     # The ground faces the eastern sun where its height decreases with x.
-    eastern_sun = Sun(direction(np.radians(90.0), np.radians(40.0)))
+    east_sun = Sun(direction(np.radians(90.0), np.radians(40.0)))
     frame = renderer.render(
-        Scene(_make_surface(heights), (0.0, 0.0), eastern_sun, law), PixelRays.from_camera(camera), NADIR
+        Scene(_make_surface(heights), (0.0, 0.0), east_sun, law), PixelRays.from_camera(camera), NADIR
     )
     is_facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
     is_facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
@@ -181,7 +179,7 @@ def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     low_sun = Sun(direction(np.radians(90.0), np.radians(5.0)))
-    without_sky = _render_scene(
+    without_sky = _render_ground(
         renderer,
         descent_camera(128),
         _make_surface(heights),
@@ -189,7 +187,7 @@ def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_
         Photometry(sky_fraction=0.0, surrounding_albedo=0.0),
     )
     assert without_sky.min() == 0.0
-    with_sky = _render_scene(
+    with_sky = _render_ground(
         renderer, descent_camera(128), _make_surface(heights), low_sun, Photometry(sky_fraction=0.15)
     )
     # Sky fraction times albedo, with a margin of 10 %.
@@ -205,7 +203,7 @@ def test_albedo_finer_than_a_pixel_is_averaged(renderer: Renderer, descent_camer
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     overhead = Sun(np.array([0.0, 0.0, 1.0]))
     pose = rigid(Rotation.from_euler("z", 33.0, degrees=True), np.array([0.0, 0.0, 1200.0]))
-    radiance = _render_scene(renderer, descent_camera(128), stripes, overhead, law, pose)
+    radiance = _render_ground(renderer, descent_camera(128), stripes, overhead, law, pose)
     np.testing.assert_allclose(radiance, 0.3, rtol=0.01)
 
 

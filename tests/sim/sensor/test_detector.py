@@ -32,9 +32,7 @@ def test_signal_divided_by_variance_equals_the_gain() -> None:
     The tolerance of 2 % is four standard errors of 100 images.
     """
     detector = _make_detector(transfer_row_s=0.0, clear_row_s=0.0, responsivity_e_s=5e7)
-    images = np.stack(
-        [detector.expose(0.2 * UNIFORM, np.random.default_rng(seed)).astype(np.float64) for seed in range(100)]
-    )
+    images = np.stack([detector.expose(0.2 * UNIFORM, np.random.default_rng(n)).astype(np.float64) for n in range(100)])
     signal_dn = images.mean() - detector.parameters.offset_dn
     # Rounding adds one twelfth of a count to the variance.
     variance = images.var(axis=0, ddof=1).mean() - 1.0 / 12.0

@@ -57,9 +57,7 @@ def _run_filter(
     return path, imu, navigation.run(start, increments, solutions, readings, np.array(covariance_times_s))
 
 
-def _compute_state_errors(
-    path: SimulatedPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray
-) -> np.ndarray:
+def _compute_errors(path: SimulatedPath, imu: Imu, solution: NavigationSolution, indices: np.ndarray) -> np.ndarray:
     """Compute the true minus the estimated state: position, velocity, attitude, biases of gyro and accelerometer.
 
     The result has fifteen columns. `indices` select the samples of the inertial unit.
@@ -92,7 +90,7 @@ def test_errors_are_consistent_with_the_covariance() -> None:
         path, imu, solution = _run_filter(
             seed, rtk_parameters=receiver_with_float_solutions, covariance_times_s=(-3.0, 0.0, 2.5, 5.0)
         )
-        errors = _compute_state_errors(path, imu, solution, solution.covariance_indices)
+        errors = _compute_errors(path, imu, solution, solution.covariance_indices)
         covariances = solution.covariances
         squared_errors.append(
             [
@@ -134,7 +132,7 @@ def test_better_instruments_reduce_the_errors() -> None:
     accurate_receiver = RtkParameters.model_validate({"fixed": static, "floating": static} | white)
     path, imu, solution = _run_filter(0, ideal, accurate_receiver)
     # Ten seconds after the start; the unit has 100 samples per second.
-    errors = _compute_state_errors(path, imu, solution, np.arange(1000, 1550))
+    errors = _compute_errors(path, imu, solution, np.arange(1000, 1550))
     assert np.abs(errors[:, :3]).max() < 6e-3
     assert np.abs(errors[:, 3:6]).max() < 0.015
 
@@ -148,7 +146,7 @@ def test_outage_errors_are_consistent_with_the_covariance() -> None:
     squared_errors, horizontal_errors_m = [], []
     for seed in range(N_FLIGHTS):
         path, imu, solution = _run_filter(seed, rtk_parameters=with_outage, covariance_times_s=(5.0,))
-        error = _compute_state_errors(path, imu, solution, solution.covariance_indices)[0]
+        error = _compute_errors(path, imu, solution, solution.covariance_indices)[0]
         squared_errors.append(error[:9] @ np.linalg.solve(solution.covariances[0][:9, :9], error[:9]))
         horizontal_errors_m.append(np.hypot(*error[:2]))
     assert 0.2 < np.sqrt(np.mean(np.square(horizontal_errors_m))) < 3.0
@@ -163,7 +161,7 @@ def test_stuck_instruments_are_ignored() -> None:
     for seed in range(20):
         for name, compass_parameters in (("free", COMPASS), ("stuck", stuck_parameters)):
             path, imu, solution = _run_filter(seed, compass_parameters=compass_parameters)
-            error = _compute_state_errors(path, imu, solution, np.array([1500]))[0]
+            error = _compute_errors(path, imu, solution, np.array([1500]))[0]
             attitude_errors_deg[name].append(np.degrees(error[6:9]))
             if name == "stuck":
                 late_kinds = solution.innovations.kinds[solution.innovations.times_s > -7.0]

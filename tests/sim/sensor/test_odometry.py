@@ -96,10 +96,8 @@ def test_odometry_errors_are_specified_fractions_of_the_distance() -> None:
     ]
     # The RMS of 100 vectors with one to three degrees of freedom has a standard error of up to 7 %.
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.02 * 8.0, rel=0.2)
-    wheel_errors = [
-        np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(end)) for n in range(100)
-    ]
-    assert np.sqrt(np.mean(np.square(wheel_errors))) == pytest.approx(0.011 * 8.0, rel=0.2)
+    wheels = [np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(end)) for n in range(100)]
+    assert np.sqrt(np.mean(np.square(wheels))) == pytest.approx(0.011 * 8.0, rel=0.2)
 
 
 @pytest.mark.slow

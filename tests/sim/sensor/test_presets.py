@@ -37,9 +37,7 @@ def _compute_fields_of_view_deg(name: str) -> tuple[float, float]:
         ("research-pancam", 17.0, 13.0, 0.5),
     ],
 )
-def test_presets_have_the_specified_fields_of_view(
-    name: str, horizontal_deg: float, vertical_deg: float, tolerance: float
-) -> None:
+def test_presets_have_fields_of_view(name: str, horizontal_deg: float, vertical_deg: float, tolerance: float) -> None:
     assert _compute_fields_of_view_deg(name) == pytest.approx((horizontal_deg, vertical_deg), abs=tolerance)
 
 

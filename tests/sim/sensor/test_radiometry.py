@@ -22,12 +22,10 @@ def _compute_snr(parameters: DetectorParameters, radiance_factor: float) -> floa
 
 
 def test_total_sunlight_equals_the_solar_constant() -> None:
-    wavelength_nm = np.linspace(150.0, 20000.0, 100000)
-    photon_energy_j = 6.62607015e-34 * 2.99792458e8 / (wavelength_nm * 1e-9)
+    waves_nm = np.linspace(150.0, 20000.0, 100000)
+    photon_energy_j = 6.62607015e-34 * 2.99792458e8 / (waves_nm * 1e-9)
     # The solar constant is 1361 W/m2; 0.2 % of it are outside these wavelengths.
-    assert np.trapezoid(solar_photons(wavelength_nm) * photon_energy_j, wavelength_nm) == pytest.approx(
-        1361.0, rel=0.003
-    )
+    assert np.trapezoid(solar_photons(waves_nm) * photon_energy_j, waves_nm) == pytest.approx(1361.0, rel=0.003)
 
 
 def test_neutral_density_filters_match_the_paper() -> None:
@@ -41,7 +39,7 @@ def test_neutral_density_filters_match_the_paper() -> None:
 @pytest.mark.parametrize(
     ("temperature_c", "ratio", "dark_fraction"), [(-34.0, 102.0, None), (0.0, 100.0, 0.02), (23.0, 87.0, 0.15)]
 )
-def test_signal_to_noise_and_dark_current_match_the_paper(
+def test_noise_and_dark_current_match_the_paper(
     temperature_c: float, ratio: float, dark_fraction: float | None
 ) -> None:
     """One set of constants reproduces the values of the field test paper, section III.B.3.

@@ -86,11 +86,9 @@ def test_border_of_the_imported_terrain_has_no_step(npz: Path) -> None:
 def test_roughness_finer_than_the_posts_is_optional(npz: Path) -> None:
     smooth, rough = (
         build_surface(
-            make_terrain_parameters(
-                RealTerrain(dtm=npz, roughen=roughen), samples=1024, spacing_m=0.25, rms_slope_deg=4.0
-            )
+            make_terrain_parameters(RealTerrain(dtm=npz, roughen=fine), samples=1024, spacing_m=0.25, rms_slope_deg=4.0)
         )
-        for roughen in (False, True)
+        for fine in (False, True)
     )
     middle = np.s_[480:560, 480:560, 0]
     roughness_m = rough.levels[0][middle] - smooth.levels[0][middle]

@@ -81,14 +81,8 @@ def expected(tmp_path: Path) -> np.ndarray:
 @pytest.mark.parametrize(
     ("shift", "problem"),
     [
-        (
-            {"west": EAST_M + COLUMNS},
-            r"at 100.0% of the DTM's posts \(100.0% are outside the image\); allowed: up to 20.0%",
-        ),
-        (
-            {"north": NORTH_M + 5000.0},
-            r"at 100.0% of the DTM's posts \(100.0% are outside the image\); allowed: up to 20.0%",
-        ),
+        ({"west": EAST_M + COLUMNS}, r"at 100.0% of the DTM's posts \(100.0% are outside the image\); allowed: up to"),
+        ({"north": NORTH_M + 5000.0}, r"at 100.0% of the DTM's posts \(100.0% are outside the image\); allowed: up to"),
         ({"west": EAST_M + 0.5 * COLUMNS}, r"at 50.0% of the DTM's posts \(50.0% are outside the image\)"),
         ({"north": NORTH_M - 0.25 * ROWS}, "at 25.0% of the DTM's posts"),
     ],
@@ -198,9 +192,7 @@ def test_missing_pixels_are_limited(tmp_path: Path, columns: int) -> None:
         ("uint16", -0.01, 130.0),
     ],
 )
-def test_scale_and_offset_are_applied(
-    tmp_path: Path, expected: np.ndarray, dtype: str, scale: float, offset: float
-) -> None:
+def test_scale_and_offset_apply(tmp_path: Path, expected: np.ndarray, dtype: str, scale: float, offset: float) -> None:
     stored = np.rint((BRIGHTNESS * (2.0 if scale == 2.0 else 1.0) - offset) / scale)[None]
     source = make_source(tmp_path, stored.astype(dtype), scales=(scale,), offsets=(offset,))
     # All stored values are integers. With the scale 2, the brightness is doubled, which its mean removes.
@@ -240,9 +232,7 @@ def test_palette_is_applied(tmp_path: Path, expected: np.ndarray, transparent: b
 def test_colours_become_luminance(tmp_path: Path, dtype: str, alpha: bool) -> None:
     """Ground that is bright in red in the west, and in blue in the east: 0.299 R + 0.587 G + 0.114 B."""
     east = np.arange(2 * COLUMNS) >= COLUMNS
-    red, green, blue = (
-        np.broadcast_to(np.where(east, *pair), BRIGHTNESS.shape) for pair in ((10, 200), (20, 30), (250, 5))
-    )
+    red, green, blue = (np.broadcast_to(np.where(east, *p), BRIGHTNESS.shape) for p in ((10, 200), (20, 30), (250, 5)))
     bands = [red, green, blue]
     names = [ColorInterp.red, ColorInterp.green, ColorInterp.blue]
     if alpha:
@@ -284,7 +274,5 @@ def test_invalid_bands_are_rejected(tmp_path: Path, bands: np.ndarray, changes: 
 def test_colours_are_no_heights(tmp_path: Path) -> None:
     source = make_source(tmp_path)
     write(source.dtm, np.ones((3, ROWS, COLUMNS), dtype=np.uint16), 1.0, photometric="RGB")
-    with pytest.raises(
-        TerrainFileError, match=r"dtm.tif: contains colours, as in an image; allowed: heights in metres"
-    ):
+    with pytest.raises(TerrainFileError, match=r"dtm.tif: contains colours, as in an image; allowed: heights in m"):
         check_source(source)

@@ -26,9 +26,7 @@ def positions() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
-def test_height_matches_scipy_cubic_b_spline(
-    surface: Surface, positions: tuple[np.ndarray, np.ndarray], level: int
-) -> None:
+def test_height_matches_scipy_spline(surface: Surface, positions: tuple[np.ndarray, np.ndarray], level: int) -> None:
     x, y = positions
     spacing = surface.spacing_m * 2**level
     for channel, actual in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):

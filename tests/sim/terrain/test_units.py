@@ -240,9 +240,7 @@ def test_rocks_narrower_than_four_samples_have_no_tail() -> None:
     assert _make_surface_with_tail(WindTails(), diameter_m=4.1 * SPACING_M).levels[0][..., 0].any()
 
 
-def test_tails_in_the_bank_do_not_change_the_positions_of_rocks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tails_in_the_bank_do_not_move_rocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
     without_tails = TerrainParameters(samples=256, spacing_m=0.05, rocks=RockParameters(abundance=0.05, smallest_m=0.2))
     with_tails = without_tails.with_changes({"rocks": {"tails": {}}})
@@ -259,9 +257,7 @@ def test_tails_in_the_bank_do_not_change_the_positions_of_rocks(
     np.testing.assert_array_equal(z, tail_bank.terrain(0).height(x, y))
 
 
-def test_rock_abundance_changes_the_cached_terrain_only_with_tails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_abundance_changes_the_cached_terrain_only_with_tails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MARSYARD_CACHE", str(tmp_path))
     rocks = RockParameters(abundance=0.05, smallest_m=0.2)
     parameters = TerrainParameters(samples=64, spacing_m=0.05, rocks=rocks)

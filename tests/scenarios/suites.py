@@ -1,0 +1,23 @@
+"""Functions for the tests of the conformance suite: run its checks, and write modules with defects."""
+
+from pathlib import Path
+
+import pytest
+
+from marsyard.scenarios.conformance import Finding, Subject, check_names, determine_task, run_check
+
+
+def run_suite(spec: str, *checks: str, task: str | None = None, limit_s: float = 60.0) -> dict[str, Finding]:
+    """Run the given checks, or all checks, of an algorithm or part; return the findings by name of the check."""
+    subject = Subject(spec, task or determine_task(spec), limit_s)
+    names = [name for name, _ in check_names(subject)]
+    return {name: run_check(subject, names.index(name)) for name in (checks or names)}
+
+
+def write_module(folder: Path, monkeypatch: pytest.MonkeyPatch, source: str) -> str:
+    """Write a module, make its folder current and return its name, which is unique because Python caches modules."""
+    name = f"bad_{abs(hash(source))}"
+    (folder / f"{name}.py").write_text(source)
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(str(folder))
+    return name
