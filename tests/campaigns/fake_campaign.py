@@ -4,9 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import run_campaign
+from marsyard.campaigns.running.engine import append_cases, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import describe_origin
 from marsyard.campaigns.store.table import read_rows
@@ -88,3 +90,21 @@ def sign_folder(directory: Path) -> None:
 
 def read_case_rows(directory: Path) -> list[dict[str, Any]]:
     return read_rows(directory / "cases.parquet")
+
+
+def campaign_fixture(text: str) -> Any:
+    """Return a fixture that writes a campaign file with this text and returns its path."""
+
+    @pytest.fixture
+    def campaign_path(tmp_path: Path) -> Path:
+        path = tmp_path / "campaign.toml"
+        path.write_text(text)
+        return path
+
+    return campaign_path
+
+
+def continuing_commands(directory: Path, watch: RecordingWatch) -> list[Callable[[], None]]:
+    """Return the commands that continue a campaign: `resume`, and `append` with one case."""
+    executor = ExecutorConfig(1)
+    return [lambda: resume_campaign(directory, executor, watch), lambda: append_cases(directory, 1, executor, watch)]

@@ -7,6 +7,7 @@ import tempfile
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -95,6 +96,16 @@ def inject_faults(parameters: FakeParameters, case: int) -> None:
     arrays = []
     while case in parameters.allocating_cases:
         arrays.append(np.ones(1_000_000))
+
+
+class ScenarioWithoutInputs:
+    """Base of scenarios whose cases share no inputs."""
+
+    def shared_inputs(self, parameters: Any) -> tuple[int, ...]:
+        return ()
+
+    def prepare(self, parameters: Any, shared_input: int) -> None:
+        raise NotImplementedError
 
 
 class FakeScenario:

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from typing import ClassVar
 
-from pydantic import BaseModel
-
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result, run_algorithm
@@ -13,6 +11,7 @@ from marsyard.scenarios.estimators import VELOCITY, Task
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.velocity import velocity_row
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 
 
 class FakeVelocityParameters(AlgorithmSelection):
@@ -21,17 +20,11 @@ class FakeVelocityParameters(AlgorithmSelection):
     algorithm: str = "homography"
 
 
-class FakeVelocityScenario:
+class FakeVelocityScenario(ScenarioWithoutInputs):
     name = "fake-velocity"
     parameters_type = FakeVelocityParameters
     task = VELOCITY
     algorithm_table = ()
-
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """There are no shared inputs."""
 
     def run(self, parameters: FakeVelocityParameters, streams: Streams) -> CaseResult:
         inertial_error_m_s = streams.generator("inertial").normal(size=3)

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from marsyard.scenarios.interface import CaseResult, record_conditions
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 
 #: Case n has the fault with index n modulo the number of faults.
 FAULTS = (
@@ -36,15 +37,9 @@ class SilentError(Exception):
         raise RuntimeError("no message")
 
 
-class HostileScenario:
+class HostileScenario(ScenarioWithoutInputs):
     name = "hostile"
     parameters_type = HostileParameters
-
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: BaseModel, shared_input: int) -> None:
-        """There are no shared inputs."""
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         fault = FAULTS[streams.case % len(FAULTS)]

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,14 @@ from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario, scenario_names
-from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, CampaignFile, RecordingWatch, read_case_rows, run
+from tests.campaigns.fake_campaign import (
+    TOP_LEVEL_KEYS,
+    CampaignFile,
+    RecordingWatch,
+    continuing_commands,
+    read_case_rows,
+    run,
+)
 
 DISPERSION = '[dispersions]\nterrain = {distribution = "integer", low = 0, high = 5}'
 
@@ -181,11 +188,7 @@ def test_changed_input_file_is_detected(finished_campaign: Path, table: Path, wa
     assert list(record.read(finished_campaign)["identity"]["inputs"]) == [str(table)]
     resume_campaign(finished_campaign, ExecutorConfig(1), watch)
     table.write_text("1,2,4\n")
-    commands: tuple[Callable[[], None], ...] = (
-        lambda: resume_campaign(finished_campaign, ExecutorConfig(1), watch),
-        lambda: append_cases(finished_campaign, 1, ExecutorConfig(1), watch),
-    )
-    for command in commands:
+    for command in continuing_commands(finished_campaign, watch):
         with pytest.raises(CampaignError, match=r"Changed:\n  .*table.csv \(\w{12}, now \w{12}\)\nTo continue"):
             command()
     assert replay(finished_campaign, 0).changed[0].startswith(str(table))

@@ -1,7 +1,6 @@
 """Tests of `resume`, `append` and `replay`: added and repeated cases, changed programs and configurations."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,15 @@ from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import folder_lock
-from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run, sign_folder, write_campaign
+from tests.campaigns.fake_campaign import (
+    CampaignFile,
+    RecordingWatch,
+    continuing_commands,
+    read_case_rows,
+    run,
+    sign_folder,
+    write_campaign,
+)
 
 
 @pytest.fixture(scope="module")
@@ -86,11 +93,7 @@ def test_changed_versions_are_rejected_without_allow_changed(
     monkeypatch.setattr("marsyard.campaigns.definition.identity.read_versions", lambda: {**versions, "numpy": "0.9"})
     contents_before = {path: path.read_bytes() for path in finished_campaign.glob("c*.*")}
     message = rf"Changed:\n  numpy \({np.__version__}, now 0.9\)\nTo continue nevertheless.*--allow-changed"
-    commands: tuple[Callable[[], None], ...] = (
-        lambda: resume_campaign(finished_campaign, ExecutorConfig(1), watch),
-        lambda: append_cases(finished_campaign, 2, ExecutorConfig(1), watch),
-    )
-    for command in commands:
+    for command in continuing_commands(finished_campaign, watch):
         with pytest.raises(CampaignError, match=message):
             command()
     assert {path: path.read_bytes() for path in contents_before} == contents_before
@@ -119,11 +122,7 @@ def test_store_of_another_campaign_is_rejected(
 
 def test_locked_folder_is_rejected(finished_campaign: Path, watch: RecordingWatch) -> None:
     with folder_lock(finished_campaign):
-        commands: tuple[Callable[[], None], ...] = (
-            lambda: resume_campaign(finished_campaign, ExecutorConfig(1), watch),
-            lambda: append_cases(finished_campaign, 2, ExecutorConfig(1), watch),
-        )
-        for command in commands:
+        for command in continuing_commands(finished_campaign, watch):
             with pytest.raises(StoreError, match="is in use"):
                 command()
 

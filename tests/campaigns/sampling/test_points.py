@@ -13,6 +13,7 @@ from scipy.stats import norm, spearmanr
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.sampling.dispersion import MAX_FORMULA_LENGTH, parse_formula
 from marsyard.campaigns.sampling.points import Point
+from tests.campaigns.fake_campaign import campaign_fixture
 
 CAMPAIGN = """
 name = "points"
@@ -35,11 +36,7 @@ rank = [[1.0, 0.6], [0.6, 1.0]]
 """
 
 
-@pytest.fixture
-def campaign_path(tmp_path: Path) -> Path:
-    path = tmp_path / "points.toml"
-    path.write_text(CAMPAIGN)
-    return path
+campaign_path = campaign_fixture(CAMPAIGN)
 
 
 def test_points_have_the_distributions_of_the_cases(campaign_path: Path) -> None:

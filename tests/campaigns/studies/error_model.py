@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from marsyard.scenarios.error_sources import ErrorSource
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 
 CAMPAIGN = """
 name = "error-model"
@@ -71,7 +72,7 @@ class ErrorModelParameters(BaseModel):
     refused_fraction: float = 0.0
 
 
-class ErrorModelScenario:
+class ErrorModelScenario(ScenarioWithoutInputs):
     """The error of a case is the column `miss`.
 
     It is ``load + floor_sd f + e_g + e_r + interaction e_g e_r`` with ``e_g = gyro_sd g`` and
@@ -87,12 +88,6 @@ class ErrorModelScenario:
         ErrorSource("radar", "radar", ("radar_sd", "drift")),
         ErrorSource("fan", "fan", ("fan",)),
     )
-
-    def shared_inputs(self, parameters: ErrorModelParameters) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: ErrorModelParameters, shared_input: int) -> None:
-        raise NotImplementedError
 
     def run(self, parameters: ErrorModelParameters, streams: Streams) -> CaseResult:
         p = parameters

@@ -7,6 +7,7 @@ from pydantic import BaseModel, ConfigDict
 
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 
 CAMPAIGN = """
 name = "limit-state"
@@ -60,17 +61,11 @@ class LimitStateParameters(BaseModel):
     step: bool = False
 
 
-class LimitStateScenario:
+class LimitStateScenario(ScenarioWithoutInputs):
     """A violation of LOAD has the probability Phi(-beta) for any `noise`; Phi is the standard normal distribution."""
 
     name = "limit-state"
     parameters_type = LimitStateParameters
-
-    def shared_inputs(self, parameters: LimitStateParameters) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: LimitStateParameters, shared_input: int) -> None:
-        raise NotImplementedError
 
     def run(self, parameters: LimitStateParameters, streams: Streams) -> CaseResult:
         time.sleep(parameters.sleep_s)

@@ -4,6 +4,7 @@ from pydantic import BaseModel, ConfigDict
 
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
+from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 
 CAMPAIGN = """
 name = "planted-defect"
@@ -50,7 +51,7 @@ class PlantedDefectParameters(BaseModel):
     blur_px: float = 0.3
 
 
-class PlantedDefectScenario:
+class PlantedDefectScenario(ScenarioWithoutInputs):
     """Errors above 5 m/s occur only if the sun is below 15 deg and the yaw is within 10 deg of 90 deg.
 
     The error increases towards this region.
@@ -58,12 +59,6 @@ class PlantedDefectScenario:
 
     name = "planted-defect"
     parameters_type = PlantedDefectParameters
-
-    def shared_inputs(self, parameters: PlantedDefectParameters) -> tuple[int, ...]:
-        return ()
-
-    def prepare(self, parameters: PlantedDefectParameters, shared_input: int) -> None:
-        raise NotImplementedError
 
     def run(self, parameters: PlantedDefectParameters, streams: Streams) -> CaseResult:
         noise = abs(float(streams.generator("noise").normal(scale=0.5)))

@@ -27,18 +27,14 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
 from marsyard.scenarios.error_sources import ErrorSource, error_sources
 from marsyard.scenarios.systems import scenario_names
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
+from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read_case_rows
 from tests.campaigns.studies.error_model import CAMPAIGN
 from tests.campaigns.studies.killing import kill_and_resume
 
 SETTINGS = BudgetSettings("ERROR", cases=200)
 
 
-@pytest.fixture
-def campaign_path(tmp_path: Path) -> Path:
-    path = tmp_path / "error-model.toml"
-    path.write_text(CAMPAIGN)
-    return path
+campaign_path = campaign_fixture(CAMPAIGN)
 
 
 def run_budget(path: Path, directory: Path, settings: BudgetSettings, *overrides: str) -> BudgetResult:

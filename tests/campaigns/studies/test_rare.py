@@ -19,7 +19,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.decision import Basis, RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
 from marsyard.reports.evaluation import evaluate_run
-from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
+from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
 
@@ -29,11 +29,7 @@ SETTINGS = RareSettings("LOAD", 5e-2, samples=100, replicates=(4,), random_cases
 TIMES = ("wall_time_s", "cpu_time_s")
 
 
-@pytest.fixture
-def campaign_path(tmp_path: Path) -> Path:
-    path = tmp_path / "limit-state.toml"
-    path.write_text(CAMPAIGN)
-    return path
+campaign_path = campaign_fixture(CAMPAIGN)
 
 
 def run_study(

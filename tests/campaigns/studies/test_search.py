@@ -19,17 +19,12 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.rare import continue_rare
 from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
 from marsyard.campaigns.studies.search import SearchResult, SearchSettings, SearchStudy, start_search
-from tests.campaigns.fake_campaign import RecordingWatch
+from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture
 from tests.campaigns.studies import limit_state
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.planted_defect import CAMPAIGN
 
-
-@pytest.fixture
-def campaign_path(tmp_path: Path) -> Path:
-    path = tmp_path / "planted-defect.toml"
-    path.write_text(CAMPAIGN)
-    return path
+campaign_path = campaign_fixture(CAMPAIGN)
 
 
 def run_search(
