@@ -1,5 +1,7 @@
 """Fast scenarios without terrain and rendering for the tests of campaigns; parameters select the failing cases."""
 
+from __future__ import annotations
+
 import os
 import re
 import signal
