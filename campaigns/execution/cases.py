@@ -56,10 +56,12 @@ def configuration_text(configuration: CampaignConfiguration) -> str:
 def _load_campaign(configuration: str) -> Campaign:
     """Create the campaign of a configuration text; the result is cached because loading is slow."""
     campaign_configuration = CampaignConfiguration.model_validate_json(configuration)
-    selected_scenario = scenario(campaign_configuration.scenario)
+    campaign = Campaign(campaign_configuration, scenario(campaign_configuration.scenario))
+    with suppress(ValueError):  # imports and constructs custom parts; the case reports an error
+        campaign.base_parameters()
     worker_process.limit_threads()
     worker_process.accept_process_state()
-    return Campaign(campaign_configuration, selected_scenario)
+    return campaign
 
 
 def create_loader(configuration: CampaignConfiguration) -> Callable[[], object]:

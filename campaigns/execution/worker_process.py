@@ -25,8 +25,6 @@ from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervis
 Result = TypeVar("Result")
 #: Linux's `oom_score_adj` of a worker (at most 1000): if memory runs out, workers are killed before their parent.
 _OOM_SCORE = 800
-#: Maximum duration, seconds, of a group of items after which the process state is checked once; a check takes 0.1 ms.
-_MAX_GROUP_DURATION_S = 0.005
 #: Exit status of a worker after an item closed file descriptors that the worker needs.
 FILES_CLOSED = 97
 #: Layout of the status board: item, or `_NO_ITEM` between items.
@@ -99,13 +97,11 @@ class BatchResult(Generic[Result]):
     """Results of a batch.
 
     - seconds: duration; results: results of the finished items; not_started: items that were not started
-    - to_isolate: items that must run again one by one, since one item of their group changed the process state
     - must_replace: whether the process must be replaced before the next item
     """
 
     seconds: float
     results: list[TaskResult[Result]]
-    to_isolate: Sequence[int] = ()
     not_started: Sequence[int] = ()
     must_replace: bool = False
 
@@ -150,7 +146,6 @@ class _WorkerContext:
     - trace: file of the stack trace
     - output, note: descriptors of the output file, and of the shared memory of the task's note
     - item, crashed: latest item, and whether it requested a fresh worker
-    - checks_each_item: whether the state is checked after each item, since an earlier item of a group changed it
     - files: open descriptors that an item must not close, with their identities
     """
 
@@ -161,7 +156,6 @@ class _WorkerContext:
     files: Mapping[int, process_state.FileIdentity]
     item: int | None = None
     state: process_state.ProcessState = field(default_factory=process_state.ProcessState)
-    checks_each_item: bool = False
     crashed: bool = False
 
 
@@ -216,47 +210,32 @@ def load_task(_task: Callable[[int], object], load: Callable[[], object] | None,
 def run_batch(task: Callable[[int], Result], items: Sequence[int]) -> BatchResult[Result]:
     """Run a task on each item, until all are finished or the process must be replaced.
 
-    After each item, the process state is compared with its reference. Items of some milliseconds are checked in groups;
-    if a group has changed the state, its items run again one by one.
+    The process must be replaced if an item changed its state (`ProcessState`), or requested it.
     """
-    start_s = checked_s = time.perf_counter()
+    start_s = time.perf_counter()
     results: list[TaskResult[Result]] = []
-    group: list[TaskResult[Result]] = []
-    for index, item in enumerate(items):
-        if not group:
-            process_state.seed_generators(item)
-        group.append(_run_item(task, item))
-        must_check = _context is not None and (_context.checks_each_item or _context.crashed)
-        if not must_check and index + 1 < len(items) and time.perf_counter() - checked_s <= _MAX_GROUP_DURATION_S:
-            continue
-        must_replace, changed = _check_state([result.item for result in group])
-        if changed is None:
-            to_isolate = [result.item for result in group]
-            return BatchResult(time.perf_counter() - start_s, results, to_isolate, items[index + 1 :], must_replace)
-        results += [replace(group[0], changed=changed)] if changed else group
-        if must_replace:
-            return BatchResult(time.perf_counter() - start_s, results, (), items[index + 1 :], must_replace)
-        group, checked_s = [], time.perf_counter()
+    for item in items:
+        process_state.seed_generators(item)
+        result = _run_item(task, item)
+        changed = _list_changes()
+        results.append(replace(result, changed=changed))
+        if changed or result.crashed:
+            not_started = items[len(results) :]
+            return BatchResult(time.perf_counter() - start_s, results, not_started, must_replace=True)
     if _context is not None:
         _context.board.write(None)
     return BatchResult(time.perf_counter() - start_s, results)
 
 
-def _check_state(group: Sequence[int]) -> tuple[bool, tuple[str, ...] | None]:
-    """Check the process after items; return whether to replace it, and its changes (None if their item is unknown)."""
+def _list_changes() -> tuple[str, ...]:
+    """List the changes of the process state by an item; end the process if the item closed the worker's files."""
     if _context is None:
-        return False, ()
+        return ()
     if any(process_state.file_identity(number) != identity for number, identity in _context.files.items()):
         # results can no longer be sent; the parent identifies the item by the status board
         _context.trace.write_text("Fatal: the files that the worker process needs were closed\n")
         os._exit(FILES_CLOSED)
-    restored, unrestorable = _context.state.restore()
-    must_replace = bool(unrestorable) or _context.crashed
-    names = (*restored, *unrestorable)
-    if len(group) > 1 and (names or process_state.generators_were_used(group[0])):
-        _context.checks_each_item = True
-        return must_replace, None
-    return must_replace, names
+    return _context.state.list_changes()
 
 
 def _run_item(task: Callable[[int], Result], item: int) -> TaskResult[Result]:

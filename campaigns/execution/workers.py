@@ -158,7 +158,6 @@ class _WorkProgress:
 
     def _handle_batch_result(self, worker: MonitoredWorker, batch_result: BatchResult[Any]) -> list[TaskResult[Any]]:
         """Return the final results of a batch; an item that crashed after others runs again in a fresh process."""
-        self._retries.extend([item] for item in batch_result.to_isolate)
         if batch_result.not_started:
             self._retries.append(list(batch_result.not_started))
         if batch_result.results:

@@ -89,7 +89,7 @@ def test_conformance_reports_changed_process_state(tmp_path: Path, monkeypatch: 
     assert "child processes that are still running (python)" in result.output
     assert "threads that are still running (Thread-" in result.output
     assert "to fix: restore the state before returning" in result.output
-    assert "6 of 9 checks passed" in result.output
+    assert "7 of 10 checks passed" in result.output
 
 
 def test_conformance_is_printed_as_json() -> None:

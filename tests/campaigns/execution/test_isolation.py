@@ -203,7 +203,6 @@ STATE_CHANGES = {
     "sys.path": lambda: sys.path.insert(0, "/nowhere"),
     "the warning filters": lambda: warnings.simplefilter("ignore"),
     "NumPy's error handling (numpy.seterr)": lambda: np.seterr(all="ignore"),
-    "the file mode mask (umask)": lambda: os.umask(0o077),
     "the recursion limit": lambda: sys.setrecursionlimit(2345),
     "OpenCV's settings (optimised code, threads)": lambda: __import__("cv2").setUseOptimized(False),
     # 0x800 and 0x400 are upwards and downwards on x86; 0x400000 is on ARM
@@ -235,22 +234,20 @@ def read_state() -> tuple[object, ...]:
     )
 
 
-def read_and_change_state(sleep_s: float, item: int) -> object:
+def read_and_change_state(item: int) -> object:
     """Return the process state; odd items then change one part of it."""
     process_state = read_state()
     if item % 2:
         changes: list[Any] = list(STATE_CHANGES.values())
         changes[item // 2]()
-    time.sleep(sleep_s)
     # values of environment variables depend on the worker's folder; compare their names
     return item, [part for part in process_state if not isinstance(part, dict)], sorted(set(process_state[1]))  # type: ignore[call-overload]
 
 
-@pytest.mark.parametrize("sleep_s", [0.01, pytest.param(0.0, marks=pytest.mark.slow)])
-def test_changed_process_state_is_restored_for_the_next_case(sleep_s: float) -> None:
-    """The state is also restored between short cases (0 s), which run in one batch."""
+@pytest.mark.slow
+def test_next_case_has_the_state_of_a_fresh_worker() -> None:
     n_items = 2 * len(STATE_CHANGES)
-    run_results = run_items(partial(read_and_change_state, sleep_s), range(n_items))
+    run_results = run_items(read_and_change_state, range(n_items))
     results: list[Any] = [run_results[item].result for item in range(n_items)]
     # the last two entries are random numbers: they depend on the case, not on the worker
     assert len({str((result[1][:-2], result[2])) for result in results}) == 1
@@ -258,27 +255,30 @@ def test_changed_process_state_is_restored_for_the_next_case(sleep_s: float) -> 
     for position, name in enumerate(STATE_CHANGES):
         assert run_results[2 * position].changed == ()
         assert run_results[2 * position + 1].changed == (name,)
-    single_result: Any = run_items(partial(read_and_change_state, 0.01), [5])[5].result
+    single_result: Any = run_items(read_and_change_state, [5])[5].result
     assert results[5][1][-2:] == single_result[1][-2:]
 
 
 def change_environment(folder: Path, item: int) -> tuple[str | None, ...]:
-    """Return environment variables; the first case then changes them, directly and by importing a module."""
+    """Return environment variables; item 0 then imports a module that sets one, and item 1 changes two."""
     variables = (os.environ.get("SET_BY_MODULE"), os.environ.get("SET_BY_CASE"), os.environ.get("HOME"))
     if item == 0:
-        os.environ["SET_BY_CASE"] = "1"
-        sys.path.append(str(folder))
+        sys.path.insert(0, str(folder))
         __import__("changes_environment")
+        sys.path.remove(str(folder))
+    elif item == 1:
+        os.environ["SET_BY_CASE"] = "1"
         del os.environ["HOME"]
     return variables
 
 
-def test_environment_is_restored_after_import_in_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_import_in_a_case_is_no_change_by_the_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/somewhere")
     (tmp_path / "changes_environment.py").write_text("import os\nos.environ['SET_BY_MODULE'] = 'yes'\n")
     results = run_items(partial(change_environment, tmp_path), range(3))
-    assert results[0].changed == ("environment variables", "sys.path")
-    assert [results[item].result for item in (1, 2)] == [("yes", None, "/somewhere")] * 2
+    assert [results[item].changed for item in range(3)] == [(), ("environment variables",), ()]
+    # item 1 runs in the worker of item 0, and item 2 in a fresh one, which has not imported the module
+    assert [results[item].result for item in (1, 2)] == [("yes", None, "/somewhere"), (None, None, "/somewhere")]
 
 
 def crash_after_other_case(item: int) -> int:
