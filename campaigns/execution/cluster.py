@@ -6,8 +6,8 @@ exhausts memory or kills its process therefore affects only that process.
 
 If a Dask worker itself is lost, Dask sends its batches to other workers. If a batch was lost with several workers
 (Dask's `allowed-failures`, by default 3), it is divided into single cases; a case that is lost again in this way counts
-as crashed. Workers may join and leave at any time. If the scheduler is restarted at the same address, the executor
-connects again and submits all unfinished batches again.
+as crashed. Workers may join and leave at any time. If the scheduler is restarted at the same address, Dask's client
+connects again and cancels all unfinished batches; the executor submits them again.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from marsyard.campaigns.execution.workers import LocalExecutor
 Result = TypeVar("Result")
 #: Prefix of the address of a new cluster on this machine.
 _LOCAL_PREFIX = "local:"
-#: Seconds to wait for a scheduler at the start, for a scheduler that is restarted, and for a cluster without workers:
-#: a batch system may start them only after submission.
-_TIMEOUT_S, _RESTART_S, _NO_WORKERS_S = 30, 600, 3600
+#: Seconds to wait for a scheduler, at the start and if it is restarted, and for a cluster without workers: a batch
+#: system may start them only after submission.
+_TIMEOUT_S, _NO_WORKERS_S = 60, 3600
 #: Time between two requests for the list of workers, and between two checks for finished batches, s.
 _REFRESH_S, _POLL_S = 10.0, 0.02
 #: Batches queued at each Dask worker, so that no worker waits for the network.
@@ -84,7 +84,7 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
                     # Check the address first. Dask does not close a client with an invalid address; its later garbage
                     # collection can block the next client for 10 s.
                     distributed.comm.get_address_host_port(address)
-                self._client = self._connect()
+                self._client = distributed.Client(self._cluster or address, timeout=_TIMEOUT_S, set_as_default=False)
             except (OSError, ValueError, ImportError) as error:
                 raise CampaignError(f"--cluster {address}: no scheduler responds: {error}") from error
             stack.callback(self._disconnect)
@@ -92,9 +92,6 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
-
-    def _connect(self) -> Any:
-        return self._distributed.Client(self._cluster or self._address, timeout=_TIMEOUT_S, set_as_default=False)
 
     def _disconnect(self) -> None:
         with suppress(OSError, TimeoutError):
@@ -114,28 +111,15 @@ class ClusterExecutor(AbstractContextManager["ClusterExecutor"]):
 
     def cancel(self, futures: Sequence[Any]) -> None:
         """Cancel futures; without a scheduler there are none."""
-        if self.is_connected:
+        if self._client.status == "running":
             self._client.cancel(futures)
 
-    @property
     def is_connected(self) -> bool:
-        """Whether the scheduler is connected."""
+        """Whether the scheduler is connected. Raises CampaignError if it was lost, and did not return in time."""
+        if self._client.status == "closed":
+            hint = "the finished cases are stored, `marsyard resume` continues"
+            raise CampaignError(f"--cluster {self._address}: the scheduler is lost; {hint}")
         return bool(self._client.status == "running")
-
-    def reconnect(self) -> None:
-        """Wait for the scheduler and connect again. Raises CampaignError if it does not respond in time."""
-        self._disconnect()
-        deadline_s = time.monotonic() + _RESTART_S
-        while True:
-            try:
-                self._client = self._connect()
-            except (OSError, ValueError) as error:
-                if time.monotonic() > deadline_s:
-                    hint = "the finished cases are stored, `marsyard resume` continues"
-                    raise CampaignError(f"--cluster {self._address}: the scheduler is lost: {error}; {hint}") from error
-                time.sleep(1.0)
-            else:
-                return
 
     def count_threads(self) -> tuple[int, int]:
         """Return the number of threads of all workers, and the largest number of threads on one machine.
@@ -180,8 +164,6 @@ class _BatchQueue:
         self._repeated: deque[Sequence[int]] = deque()
         self._abandoned: Counter[int] = Counter()
         self._futures: dict[Any, Sequence[int]] = {}
-        if not cluster.is_connected:
-            cluster.reconnect()
         self._completed = cluster.create_queue()
         self._threads, self._executors = 0, 1
         self._refreshed_s = self._with_workers_s = time.monotonic()
@@ -206,8 +188,6 @@ class _BatchQueue:
 
     def _fill(self) -> None:
         """Submit batches until the queue is full; lost batches first."""
-        if not self._cluster.is_connected:
-            self._submit_again()
         while len(self._futures) < _QUEUED_BATCHES * max(self._threads, 1):
             batch = self._repeated.popleft() if self._repeated else self._batches.next()
             if not batch:
@@ -217,12 +197,9 @@ class _BatchQueue:
             self._completed.add(future)
 
     def _next_future(self) -> Any:
-        """Wait for a finished future; None if the queue changed instead: new workers, or a restarted scheduler."""
+        """Wait for a finished future; None if the number of workers was updated instead."""
         while not self._completed.has_ready():
-            if not self._cluster.is_connected:
-                self._submit_again()
-                return None
-            if time.monotonic() - self._refreshed_s > _REFRESH_S:
+            if self._cluster.is_connected() and time.monotonic() - self._refreshed_s > _REFRESH_S:
                 self._refresh()
                 return None
             time.sleep(_POLL_S)
@@ -237,14 +214,6 @@ class _BatchQueue:
             self._with_workers_s = self._refreshed_s
         elif self._refreshed_s - self._with_workers_s > _NO_WORKERS_S:
             raise CampaignError(f"the cluster has had no workers for {_NO_WORKERS_S / 60:.0f} minutes")
-
-    def _submit_again(self) -> None:
-        """Connect to the restarted scheduler; all unfinished batches are submitted again."""
-        self._cluster.reconnect()
-        self._completed = self._cluster.create_queue()
-        self._repeated.extend(self._futures.values())
-        self._futures.clear()
-        self._refresh()
 
     def _collect(self, future: Any, batch: Sequence[int]) -> list[TaskResult[Any]]:
         """Return the results of a batch; empty if it was lost and is queued again.
