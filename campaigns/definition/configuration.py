@@ -135,13 +135,8 @@ class CalibrationRun(Parameters):
 
 
 class Calibration(Parameters):
-    """Results that determined options of the algorithm; results on the same campaign and seed cannot be PASS.
+    """Results that determined options of the algorithm; results on the same campaign and seed cannot be PASS."""
 
-    `namespace` has no effect, since the seeds of confirmations follow from their content; files of earlier versions
-    contain it.
-    """
-
-    namespace: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)] = "confirmation"
     runs: Annotated[tuple[CalibrationRun, ...], Field(strict=False)] = ()
 
 

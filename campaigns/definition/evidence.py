@@ -109,7 +109,7 @@ class Evidence:
 
     @classmethod
     def read(cls, stored: object) -> Self:
-        """Read from the record of a run; runs of earlier versions are explorations."""
+        """Read from the record of a run; without a valid entry it is an exploration."""
         if not isinstance(stored, Mapping):
             return cls()
         names = ("number", "claim", "record", "registration", "overlap", "imported_terrain")

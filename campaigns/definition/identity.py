@@ -49,30 +49,27 @@ class Identity:
     - configuration: hash of the keys that determine the cases
     - code: hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of custom code
     - versions: versions of Python, Marsyard and the packages that Marsyard requires
-    - inputs: hashes of the parameters' input files, by path as in the parameters; missing files are omitted. None for a
-      record of an earlier version without hashes, so that changes of the files are unknown
+    - inputs: hashes of the parameters' input files, by path as in the parameters; missing files are omitted
     """
 
     configuration: str
     code: str
     versions: Mapping[str, str]
-    inputs: Mapping[str, str] | None = None
+    inputs: Mapping[str, str]
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> Self:
         """Read an identity from a record."""
-        inputs = None if stored.get("inputs") is None else dict(stored["inputs"])
-        return cls(str(stored["configuration"]), str(stored["code"]), dict(stored["versions"]), inputs)
+        versions, inputs = dict(stored["versions"]), dict(stored["inputs"])
+        return cls(str(stored["configuration"]), str(stored["code"]), versions, inputs)
 
     def differences(self, other: Identity) -> list[str]:
         """Describe the differences from another identity, each in a few words."""
         pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("configuration", "code")}
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
-        old_inputs, new_inputs = self.inputs or {}, other.inputs or {}
-        pairs.update(
-            {name: (old_inputs[name][:12], new_inputs[name][:12]) for name in sorted({*old_inputs} & {*new_inputs})}
-        )
+        common_names = sorted({*self.inputs} & {*other.inputs})
+        pairs.update({name: (self.inputs[name][:12], other.inputs[name][:12]) for name in common_names})
         return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 

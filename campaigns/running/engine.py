@@ -197,9 +197,6 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
     """Run the missing cases of a stored campaign, and cases with the outcomes in `retry` again."""
     campaign, directory, observer = run.campaign, run.directory, run.observer
     configuration, stored = campaign.configuration, record.read(directory)
-    if "identity" not in stored:
-        reason = "was run by an earlier version, which stored no rows to continue from"
-        raise StoreError(f"{directory} {reason}; run it again")
     previous, identity = Identity.read(stored["identity"]), create_identity(configuration)
     changes = previous.differences(identity)
     if changes and not allow_changed:
@@ -208,9 +205,6 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
             f"{directory} was run with another program, configuration or input files; rows would not be comparable. "
             f"Changed:\n  {changes_text}\nTo continue nevertheless, with a note in the record: --allow-changed"
         )
-    if previous.inputs is None and identity.inputs:
-        files = ", ".join(identity.inputs)
-        observer.note(f"no hash is stored for these files, so earlier changes are unknown: {files}")
     check_rows(directory)
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         if store.about.get("identity") != stored["identity"]["configuration"] and not stored["changes"]:
@@ -232,7 +226,6 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
         if changes:
             updates["changes"] = [*stored["changes"], {"utc": record.utc_now(), "cases_before": count, "in": changes}]
             updates["algorithms"] = describe_algorithms(campaign)
-        if changes or previous.inputs is None:
             updates["identity"] = asdict(identity)
         updates.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
         record.update(directory, updates)

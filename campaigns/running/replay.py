@@ -65,8 +65,7 @@ def replay(directory: Path, case: int) -> Replay:
     load_stored_campaign(directory, configuration)
     check_rows(directory)
     stored = stored_row(directory, case)
-    identity = record.read(directory).get("identity")
-    changed = Identity.read(identity).differences(create_identity(configuration)) if identity else []
+    changed = Identity.read(record.read(directory)["identity"]).differences(create_identity(configuration))
     if stored is None and configuration.design.kind == ADAPTIVE:
         raise CampaignError(f"{directory}: the study has not run case {case}")
     with LocalExecutor(1) as workers:

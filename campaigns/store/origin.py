@@ -17,7 +17,7 @@ from marsyard.campaigns.definition.identity import custom_sources, hash_sources,
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.key import is_signature, sign
-from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, StoreVersionError, readable_store
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, readable_store
 from marsyard.scenarios.imports import search_current_folder
 from marsyard.scenarios.offline import is_offline
 
@@ -42,19 +42,16 @@ def check_origin(directory: Path, configuration: CampaignConfiguration) -> None:
 
 
 def check_rows(directory: Path) -> str:
-    """Verify the rows of a campaign; return the reason if they have no chain of hashes, otherwise an empty text.
+    """Verify the rows of a campaign; return the reason if there is only their table, otherwise an empty text.
 
     Raises StoreError if a row was changed after it was stored, or rows of a folder of this user are not signed by it.
     """
     path = directory / ROWS_FILE
     if not path.exists():
         return f"{directory} has no {ROWS_FILE}"
-    try:
-        with readable_store(path) as store:
-            store.verify()
-            is_signed = store.is_signed
-    except StoreVersionError as error:
-        return f"{path} has version {error.version}, without a chain of hashes"
+    with readable_store(path) as store:
+        store.verify()
+        is_signed = store.is_signed
     if not is_signed and _is_own_folder(directory):
         raise StoreError(
             f"{path} was written by another user or program than {record.RECORD_FILE}, which you created: its rows may "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -22,6 +21,7 @@ from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 from marsyard.sim.cache import hide_folders
+from marsyard.sim.kernel_cache import processor_features
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
@@ -174,16 +174,15 @@ def read(directory: Path) -> dict[str, Any]:
         raise StoreError(f"{path} is damaged: {error}") from error
     if schema != SCHEMA:
         raise StoreError(f"{path} has schema {schema}; this version of Marsyard reads {SCHEMA}")
-    # records of earlier versions have no identity and fewer keys; reports can still be created for them
-    required_keys = _KEY_TYPES if "identity" in record else ("name", "state", "cases", "configuration")
-    problems = [f"it has no {key}" for key in required_keys if key not in record]
+    problems = [f"it has no {key}" for key in _KEY_TYPES if key not in record]
     for key, (kind, type_text) in _KEY_TYPES.items():
         if key in record and (not isinstance(record[key], kind) or isinstance(record[key], bool)):
             problems.append(f"{key} is not {type_text}")
-    if not problems and "identity" in record:
+    if not problems:
         identity, sessions = record["identity"], record["sessions"]
-        if not isinstance(identity.get("versions"), dict) or not {"configuration", "code"} <= set(identity):
-            problems.append("identity has no configuration, code or versions")
+        has_tables = all(isinstance(identity.get(key), dict) for key in ("versions", "inputs"))
+        if not has_tables or not {"configuration", "code"} <= set(identity):
+            problems.append("identity has no configuration, code, versions or inputs")
         if not sessions or not isinstance(sessions[-1], dict):
             problems.append("sessions is empty")
     if problems:
@@ -227,13 +226,11 @@ def describe_machine() -> dict[str, Any]:
     except OSError:
         text = ""
     model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
-    features = re.search(r"^(?:flags|Features)\s*:\s*(.*)$", text, re.MULTILINE)
-    sorted_features = " ".join(sorted(features[1].split())) if features else ""
     return {
         "python": platform.python_version(),
         "implementation": platform.python_implementation(),
         "platform": platform.platform(),
         "machine": platform.machine(),
         "processor": model[1] if model else platform.processor(),
-        "processor_features": hashlib.sha256(sorted_features.encode()).hexdigest()[:16] if sorted_features else None,
+        "processor_features": processor_features(),
     }

@@ -62,14 +62,6 @@ def create_store(path: Path, about: Mapping[str, str]) -> None:
         raise StoreError(f"{path} cannot be written: {error}") from error
 
 
-class StoreVersionError(StoreError):
-    """A store of another version of Marsyard; `version` is that of the store."""
-
-    def __init__(self, path: Path, version: int) -> None:
-        super().__init__(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
-        self.version = version
-
-
 class RowStore(AbstractContextManager["RowStore"]):
     """Rows of a campaign, as a context.
 
@@ -95,7 +87,7 @@ class RowStore(AbstractContextManager["RowStore"]):
             if application != _APPLICATION_ID:
                 raise StoreError(f"{path} is damaged, or is not a store of this version: wrong application id")
             if version != STORE_VERSION:
-                raise StoreVersionError(path, version)
+                raise StoreError(f"{path} has version {version}; this version of Marsyard reads {STORE_VERSION}")
             problems = [text for (text,) in execute("PRAGMA quick_check(1)")] if thorough else ["ok"]
             if problems != ["ok"]:
                 raise StoreError(f"{path} is damaged: {' '.join(problems)}; nothing was written to it")

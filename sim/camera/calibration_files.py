@@ -44,11 +44,6 @@ _ISD_NAMES = (
     *(b'"name_model"', b'"m_modelName"', b'"isis_camera_version"', b'"name_sensor"', b"USGS_ASTRO"),
     *(b'"image_lines"', b'"detector_sample_summing"', b'"center_ephemeris_time"', b'"body_rotation"'),
 )
-#: Names of which a CSM ISD (image support data in JSON) contains at least one.
-_ISD_NAMES = (
-    *(b'"name_model"', b'"m_modelName"', b'"isis_camera_version"', b'"name_sensor"', b"USGS_ASTRO"),
-    *(b'"image_lines"', b'"detector_sample_summing"', b'"center_ephemeris_time"', b'"body_rotation"'),
-)
 _ASSIGNMENT = re.compile(r"^\s*(?P<name>\w+)\s*=\s*(?P<value>.*?)\s*$")
 
 

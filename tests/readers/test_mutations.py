@@ -174,7 +174,7 @@ def _write_record(path: Path) -> None:
         "schema": record.SCHEMA, "name": "fake", "state": "finished", "cases": 12, "cases_finished": 12,
         "cases_crashed": 0, "requirements": [], "sessions": [{"environment": environment}], "changes": [],
         "configuration": configuration.model_dump(mode="json"), "environment": environment,
-        "identity": {"configuration": "1", "code": "2", "versions": {}},
+        "identity": {"configuration": "1", "code": "2", "versions": {}, "inputs": {}},
     }  # fmt: skip
     path.write_text(json.dumps(contents, indent=1))
 

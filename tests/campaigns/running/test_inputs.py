@@ -198,20 +198,6 @@ def test_changed_input_file_is_detected(finished_campaign: Path, table: Path, wa
     append_cases(finished_campaign, 1, ExecutorConfig(1), watch)
 
 
-def test_missing_input_hashes_are_added_when_a_campaign_continues(
-    finished_campaign: Path, table: Path, watch: RecordingWatch
-) -> None:
-    stored_record = json.loads((finished_campaign / "campaign.json").read_text())
-    del stored_record["identity"]["inputs"]
-    (finished_campaign / "campaign.json").write_text(json.dumps(stored_record))
-    append_cases(finished_campaign, 1, ExecutorConfig(1), watch)
-    assert any("table.csv" in note and "no hash is stored" in note for note in watch.notes)
-    assert record.read(finished_campaign)["identity"]["inputs"]
-    table.write_text("other\n")
-    with pytest.raises(CampaignError, match=r"table\.csv"):
-        resume_campaign(finished_campaign, ExecutorConfig(1), watch)
-
-
 def test_dispersed_input_files_belong_to_the_identity(campaign_file: CampaignFile, tmp_path: Path, table: Path) -> None:
     second_table = tmp_path / "second.csv"
     second_table.write_text("4,5,6\n")

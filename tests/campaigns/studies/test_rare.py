@@ -206,7 +206,7 @@ def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Pa
 
 def test_verdict_on_a_calibration_seed_cannot_be_pass(campaign_path: Path, tmp_path: Path) -> None:
     run = '[[calibration.runs]]\noptions = ["beta"]\ncampaign = "limit-state"\nseed = 3'
-    campaign_path.write_text(f'{CAMPAIGN}\n[calibration]\nnamespace = "test"\n\n{run}\n')
+    campaign_path.write_text(f"{CAMPAIGN}\n[calibration]\n\n{run}\n")
     result = run_study(campaign_path, tmp_path / "run")
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert result.decision.reason.startswith("The verdict would be PASS. Calibrated on these cases")
