@@ -82,9 +82,12 @@ class Subject:
         return estimators.EstimatorSuite(create, self.spec, is_program, self.limit_s, protocol)
 
     def prepare(self) -> None:
-        """Check that the algorithm or part exists, and create the inputs of its suite."""
+        """Check that the algorithm or part exists, import it, and create the inputs of its suite."""
         check_subject(self.spec, self.task)
-        self.suite().cases()
+        suite = self.suite()
+        suite.cases()
+        if ":" in self.spec and suite.make_remote is not None:
+            import_object(self.spec)
 
 
 def check_subject(spec: str, task: str) -> None:

@@ -149,6 +149,11 @@ def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, An
         "versions": {"marsyard": "0.1.0", "numpy": "2.4.0", "scipy": "1.17.0"},
         "git_commit": "0123456789abcdef0123456789abcdef01234567",
         "environment": {"python": "3.11.7", "platform": "Linux", "processor": "synthetic"},
+        "cases_finished": len(frame),
+        "cases_crashed": 0,
+        "sessions": [{"command": "run"}],
+        "changes": [],
+        "identity": {"configuration": "a", "code": "b", "versions": {}, "inputs": {}},
     }
 
 

@@ -55,6 +55,7 @@ def test_run_killed_at_its_start_can_be_restarted(
         ("sessions", [], "sessions is empty"),
         ("identity", "abc", "identity is not a table"),
         ("identity", {"configuration": "a"}, "identity has no"),
+        ("identity", {"configuration": "a", "code": "b", "versions": {}}, "identity has no .* or inputs"),
         ("environment", 3, "environment is not a table"),
         ("configuration", [], "configuration is not a table"),
         ("changes", None, "changes is not a list"),
