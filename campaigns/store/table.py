@@ -152,6 +152,8 @@ def refresh_table(directory: Path) -> None:
 
     Raises StoreError if a row was changed after it was stored, or the table is not writable.
     """
+    if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
+        return  # a folder of which only the table was copied
     requirements = stored_configuration(directory).requirements
     check_rows(directory)
     with RowStore(directory / ROWS_FILE) as store:
