@@ -1,6 +1,5 @@
 """Tests of the inputs of a campaign: shared inputs such as terrains, hashes of input files, estimated cost."""
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
