@@ -36,7 +36,9 @@ from tests.scenarios import spies
 
 #: The first case runs in the suite, the other ones in `make validate`.
 CASES = [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-RECORDING_SCORE = {"scores": ["tests.scenarios.spies:record_case"]}
+#: The algorithm runs in this process, so that it records its inputs here.
+IN_PROCESS: dict[str, Any] = {"executable": {"isolated": False}}
+RECORDING_SCORE = {"scores": ["tests.scenarios.spies:record_case"], **IN_PROCESS}
 
 Numbers = Float[np.ndarray, "..."]
 
@@ -195,7 +197,9 @@ def test_rover_inputs_differ_from_truth(case: int) -> None:
     """The first stop is not compared: the estimated pose is defined as exact at the start."""
     from tests.scenarios.rover.short_run import SHORT_RUN
 
-    parameters = RoverScenarioParameters.model_validate({**SHORT_RUN, "algorithm": "tests.scenarios.spies:TrackerSpy"})
+    parameters = RoverScenarioParameters.model_validate(
+        {**SHORT_RUN, **IN_PROCESS, "algorithm": "tests.scenarios.spies:TrackerSpy"}
+    )
     run = run_case(parameters, Streams(1, "truth", case))
     aim_calls = [entry for entry in spies.RECORDED_INPUTS if isinstance(entry, tuple)]
     updates = [entry for entry in spies.RECORDED_INPUTS if isinstance(entry, RoverMeasurements)]

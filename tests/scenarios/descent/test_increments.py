@@ -128,11 +128,13 @@ def test_other_rates_are_rejected(rate_hz: float) -> None:
 
 def test_increments_arrive_in_order_and_change_no_other_measurement() -> None:
     """Two descents with the same images: one without increments, one with increments at 100 Hz."""
-    without = run_descent(algorithm=RECORDER, images=2)
+    # in this process, so that the estimator records its measurements here
+    settings: dict[str, Any] = {"algorithm": RECORDER, "images": 2, "executable": {"isolated": False}}
+    without = run_descent(**settings)
     frames = [event for event in EVENTS if isinstance(event, DescentFrame)]
     assert len(EVENTS) == len(frames) == 2
     EVENTS.clear()
-    with_increments = run_descent(algorithm=RECORDER, images=2, inertial={"rate_hz": 100.0})
+    with_increments = run_descent(**settings, inertial={"rate_hz": 100.0})
     assert with_increments.outcome == "VALID"
     assert with_increments.row["image_hash"] == without.row["image_hash"]
     assert differing_columns(dict(without.row), dict(with_increments.row)) == ()

@@ -115,7 +115,10 @@ def test_terrain_and_files_of_a_wrong_size_are_rejected(tmp_path: Path) -> None:
     cases: list[tuple[dict[str, Any], str]] = [
         (_settings(source, terrain={**TERRAIN, "samples": 512, "source": source}), r"repeats after 6144 m; .* 12000 m"),
         # the camera's field of 90 deg shows 2100 m from 1050 m
-        (_settings(small), r"dtm.tif: covers 278 m x 238 m; allowed: at least 2140 m: the last image shows"),
+        (
+            _settings(small),
+            r"dtm.tif: covers 278 m x 238 m; allowed: at least 2140 m along each side: the last image shows",
+        ),
         (_settings(large), r"dtm.tif: covers 13900 m x 11900 m; allowed: at most 12264 m along each side: extract"),
         (_settings({**source, "dtm": str(tmp_path / "no.tif")}), r"no.tif: no such file"),
         (_settings({**source, "ortho": str(tmp_path / "no.tif")}), r"no.tif: no such file"),

@@ -207,7 +207,11 @@ def test_hash_covers_kernels_in_meta_kernels(meta_kernel: Path, tmp_path: Path, 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("lander.bc", "absent.bc", r"flight.tm: names the kernel \$K/no.bc, but .*mk/../a/no.bc .*do not exist"),
+        (
+            "lander.bc",
+            "absent.bc",
+            r"flight.tm: names the kernel \$K/absent.bc, but .*mk/../a/absent.bc .*do not exist",
+        ),
         ("'K', 'KERNELS'", "'KERNELS'", "has 1 PATH_SYMBOLS and 2 PATH_VALUES"),
         ("$K/lander.bc", "flight.tm", "names the meta-kernel flight.tm"),
         ("KERNELS_TO_LOAD =", "KERNELS_TO_LOAD", "SPICE: "),
