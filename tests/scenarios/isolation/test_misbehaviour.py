@@ -49,7 +49,14 @@ EXPECTED = {name: outcome for name, (_, outcome) in ACTIONS.items()}
 EXPECTED |= dict.fromkeys(ANSWERS, "BAD_ANSWER") | {"change its inputs": "CRASHED", "a nested list": "CRASHED"}
 
 
-@pytest.mark.parametrize("misbehaviour", EXPECTED)
+#: The other misbehaviours are tested in `make validate`.
+QUICK = {"exit", "kill its parent", "close all descriptors", "loop", "allocate", "patch libraries", "leave an orphan"}
+QUICK |= {"an object that runs code", "valid without a velocity"}
+
+
+@pytest.mark.parametrize(
+    "misbehaviour", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in EXPECTED]
+)
 def test_misbehaviour_affects_only_its_own_row(
     misbehaviour: str, healthy_rows: list[dict[str, Scalar]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
