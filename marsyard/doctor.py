@@ -38,8 +38,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "marsyard"
 #: Import names of distributions whose import name differs from the distribution name.
 IMPORT_NAMES = {
-    "cyrk": "CyRK", "opencv-python-headless": "cv2", "pyrender2": "pyrender", "pyyaml": "yaml", "salib": "SALib",
-    "scikit-learn": "sklearn",
+    "cyrk": "CyRK", "opencv-python-headless": "cv2", "pillow": "PIL", "pyrender2": "pyrender", "pyyaml": "yaml",
+    "salib": "SALib", "scikit-learn": "sklearn",
 }  # fmt: skip
 #: Pairs of a required distribution and a conflicting distribution that overwrites its files.
 CONFLICTS = (("pyrender2", "pyrender"), ("opencv-python-headless", "opencv-python"))

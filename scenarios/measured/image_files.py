@@ -68,6 +68,9 @@ def _check_metadata(path: Path, size: tuple[int, int] | None) -> None:
             image = Image.open(file, formats=_FORMATS)
         except UnidentifiedImageError as error:
             raise IngestError(f"{path}: is not a supported image; {_ALLOWED}") from error
+        except Image.DecompressionBombError as error:
+            limit = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+            raise IngestError(f"{path}: has too many pixels; allowed: at most {limit}") from error
         orientation, (columns, rows) = image.getexif().get(ExifTags.Base.Orientation, 1), image.size
     if orientation not in (0, 1):  # 0 is not defined, and written by programs that do not know the orientation
         raise IngestError(

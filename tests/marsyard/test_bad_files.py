@@ -130,7 +130,7 @@ def test_campaign_with_invalid_file_is_rejected(
     [
         (
             lambda path: write_gigabyte(path, b"P5 32768 32768 255\n"),
-            "has 32768 x 32768 pixels; its camera has 1024 x 256",
+            "has too many pixels; allowed: at most 178956970",
         ),
         (lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
         (write_empty, "is empty (0 bytes)"),

@@ -77,6 +77,7 @@ def test_printed_command_decides_the_campaign(
     assert (status, "verdict: PASS" in output, "to decide:" in output) == (0, True, False), output
 
 
+@pytest.mark.slow
 def test_new_campaign_of_the_stated_size_is_decided(marsyard: Command, tmp_path: Path) -> None:
     """The campaign with 230 cases has one look and needs fewer cases than the extended one."""
     path = write_small_campaign(tmp_path, "all", range(0))
@@ -86,6 +87,7 @@ def test_new_campaign_of_the_stated_size_is_decided(marsyard: Command, tmp_path:
     assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
 
 
+@pytest.mark.slow
 def test_new_campaign_has_a_terrain_for_each_case(marsyard: Command, tmp_path: Path) -> None:
     """Cases on shared terrains need more: a new campaign without shared terrains is named, and is decided."""
     shared = DISPERSIONS.replace("99999", "11")

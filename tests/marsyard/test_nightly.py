@@ -43,6 +43,7 @@ def nightly(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
     return run
 
 
+@pytest.mark.slow
 def test_regression_is_reported_with_its_metric(
     nightly: Nightly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,6 +66,7 @@ def test_answers_allow_no_foreign_scripts_and_no_frames(port: int) -> None:
         assert (headers["X-Content-Type-Options"], headers["X-Frame-Options"]) == ("nosniff", "DENY")
 
 
+@pytest.mark.slow
 def test_connections_are_limited_in_number_and_time(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A client that sends one letter after the other holds a connection for a limited time only."""
     monkeypatch.setattr(server, "REQUEST_S", 4.0)

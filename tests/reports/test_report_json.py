@@ -22,7 +22,7 @@ MakeRun = Callable[..., Path]
     [
         {"cases": 24},
         {"cases": 400, "terrains": 60},
-        {"cases": 24, "n_crashed": 3},
+        pytest.param({"cases": 24, "n_crashed": 3}, marks=pytest.mark.slow),
         {"cases": 24, "answer_rate": 0.0},
         {"cases": 1},
         {"cases": 0},

@@ -131,6 +131,7 @@ print(*(f"{item}:{result.result}:{result.error}" for item, result in sorted(resu
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_workers", [True, False])
 def test_suspended_parent_ends_no_case(tmp_path: Path, with_workers: bool) -> None:
     """The parent, alone or with its workers (a closed laptop), is stopped for 4 s; the limit of a case is 2 s."""
@@ -178,6 +179,7 @@ def test_case_cannot_use_the_time_of_later_cases() -> None:
     assert {item for item, result in results.items() if result.result == item} == {*range(60)} - {20}
 
 
+@pytest.mark.slow
 def test_several_short_cases_may_exceed_the_limit_of_one() -> None:
     """Cases of 0.01 s, then cases of 0.3 s: batches together exceed the limit of 1 s, but no case does."""
     results = run_items(sleep_longer_later, range(30), 1.0)
@@ -189,6 +191,7 @@ def sleep_longer_later(item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_time_of_the_caller_is_not_time_of_the_cases(tmp_path: Path) -> None:
     """The caller stores results for 1.5 s, longer than the limit of 1 s; each case runs once."""
     with LocalExecutor(1) as workers:
@@ -198,6 +201,7 @@ def test_time_of_the_caller_is_not_time_of_the_cases(tmp_path: Path) -> None:
     assert [len(read_starts(tmp_path, item)) for item in range(12)] == [1] * 12
 
 
+@pytest.mark.slow
 def test_loading_has_its_own_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Loading takes 2 s, longer than the limit of 1 s of a case. Then its limit is 4 s, longer than starting takes."""
     task, load = partial(sleep_after_start, str(tmp_path), 0.0), partial(time.sleep, 2.0)

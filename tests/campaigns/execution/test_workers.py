@@ -234,6 +234,7 @@ def exit_while_marked(folder: str, task: Callable[[int], Any], items: Any) -> An
     return run_batch(task, items)
 
 
+@pytest.mark.slow
 def test_campaign_survives_several_deaths_at_start(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A worker dies three times, and pauses before each start."""
     monkeypatch.setattr("marsyard.campaigns.execution.workers._DEATH_PAUSE_S", 0.5)

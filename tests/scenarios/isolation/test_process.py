@@ -123,6 +123,7 @@ def test_answers_to_one_case_have_a_limit_together() -> None:
     assert slow_enough.estimate(inputs.inertial_descent(3)).outcome is VelocityOutcome.NO_VALID_TRACK
 
 
+@pytest.mark.slow
 def test_limit_of_an_algorithm_does_not_end_the_case(tmp_path: Path) -> None:
     """The algorithm hangs longer than the limit of a case, and its limit is longer too."""
     path = tmp_path / "hanging.toml"
