@@ -128,10 +128,7 @@ def test_campaign_with_invalid_file_is_rejected(
 @pytest.mark.parametrize(
     ("write", "message"),
     [
-        (
-            lambda path: write_gigabyte(path, b"P5 32768 32768 255\n"),
-            "has too many pixels; allowed: at most 178956970",
-        ),
+        (lambda path: write_gigabyte(path, b"P5 32768 32768 255\n"), "has too many pixels; allowed: at most 178956970"),
         (lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
         (write_empty, "is empty (0 bytes)"),
     ],
