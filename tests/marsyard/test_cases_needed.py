@@ -61,7 +61,7 @@ def write_small_campaign(folder: Path, population: str, unanswered: range, dispe
     [
         ("all", range(0), 273, 273),
         # 24 of 24 answered: at 99 % confidence at least 0.01^(1/24) = 82.5 % of the cases have one; 273 / 0.825 = 331
-        ("valid", range(24, 370, 14), 273, 331),
+        pytest.param("valid", range(24, 370, 14), 273, 331, marks=pytest.mark.slow),
     ],
 )
 def test_printed_command_decides_the_campaign(

@@ -185,7 +185,17 @@ ATTEMPTS: list[tuple[Attempt, Expected, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("attempt", "expected", "text"), ATTEMPTS, ids=[attempt.__name__ for attempt, *_ in ATTEMPTS])
+#: Attempts of the suite; the others are made in `make validate`.
+QUICK = {"repeat", "delete_the_record", "reuse_a_seed", "edit_the_record"}
+
+
+@pytest.mark.parametrize(
+    ("attempt", "expected", "text"),
+    [
+        pytest.param(*values, id=values[0].__name__, marks=[] if values[0].__name__ in QUICK else pytest.mark.slow)
+        for values in ATTEMPTS
+    ],
+)
 def test_attempt_gives_no_unqualified_pass(
     project: Path,
     capfd: pytest.CaptureFixture[str],

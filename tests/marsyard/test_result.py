@@ -60,6 +60,7 @@ def estimator_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     del sys.modules["my_notebook_module"]
 
 
+@pytest.mark.slow
 def test_object_has_the_rows_of_its_import_path(estimator_module: Any, tmp_path: Path) -> None:
     campaign = _create_campaign()
     results = [

@@ -138,6 +138,7 @@ def exceed_limit(folder: str, item: int) -> int:
     return item
 
 
+@pytest.mark.slow
 def test_only_tasks_that_exceed_a_limit_are_ended(tmp_path: Path) -> None:
     limits = WorkLimits(time_s=3.0, memory_bytes=0.2e9, output_bytes=1e5)
     # one worker runs the items in order; later batches contain several items

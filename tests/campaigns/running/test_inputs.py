@@ -49,6 +49,7 @@ def _name_shared_inputs(rows: Iterable[Mapping[str, Any]]) -> set[str]:
     return {f"shared-{number}" for number, count in uses.items() if count > 1}
 
 
+@pytest.mark.slow
 def test_only_inputs_of_many_cases_are_built(selecting_campaign: Path, tmp_path: Path, watch: RecordingWatch) -> None:
     directory = run(selecting_campaign, tmp_path / "run", watch)
     expected = _name_shared_inputs(read_case_rows(directory))

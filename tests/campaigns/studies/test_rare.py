@@ -121,6 +121,7 @@ def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
         replay(tmp_path / "run", cases[-1] + 1)
 
 
+@pytest.mark.slow
 def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_path: Path) -> None:
     settings = replace(SETTINGS, max_probability=1e-3)
     result = run_study(campaign_path, tmp_path / "run", settings, max_cases=350)
@@ -139,6 +140,7 @@ def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaig
     assert result.exit_code == 3
 
 
+@pytest.mark.slow
 def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -> None:
     run_study(campaign_path, tmp_path / "run")
     with pytest.raises(CampaignError, match="contains a study"):
@@ -147,6 +149,7 @@ def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -
         append_cases(tmp_path / "run", 10, ExecutorConfig(1), RecordingWatch())
 
 
+@pytest.mark.slow
 def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> None:
     run_study(campaign_path, tmp_path / "run")
     stored_record = record.read(tmp_path / "run")
@@ -231,6 +234,7 @@ def test_plateau_is_insufficient(campaign_path: Path, tmp_path: Path) -> None:
     assert result.decision.interval.upper == 1.0
 
 
+@pytest.mark.slow
 def test_cases_on_one_terrain_are_not_counted_as_independent(campaign_path: Path, tmp_path: Path) -> None:
     settings = RareSettings("LOAD", 5e-2, samples=100, replicates=(2,), random_cases=(50,))
     # without terrains, 250 cases without a violation are enough for a limit of 5 %
@@ -261,6 +265,7 @@ def test_printed_number_of_random_cases_decides(campaign_path: Path, tmp_path: P
     assert "from 0 violations in 368 independent random cases" in second.stdout
 
 
+@pytest.mark.slow
 def test_verdict_of_an_earlier_version_is_not_kept(campaign_path: Path, tmp_path: Path) -> None:
     """Results without a counting bound assumed a continuous margin."""
     assert run_study(campaign_path, tmp_path / "run").exit_code == 0
@@ -271,6 +276,7 @@ def test_verdict_of_an_earlier_version_is_not_kept(campaign_path: Path, tmp_path
     assert evaluate_run(tmp_path / "run").exit_code == 3
 
 
+@pytest.mark.slow
 def test_random_cases_are_rejected_for_a_campaign(campaign_path: Path, tmp_path: Path) -> None:
     directory = str(tmp_path / "run")
     run = ["marsyard", "run", str(campaign_path), "--cases", "5", "--jobs", "1", "--out", directory]

@@ -112,6 +112,7 @@ def test_stream_receives_images_one_by_one(log: Path) -> None:
     assert log.read_text().splitlines() == [f"DescentFrame {number}" for number in (1, 2, 3, 4)] * 2
 
 
+@pytest.mark.slow
 def test_answers_to_one_case_have_a_limit_together() -> None:
     limits = ExecutableLimits(time_s=60.0, total_s=1.2)
     for _ in range(2):
