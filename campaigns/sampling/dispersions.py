@@ -6,6 +6,7 @@ from __future__ import annotations
 import bisect
 import itertools
 import math
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self, get_args
@@ -32,8 +33,9 @@ class _Levels(base.Dispersion):
     """A dispersion over an ordered list of values, its `points`."""
 
     @property
+    @abstractmethod
     def points(self) -> Sequence[Any]:
-        raise NotImplementedError
+        """The values in order."""
 
     def bounds(self) -> tuple[float, float] | None:
         points = self.points

@@ -107,7 +107,7 @@ class ScenarioWithoutInputs:
         return ()
 
     def prepare(self, parameters: Any, shared_input: int) -> None:
-        raise NotImplementedError
+        raise AssertionError("the cases share no inputs")
 
 
 class FakeScenario:

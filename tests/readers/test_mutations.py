@@ -50,6 +50,7 @@ from marsyard.sim.camera import CameraFileError, read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
 from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
+from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS
 from tests.scenarios.measured.folders import write_velocity_folder
 from tests.scenarios.test_terrain_files import write_tif
 from tests.sim.camera.test_calibrations import KALIBR, OPENCV
@@ -62,21 +63,10 @@ ROWS: list[dict[str, Any]] = [
      "wall_time_s": 1.0, "cpu_time_s": 1.0, "error": "", "traceback": ""}
     for case in range(40)
 ]  # fmt: skip
-CAMPAIGN = """name = "fake"
-scenario = "tests.campaigns.fake_scenario:FakeScenario"
-description = "a campaign without terrain"
-cases = 12
-seed = 5
+CAMPAIGN = f"""{TOP_LEVEL_KEYS}
 [dispersions]
-altitude_m = {distribution = "normal", mean = 2000, sd = 100, truncate = [1700, 2200]}
-[[requirements]]
-id = "velocity"
-statement = "the error is small"
-metric = "velocity_error_m_s"
-bound = 5.0
-probability = 0.99
-confidence = 0.9
-"""
+altitude_m = {{distribution = "normal", mean = 2000, sd = 100, truncate = [1700, 2200]}}
+{REQUIREMENT}"""
 
 
 @dataclass(frozen=True)
