@@ -59,14 +59,14 @@ _MAX_NORM_ERROR = 1e-3
 class ExecutablePositionEstimator:
     """`PositionEstimator` that runs an external program: one JSON request line per call.
 
-    Each estimator has its own process, also with the prefix `serve:`, so that a descent cannot affect another one.
+    With the prefix `serve:`, one process of the program answers many descents; `start` resets it.
     Methods raise AlgorithmError if the program fails, exceeds a limit, or its answer has the wrong form.
 
     - request_time_s: wall-clock time of the program's last answer
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
-        self._session = Session(replace(command, persistent=False), limits)
+        self._session = Session(command, limits)
         self._total = ProgramDetails("", 0.0)  # standard error and time of all answers of a descent
         self._start_s = -math.inf
         self.request_time_s = 0.0
