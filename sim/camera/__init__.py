@@ -6,9 +6,10 @@ column and row, with the centre of the upper left pixel at (0, 0).
 """
 
 from marsyard.sim.camera.base import CameraModel, mount_looking_down
-from marsyard.sim.camera.calibrations import Calibration, Residual, from_opencv, from_opencv_fisheye, read_calibrations
+from marsyard.sim.camera.calibrations import Calibration, read_calibrations
 from marsyard.sim.camera.label_frames import Frame, FramedCamera
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
 from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product
 from marsyard.sim.camera.pds4 import read_pds4
 from marsyard.sim.camera.source import CameraFileError
