@@ -16,41 +16,23 @@ from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.verdicts import Status
+from tests.reports.single_verdict import evaluate, make_cases
 
 Rows = Callable[..., pd.DataFrame]
 
 
-def _make_rows(n: int, failures: int, *, error: float = 6.0) -> pd.DataFrame:
-    """Return cases with one terrain per case; the errors of the first `failures` cases exceed the bound of 5 m/s."""
-    errors = np.where(np.arange(n) < failures, error, 1.0)
-    return pd.DataFrame(
-        {
-            "case": np.arange(n),
-            "outcome": "VALID",
-            "answered": True,
-            "velocity_error_m_s": errors,
-            "terrain": np.arange(n),
-        }
-    )
-
-
-def _evaluate(frame: pd.DataFrame, requirement: dict[str, Any], **changes: Any) -> Verdict:
-    (verdict,) = evaluate_requirements(frame, [{**requirement, **changes}])
-    return verdict
-
-
 def test_verdict_passes_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
     # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (binomial distribution)
-    assert _evaluate(_make_rows(230, 0), velocity).status is Status.PASS
-    assert _evaluate(_make_rows(388, 1), velocity).status is Status.PASS
-    undecided = _evaluate(_make_rows(229, 0), velocity)
+    assert evaluate(make_cases(230, 0), velocity).status is Status.PASS
+    assert evaluate(make_cases(388, 1), velocity).status is Status.PASS
+    undecided = evaluate(make_cases(229, 0), velocity)
     # After a first look that cannot pass, the second look needs 297 cases without failure at the corrected risk.
     assert (undecided.status, undecided.further_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
 def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(_make_rows(24, 0), velocity)
+    verdict = evaluate(make_cases(24, 0), velocity)
     assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 24, 0)
     assert verdict.further_cases == 297 - 24
     # Clopper-Pearson bound without failure in 24 cases at 90 % confidence
@@ -59,7 +41,7 @@ def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> 
 
 
 def test_verdict_fails_if_all_cases_fail(velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(_make_rows(24, 24), velocity)
+    verdict = evaluate(make_cases(24, 24), velocity)
     assert (verdict.status, verdict.estimate, verdict.lower) == (Status.FAIL, 0.0, 0.0)
     assert verdict.further_cases is None
 
@@ -73,14 +55,14 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
     n, failures = counts
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "population": "all"}
     requirement |= {"probability": probability, "confidence": confidence}
-    verdict = _evaluate(_make_rows(n, failures), requirement)
+    verdict = evaluate(make_cases(n, failures), requirement)
     lower, upper = proportion_lower(n - failures, n, confidence), proportion_upper(n - failures, n, confidence)
     assert (verdict.lower, verdict.upper) == (lower, upper)
     assert (verdict.status is Status.PASS) == (lower >= probability)
     assert (verdict.status is Status.FAIL) == (upper < probability)
     if verdict.status is Status.INSUFFICIENT:
         assert verdict.further_cases
-        extended_rows = pd.concat([_make_rows(n, failures), _make_rows(verdict.further_cases, 0)], ignore_index=True)
+        extended_rows = pd.concat([make_cases(n, failures), make_cases(verdict.further_cases, 0)], ignore_index=True)
         extended_rows = extended_rows.drop(columns="terrain").assign(case=np.arange(len(extended_rows)))
         (later,) = evaluate_requirements(extended_rows, [requirement], SamplingDesign(first_look=n))
         assert later.status is Status.PASS
@@ -89,23 +71,23 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
 
 
 def test_metric_equal_to_the_bound_succeeds(velocity: dict[str, Any]) -> None:
-    assert _evaluate(_make_rows(5, 5, error=5.0), velocity).failures == 0
-    assert _evaluate(_make_rows(5, 5, error=math.nextafter(5.0, 6.0)), velocity).failures == 5
+    assert evaluate(make_cases(5, 5, error=5.0), velocity).failures == 0
+    assert evaluate(make_cases(5, 5, error=math.nextafter(5.0, 6.0)), velocity).failures == 5
 
 
 def test_signed_metrics_count_by_magnitude(velocity: dict[str, Any]) -> None:
-    assert _evaluate(_make_rows(5, 2, error=-6.0), velocity).failures == 2
+    assert evaluate(make_cases(5, 2, error=-6.0), velocity).failures == 2
 
 
 @pytest.mark.parametrize("error", [math.nan, math.inf, -math.inf])
 def test_non_finite_metric_fails(velocity: dict[str, Any], error: float) -> None:
-    assert _evaluate(_make_rows(5, 2, error=error), velocity).failures == 2
+    assert evaluate(make_cases(5, 2, error=error), velocity).failures == 2
 
 
 def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> None:
     frame = make_rows(100, answer_rate=0.8, n_crashed=3)
     n_answered, n_crashed = int(frame["answered"].sum()), 3
-    verdicts = {name: _evaluate(frame, velocity, population=name) for name in ("all", "completed", "valid")}
+    verdicts = {name: evaluate(frame, velocity, population=name) for name in ("all", "completed", "valid")}
     assert [verdict.n for verdict in verdicts.values()] == [100, 100 - n_crashed, n_answered]
     n_beyond = int((frame["velocity_error_m_s"] > 5.0).sum())
     # a case without an answer fails if it belongs to the population
@@ -114,15 +96,15 @@ def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> 
 
 
 def test_empty_population_is_insufficient(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(make_rows(24, answer_rate=0.0), velocity)
+    verdict = evaluate(make_rows(24, answer_rate=0.0), velocity)
     assert (verdict.status, verdict.n, verdict.further_cases) == (Status.INSUFFICIENT, 0, 297)
     assert math.isnan(verdict.estimate)
     assert "No case" in verdict.note
 
 
 def test_empty_table_is_insufficient(velocity: dict[str, Any]) -> None:
-    assert _evaluate(pd.DataFrame(), velocity, population="all").status is Status.INSUFFICIENT
-    assert _evaluate(_make_rows(0, 0), velocity).n == 0
+    assert evaluate(pd.DataFrame(), velocity, population="all").status is Status.INSUFFICIENT
+    assert evaluate(make_cases(0, 0), velocity).n == 0
 
 
 @pytest.mark.parametrize(
@@ -139,53 +121,51 @@ def test_empty_table_is_insufficient(velocity: dict[str, Any]) -> None:
 def test_invalid_requirements_are_insufficient_with_a_note(
     velocity: dict[str, Any], changes: dict[str, Any], message: str
 ) -> None:
-    verdict = _evaluate(_make_rows(500, 0), velocity, **changes)
+    verdict = evaluate(make_cases(500, 0), velocity, **changes)
     assert verdict.status is Status.INSUFFICIENT
     assert message in verdict.note
 
 
 def test_boolean_metric_counts_true_as_success() -> None:
-    frame = _make_rows(100, 0).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) >= 5)
+    frame = make_cases(100, 0).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) >= 5)
     availability = {"id": "AVAIL", "metric": "answered", "probability": 0.9, "confidence": 0.9}
-    all_cases, feasible_cases = (
-        _evaluate(frame, availability, population=name) for name in ("all", "feasible_overlap")
-    )
+    all_cases, feasible_cases = (evaluate(frame, availability, population=name) for name in ("all", "feasible_overlap"))
     assert (all_cases.n, all_cases.failures, feasible_cases.n, feasible_cases.failures) == (100, 10, 95, 5)
     assert (all_cases.status, feasible_cases.status) == (Status.INSUFFICIENT, Status.PASS)
     # if the estimate decides, 90 of 100 cases meet 90 %; the bounds do not change
-    by_estimate = _evaluate(frame, availability, decide_by="estimate")
+    by_estimate = evaluate(frame, availability, decide_by="estimate")
     assert (by_estimate.status, by_estimate.lower) == (Status.MET_BY_RATE, all_cases.lower)
-    assert _evaluate(frame, availability, decide_by="estimate", probability=0.91).status is Status.FAIL
+    assert evaluate(frame, availability, decide_by="estimate", probability=0.91).status is Status.FAIL
 
 
 def test_populations_combine_columns() -> None:
-    frame = _make_rows(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
+    frame = make_cases(100, 20).assign(answered=np.arange(100) >= 10, feasible_overlap=np.arange(100) < 50)
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    verdict = _evaluate(frame, requirement, population="valid and feasible_overlap")
+    verdict = evaluate(frame, requirement, population="valid and feasible_overlap")
     assert (verdict.n, verdict.failures) == (40, 10)
     assert (
         "feasible_overlap"
-        in _evaluate(frame.assign(feasible_overlap=np.arange(100.0)), requirement, population="feasible_overlap").note
+        in evaluate(frame.assign(feasible_overlap=np.arange(100.0)), requirement, population="feasible_overlap").note
     )
 
 
 @pytest.mark.parametrize("outcome", ["VALID", "CRASHED", "BAD_ANSWER", "TIMED_OUT"])
 def test_unknown_membership_counts_as_failure(outcome: str) -> None:
-    frame = _make_rows(100, 0).assign(feasible_overlap=np.arange(100) < 50).astype({"feasible_overlap": object})
+    frame = make_cases(100, 0).assign(feasible_overlap=np.arange(100) < 50).astype({"feasible_overlap": object})
     frame.loc[90:93, "outcome"] = outcome
     frame.loc[90:93, "feasible_overlap"] = None
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    verdict = _evaluate(frame, requirement, population="feasible_overlap")
+    verdict = evaluate(frame, requirement, population="feasible_overlap")
     assert (verdict.n, verdict.failures) == (54, 4)
     # cases 92 and 93 are excluded by the second condition
     frame["is_near"] = np.arange(100) < 92
-    verdict = _evaluate(frame, requirement, population="feasible_overlap and is_near")
+    verdict = evaluate(frame, requirement, population="feasible_overlap and is_near")
     assert (verdict.n, verdict.failures) == (52, 2)
 
 
 def test_crashed_cases_are_failures_of_availability() -> None:
     """4 of 20 cases crash before their conditions are known; the other 16 succeed."""
-    frame = _make_rows(20, 0).assign(feasible_overlap=True).astype({"feasible_overlap": object})
+    frame = make_cases(20, 0).assign(feasible_overlap=True).astype({"feasible_overlap": object})
     frame.loc[:3, ["outcome", "answered", "feasible_overlap"]] = ["CRASHED", False, None]
     requirement = {
         "id": "AVAIL",
@@ -194,47 +174,47 @@ def test_crashed_cases_are_failures_of_availability() -> None:
         "confidence": 0.9,
         "population": "feasible_overlap",
     }
-    verdict = _evaluate(frame, requirement, decide_by="estimate")
+    verdict = evaluate(frame, requirement, decide_by="estimate")
     assert (verdict.status, verdict.n, verdict.failures) == (Status.FAIL, 20, 4)
 
 
 def test_crashed_case_with_a_small_error_fails() -> None:
-    frame = _make_rows(20, 0).assign(outcome=["CRASHED"] * 2 + ["VALID"] * 18)
+    frame = make_cases(20, 0).assign(outcome=["CRASHED"] * 2 + ["VALID"] * 18)
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.95, "confidence": 0.9}
-    assert _evaluate(frame, requirement, population="all", decide_by="estimate").failures == 2
+    assert evaluate(frame, requirement, population="all", decide_by="estimate").failures == 2
 
 
 @pytest.mark.parametrize("population", ["valid", "completed", "valid and is_near"])
 def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) -> None:
     """The verdict is INSUFFICIENT if it depends on whether crashed cases belong to the population."""
     requirement = {"id": "R", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.9, "confidence": 0.9}
-    frame = _make_rows(50, 0).assign(is_near=True)
+    frame = make_cases(50, 0).assign(is_near=True)
     frame.loc[:9, "outcome"] = "CRASHED"
     frame.loc[:9, "answered"] = False
     for rule in ("confidence", "estimate"):
-        verdict = _evaluate(frame, requirement, population=population, decide_by=rule)
+        verdict = evaluate(frame, requirement, population=population, decide_by=rule)
         assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 40, 0)
         assert "10 cases did not finish" in verdict.note
     # too few crashes, or crashes outside the population, do not change the verdict
-    few_crashes = _make_rows(200, 0).assign(is_near=True)
+    few_crashes = make_cases(200, 0).assign(is_near=True)
     few_crashes.loc[:1, "outcome"] = "CRASHED"
     few_crashes.loc[:1, "answered"] = False
-    assert _evaluate(few_crashes, requirement, population=population).status is Status.PASS
+    assert evaluate(few_crashes, requirement, population=population).status is Status.PASS
     outside_population = frame.assign(is_near=frame["answered"])
-    assert _evaluate(outside_population, requirement, population="valid and is_near").status is Status.PASS
+    assert evaluate(outside_population, requirement, population="valid and is_near").status is Status.PASS
 
 
 def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
+    verdict = evaluate(make_cases(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
     assert (verdict.status, verdict.plain_status) == (Status.MET_BY_RATE, None)
     assert "8 terrains" in verdict.note
 
 
 def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(_make_rows(120, 1), velocity, decide_by="estimate")
+    verdict = evaluate(make_cases(120, 1), velocity, decide_by="estimate")
     assert (verdict.status, verdict.confident_status) == (Status.MET_BY_RATE, Status.INSUFFICIENT)
     assert "at 90 % confidence the verdict would be INSUFFICIENT" in verdict.note
-    summary = combine_verdicts([verdict], _make_rows(120, 1))
+    summary = combine_verdicts([verdict], make_cases(120, 1))
     assert summary.word == "MET BY RATE"
     assert "1 of 1 requirement met by the rate only, not at the required confidence" in summary.sentence
     assert verdict.statement.endswith("(evaluated by observed rate).")
@@ -243,21 +223,21 @@ def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any
 def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
     """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % at a required rate of 99.7 %."""
     requirement_99_7 = {**velocity, "probability": 0.997, "decide_by": "estimate"}
-    eight_cases = _evaluate(_make_rows(8, 0), requirement_99_7)
+    eight_cases = evaluate(make_cases(8, 0), requirement_99_7)
     # a failure rate of 0.003 allows one failure in 1 / 0.003 = 334 cases
     assert (eight_cases.status, eight_cases.further_cases) == (Status.INSUFFICIENT, 334 - 8)
     assert "needs at least 334 cases" in eight_cases.note
-    assert _evaluate(_make_rows(333, 0), requirement_99_7).status is Status.INSUFFICIENT
-    assert _evaluate(_make_rows(334, 1), requirement_99_7).status is Status.MET_BY_RATE
-    assert _evaluate(_make_rows(334, 2), requirement_99_7).status is Status.FAIL
+    assert evaluate(make_cases(333, 0), requirement_99_7).status is Status.INSUFFICIENT
+    assert evaluate(make_cases(334, 1), requirement_99_7).status is Status.MET_BY_RATE
+    assert evaluate(make_cases(334, 2), requirement_99_7).status is Status.FAIL
     # 99.7 % at 90 % confidence needs 767 cases without failure
-    assert _evaluate(_make_rows(767, 0), requirement_99_7).status is Status.PASS
-    by_rate = _evaluate(_make_rows(334, 1), requirement_99_7)
+    assert evaluate(make_cases(767, 0), requirement_99_7).status is Status.PASS
+    by_rate = evaluate(make_cases(334, 1), requirement_99_7)
     assert compute_exit_code([by_rate], crashed=False) == 3
-    assert compute_exit_code([_evaluate(_make_rows(334, 1), requirement_99_7, accept_rate=True)], crashed=False) == 0
-    passing = _evaluate(_make_rows(230, 0), velocity)
-    assert combine_verdicts([passing, by_rate], _make_rows(334, 1)).word == "MET BY RATE"
-    assert combine_verdicts([passing, by_rate, eight_cases], _make_rows(334, 1)).word == "INSUFFICIENT"
+    assert compute_exit_code([evaluate(make_cases(334, 1), requirement_99_7, accept_rate=True)], crashed=False) == 0
+    passing = evaluate(make_cases(230, 0), velocity)
+    assert combine_verdicts([passing, by_rate], make_cases(334, 1)).word == "MET BY RATE"
+    assert combine_verdicts([passing, by_rate, eight_cases], make_cases(334, 1)).word == "INSUFFICIENT"
 
 
 @pytest.mark.parametrize(("probability", "min_cases"), [(0.5, 2), (0.9, 10), (0.92, 13), (0.95, 20), (0.99, 100)])
@@ -265,32 +245,32 @@ def test_minimum_cases_of_a_rate_allow_one_failure(
     velocity: dict[str, Any], probability: float, min_cases: int
 ) -> None:
     requirement = {**velocity, "probability": probability, "decide_by": "estimate"}
-    assert _evaluate(_make_rows(min_cases, 1), requirement).status is Status.MET_BY_RATE
-    assert _evaluate(_make_rows(min_cases - 1, 1), requirement).status is Status.FAIL
-    assert _evaluate(_make_rows(min_cases - 1, 0), requirement).status is Status.INSUFFICIENT
+    assert evaluate(make_cases(min_cases, 1), requirement).status is Status.MET_BY_RATE
+    assert evaluate(make_cases(min_cases - 1, 1), requirement).status is Status.FAIL
+    assert evaluate(make_cases(min_cases - 1, 0), requirement).status is Status.INSUFFICIENT
 
 
 def test_appended_cases_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
     """388 cases with one failure pass in a single evaluation, but not in a second evaluation after one at 230 cases."""
     design = read_sampling_design({"cases": 230, "appended": [158]})
-    frame = _make_rows(388, 1)
+    frame = make_cases(388, 1)
     (first,) = evaluate_requirements(frame[:230], [velocity], design)
     (later,) = evaluate_requirements(frame, [velocity], design)
-    assert _evaluate(frame, velocity).status is Status.PASS
+    assert evaluate(frame, velocity).status is Status.PASS
     assert (first.status, first.bounds_confidence) == (Status.INSUFFICIENT, 0.9)
     assert (later.status, later.bounds_confidence > 0.99) == (Status.INSUFFICIENT, True)
     assert "evaluated more than once" in later.note
     # with one failure, the second look needs 1049 cases at the corrected risk
     assert first.further_cases == 1049 - 230
-    (sufficient,) = evaluate_requirements(_make_rows(1049, 1), [velocity], design)
+    (sufficient,) = evaluate_requirements(make_cases(1049, 1), [velocity], design)
     assert (sufficient.status, sufficient.n) == (Status.PASS, 1049)
     # 388 cases with 60 failures fail also in the second evaluation
-    assert evaluate_requirements(_make_rows(388, 60), [velocity], design)[0].status is Status.FAIL
+    assert evaluate_requirements(make_cases(388, 60), [velocity], design)[0].status is Status.FAIL
 
 
 def test_appended_terrains_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
     design = SamplingDesign(first_look=460)
-    frame = _make_rows(776, 0).assign(terrain=np.arange(776) // 2)
+    frame = make_cases(776, 0).assign(terrain=np.arange(776) // 2)
     frame.loc[0, "velocity_error_m_s"] = 6.0
     (first,) = evaluate_requirements(frame[:460], [velocity], design)
     (later,) = evaluate_requirements(frame, [velocity], design)
@@ -298,139 +278,32 @@ def test_appended_terrains_share_the_risk_of_two_evaluations(velocity: dict[str,
     assert first.status is Status.INSUFFICIENT
     assert first.further_cases is not None
     assert first.further_cases > 800
-    assert _evaluate(frame, velocity).status is Status.PASS
+    assert evaluate(frame, velocity).status is Status.PASS
     assert later.status is Status.INSUFFICIENT
 
 
 def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
     # 0.99^230 = 0.0991 is below 10 %
-    assert _evaluate(_make_rows(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
+    assert evaluate(make_cases(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
     # ten cases on each of 230 terrains count as 230 cases
-    verdict = _evaluate(_make_rows(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
+    verdict = evaluate(make_cases(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
 
 
 @pytest.mark.parametrize("changes", [{"metric": "velocity_error_m_s"}, {"metric": "site_safe", "bound": None}])
 def test_campaign_without_a_finished_case_fails(velocity: dict[str, Any], changes: dict[str, Any]) -> None:
     """The columns of metric and population are missing if every case crashed; that is no reason for INSUFFICIENT."""
-    frame = _make_rows(30, 0).assign(outcome="CRASHED", answered=False).drop(columns="velocity_error_m_s")
-    verdict = _evaluate(frame, velocity | changes, population="selectable")
+    frame = make_cases(30, 0).assign(outcome="CRASHED", answered=False).drop(columns="velocity_error_m_s")
+    verdict = evaluate(frame, velocity | changes, population="selectable")
     assert (verdict.status, verdict.failures) == (Status.FAIL, 30)
 
 
 def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
-    assert "answered" in _evaluate(_make_rows(5, 0).drop(columns="answered"), velocity).note
+    assert "answered" in evaluate(make_cases(5, 0).drop(columns="answered"), velocity).note
 
 
 def test_text_metric_fails_all_cases(velocity: dict[str, Any]) -> None:
-    assert _evaluate(_make_rows(5, 0).assign(velocity_error_m_s="good"), velocity).failures == 5
-
-
-def test_shared_terrains_count_as_single_cases(velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(_make_rows(400, 0).assign(terrain=np.arange(400) % 8), velocity)
-    # without failures each terrain counts as one case: 99 % at 90 % needs 230 terrains
-    assert (verdict.status, verdict.terrains, verdict.plain_status) == (Status.INSUFFICIENT, 8, Status.PASS)
-    assert verdict.lower == proportion_lower(8, 8, 0.9)
-    assert verdict.plain_lower == proportion_lower(400, 400, 0.9)
-    assert verdict.further_cases == 297 - 8
-    for message in ("8 terrains", "every distribution of failure rates", "289 additional cases", "PASS"):
-        assert message in verdict.note
-    many_terrains = _evaluate(_make_rows(460, 0).assign(terrain=np.arange(460) % 230), velocity)
-    assert many_terrains.status is Status.PASS
-
-
-def test_additional_cases_lead_to_pass_on_new_terrains(velocity: dict[str, Any]) -> None:
-    # 6 of 50 terrains fail with one of their 5 cases
-    frame = _make_rows(250, 0).assign(terrain=np.arange(250) // 5)
-    frame.loc[5 * np.arange(6), "velocity_error_m_s"] = 6.0
-    verdict = _evaluate(frame, velocity, probability=0.95)
-    assert verdict.status is Status.INSUFFICIENT
-    assert verdict.clustered is not None
-    assert (verdict.clustered.failed_terrains, verdict.clustered.failure_pairs) == (6, 0)
-    assert verdict.further_cases
-    extended_rows = pd.concat(
-        [frame, _make_rows(verdict.further_cases, 0).assign(terrain=lambda rows: 60 + rows.index)]
-    )
-    extended_rows["case"] = np.arange(len(extended_rows))
-    requirements, design = [{**velocity, "probability": 0.95}], SamplingDesign(first_look=250)
-    (later,) = evaluate_requirements(extended_rows, requirements, design)
-    assert later.status is Status.PASS
-    (earlier,) = evaluate_requirements(extended_rows.iloc[:-1], requirements, design)
-    assert earlier.status is Status.INSUFFICIENT
-
-
-def test_verdict_of_925_answers_on_243_terrains_with_one_failure(velocity: dict[str, Any]) -> None:
-    """1,000 descents on 250 terrains drawn at random, 925 answers, one wrong: a terrain is missing for a PASS.
-
-    Independent cases would need 388 answers. With 243 terrains, 0.99^243 = 0.087 without a failure leaves nearly no
-    room for one failure and for the rate of answers, which the terrains can also determine.
-    """
-    rng = np.random.default_rng(250)
-    terrain, answered = rng.integers(0, 250, 1000), rng.permutation(1000) < 925
-    frame = _make_rows(1000, 0).assign(terrain=terrain, answered=answered)
-    frame.loc[np.flatnonzero(answered)[0], "velocity_error_m_s"] = 6.0
-    verdict = _evaluate(frame, velocity)
-    assert (verdict.status, verdict.plain_status) == (Status.INSUFFICIENT, Status.PASS)
-    assert 0.98 < verdict.lower < 0.99
-    # one case on each of 1,000 terrains: the bound of independent cases
-    assert _evaluate(frame.assign(terrain=np.arange(1000)), velocity).status is Status.PASS
-
-
-def _make_terrain_design(bank: int, **dispersion: Any) -> SamplingDesign:
-    return read_sampling_design(
-        {
-            "parameters": {"location": {"bank": bank}},
-            "dispersions": {"location.terrain": dispersion} if dispersion else {},
-        }
-    )
-
-
-def test_advice_contains_the_necessary_number_of_terrains(velocity: dict[str, Any]) -> None:
-    """8 terrains cannot show 99 % at 90 % confidence, so no number of additional cases is given."""
-    frame = _make_rows(400, 0).assign(terrain=np.arange(400) % 8)
-    design = _make_terrain_design(8, distribution="integer", low=0, high="location.bank - 1")
-    (verdict,) = evaluate_requirements(frame, [velocity], design)
-    assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
-    message = (
-        "To show a success rate of 99 % at 90 % confidence, the cases must include at least 230 different terrains. "
-        "The campaign has only 8 terrains (location.bank = 8). Run the campaign again with 230 cases, each on a "
-        "terrain of its own: --set location.bank=230 --set "
-        """'dispersions."location.terrain"={distribution="in-turn",low=0,high=229}' -n 230."""
-    )
-    assert message in verdict.note
-    assert message in combine_verdicts([verdict], frame).sentence
-    assert "additional case" not in combine_verdicts([verdict], frame).sentence
-    in_turn = _make_terrain_design(8, distribution="in-turn", low=0, high="location.bank - 1")
-    assert "--set location.bank=230 -n 230" in evaluate_requirements(frame, [velocity], in_turn)[0].note
-    fixed_terrain = evaluate_requirements(frame.assign(terrain=0), [velocity], _make_terrain_design(8))[0]
-    assert "has only 1 terrain (location.terrain = 1)" in fixed_terrain.note
-    narrow_dispersion = _make_terrain_design(100, distribution="integer", low=0, high=7)
-    assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [velocity], narrow_dispersion)[0].note
-    large_bank = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
-    assert evaluate_requirements(frame, [velocity], large_bank)[0].further_cases == 289
-
-
-def test_evaluations_of_an_adaptive_campaign_share_the_risk(velocity: dict[str, Any]) -> None:
-    # evaluations at 20, 40, 80, 160, 320 and 640 cases; the last has half of the cases and spends half of the risk
-    design = SamplingDesign(max_cases=640)
-    (early,) = evaluate_requirements(_make_rows(320, 0), [velocity], design)
-    assert early.bounds_confidence == pytest.approx(1.0 - 0.1 * 160 / 640)
-    assert early.lower == proportion_lower(320, 320, early.bounds_confidence)
-    (last,) = evaluate_requirements(_make_rows(640, 0), [velocity], design)
-    assert last.status is Status.PASS
-    assert last.bounds_confidence == pytest.approx(0.95)
-    assert "evaluated more than once" in last.note
-
-
-def test_one_terrain_per_case_gives_no_note(velocity: dict[str, Any]) -> None:
-    verdict = _evaluate(_make_rows(20, 0), velocity)
-    assert (verdict.terrains, verdict.clustered, verdict.note) == (20, None, "")
-
-
-def test_cases_of_unknown_terrain_are_independent(velocity: dict[str, Any]) -> None:
-    frame = _make_rows(20, 3).assign(terrain=[np.nan, np.nan, *range(18)])
-    assert _evaluate(frame, velocity).clustered is None
-    assert _evaluate(frame.assign(terrain=np.nan), velocity).terrains is None
+    assert evaluate(make_cases(5, 0).assign(velocity_error_m_s="good"), velocity).failures == 5
 
 
 def test_evaluation_does_not_change_its_inputs(make_rows: Rows, velocity: dict[str, Any]) -> None:
@@ -442,9 +315,9 @@ def test_evaluation_does_not_change_its_inputs(make_rows: Rows, velocity: dict[s
 
 
 def test_overall_verdict_is_the_worst_verdict(velocity: dict[str, Any]) -> None:
-    frame = _make_rows(230, 0)
-    passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
-    undecided = _evaluate(frame, velocity, probability=0.999)
+    frame = make_cases(230, 0)
+    passing, failing = evaluate(frame, velocity), evaluate(frame, velocity, bound=0.5)
+    undecided = evaluate(frame, velocity, probability=0.999)
     assert combine_verdicts([passing], frame).word == "PASS"
     assert combine_verdicts([passing, undecided], frame).word == "INSUFFICIENT"
     assert combine_verdicts([passing, undecided, failing], frame).word == "FAIL"
@@ -453,9 +326,9 @@ def test_overall_verdict_is_the_worst_verdict(velocity: dict[str, Any]) -> None:
 
 
 def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
-    frame = _make_rows(230, 0)
-    passing, failing = _evaluate(frame, velocity), _evaluate(frame, velocity, bound=0.5)
-    undecided = _evaluate(frame, velocity, probability=0.999)
+    frame = make_cases(230, 0)
+    passing, failing = evaluate(frame, velocity), evaluate(frame, velocity, bound=0.5)
+    undecided = evaluate(frame, velocity, probability=0.999)
     assert compute_exit_code([], crashed=False) == 0
     assert compute_exit_code([passing], crashed=False) == 0
     assert compute_exit_code([passing, undecided], crashed=False) == 3
@@ -471,7 +344,7 @@ def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
 
 
 def test_population_defined_by_truth_is_named_and_compared_with_all_cases(velocity: dict[str, Any]) -> None:
-    frame = _make_rows(20, 2)
+    frame = make_cases(20, 2)
     frame["lit"] = np.arange(20) >= 10
     requirement = {**velocity, "population": "lit", "statement": "The error is small."}
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"})
@@ -491,7 +364,7 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
 
 
 def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: dict[str, Any]) -> None:
-    frame = _make_rows(20, 2)
+    frame = make_cases(20, 2)
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
     requirement = {**velocity, "population": "lit and navcam"}
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"}, configured=("nav*",))
