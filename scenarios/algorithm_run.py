@@ -136,11 +136,16 @@ def run_algorithm(call: Callable[[], object], check: Callable[[object], Answer])
     return AlgorithmRun(answer, None, row)
 
 
+def call_estimate(estimator: Any, measurements: Any) -> object:
+    """Call the method `estimate` of an estimator."""
+    return estimator.estimate(measurements)
+
+
 def run_on_measurements(
     create: Callable[[], Algorithm],
-    call: Callable[[Algorithm, Inputs], object],
     check: Callable[[object], Answer],
     measurements: Inputs,
+    call: Callable[[Algorithm, Inputs], object] = call_estimate,
 ) -> AlgorithmRun[Answer]:
     """Create an algorithm, call it with the measurements and validate its answer; see `run_algorithm`.
 

@@ -53,7 +53,7 @@ def run_estimator(
         return estimator.estimate(triple_inputs)
 
     return run_on_measurements(
-        create_estimator, estimate, lambda answer: check_and_set_span(answer, tags), measurements
+        create_estimator, lambda answer: check_and_set_span(answer, tags), measurements, estimate
     )
 
 

@@ -108,7 +108,6 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         def evaluate(algorithm: str) -> CaseResult:
             algorithm_run = run_on_measurements(
                 lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case),
-                lambda estimator, inputs: estimator.estimate(inputs),
                 lambda answer: check_last_interval(answer, measurements),
                 measurements,
             )

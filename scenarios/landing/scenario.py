@@ -84,10 +84,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
         def evaluate(algorithm: str) -> CaseResult:
             algorithm_run = run_on_measurements(
-                lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case),
-                lambda estimator, inputs: estimator.estimate(inputs),
-                check_site,
-                measurements,
+                lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case), check_site, measurements
             )
             # without an answer the helicopter lands at the a-priori site; NO_STRUCTURE stands for any failure
             answer = algorithm_run.answer

@@ -87,9 +87,9 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             span_s = (float(tags[0]), float(tags[-1]))
             algorithm_run = run_on_measurements(
                 lambda: LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case),
-                _run_estimator,
                 lambda answers: _check_answers(answers, span_s),
                 measurements,
+                _run_estimator,
             )
             answers = algorithm_run.answer
             row = {**algorithm_run.row, **({} if answers is None else score.answer_row(descent, answers))}

@@ -250,12 +250,7 @@ def _run_algorithms(
 ) -> Mapping[str, AlgorithmRun[Answer]]:
     """Run all algorithms on the measurements."""
     return {
-        spec: run_on_measurements(
-            partial(p.task.make, spec, options, p.executable, case),
-            lambda algorithm, inputs: algorithm.estimate(inputs),
-            check,
-            measurements,
-        )
+        spec: run_on_measurements(partial(p.task.make, spec, options, p.executable, case), check, measurements)
         for spec in p.algorithms
     }
 

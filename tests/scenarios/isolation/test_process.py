@@ -102,9 +102,7 @@ def test_stream_receives_images_one_by_one(log: Path) -> None:
     stream = VELOCITY.make(f"{MODULE}:Stream", DimesOptions(), ExecutableLimits())
     assert is_remote(stream)
     for _ in range(2):
-        estimate = run_on_measurements(
-            lambda: stream, lambda algorithm, case: algorithm.estimate(case), lambda answer: answer, measurements
-        ).answer
+        estimate = run_on_measurements(lambda: stream, lambda answer: answer, measurements).answer
         assert isinstance(estimate, VelocityEstimate)
         assert estimate.velocity_m_s is not None
         assert estimate.velocity_m_s.tolist() == [4.0, 0.0]
