@@ -86,14 +86,12 @@ class WorkerExitError(Exception):
 
     - outcome: one of this module's outcomes; reason: text that is equal for equal causes
     - trace: Python stack of the process and its last output, as far as available
-    - note: text recorded by the task (`worker_process.record_note`)
     """
 
-    def __init__(self, outcome: str, reason: str, trace: str, note: str = "") -> None:
+    def __init__(self, outcome: str, reason: str, trace: str) -> None:
         super().__init__(reason)
         self.outcome = outcome
         self.trace = trace
-        self.note = note
 
-    def __reduce__(self) -> tuple[type[WorkerExitError], tuple[str, str, str, str]]:
-        return type(self), (self.outcome, str(self), self.trace, self.note)
+    def __reduce__(self) -> tuple[type[WorkerExitError], tuple[str, str, str]]:
+        return type(self), (self.outcome, str(self), self.trace)

@@ -113,7 +113,7 @@ def format_ingest_keys() -> str:
 def _walk_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Yield keys and fields of a model and of its nested models, in order."""
     for name, field in model.model_fields.items():
-        nested_models = _nested_models(field.annotation)
+        nested_models = list_models(field.annotation)
         if not nested_models:
             yield prefix + name, field
         # alternative models can have the same key: yield the first
@@ -122,15 +122,6 @@ def _walk_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str
             fields = {key: entry for key, entry in _walk_fields(nested_model, f"{prefix}{name}.") if key not in keys}
             keys.update(fields)
             yield from fields.items()
-
-
-def _nested_models(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models that are possible values of a field."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    if get_origin(annotation) is Annotated:
-        return _nested_models(get_args(annotation)[0])
-    return [model for part in get_args(annotation) for model in _nested_models(part)] if _is_union(annotation) else []
 
 
 def _is_union(annotation: Any) -> bool:

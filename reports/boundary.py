@@ -31,9 +31,8 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.sections import find_dispersed_column
-from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import label, number, numbers
+from marsyard.reports.stored import StoredRun
+from marsyard.reports.wording import distinct_columns, label, number, numbers
 
 #: Minimum number of violations, and of other cases, of a requirement.
 MIN_CASES_PER_CLASS = 20
@@ -173,9 +172,9 @@ def boundary_section(subject: Subject) -> Section | None:
 def list_conditions(run: StoredRun) -> list[str]:
     """List the columns of the dispersed parameters and of the measured conditions of a campaign; not the terrain."""
     frame = run.frame
-    dispersed = (find_dispersed_column(frame, str(path)) for path in table(run.recorded("dispersions")))
-    measured = (column for column in map(str, frame.columns) if column.startswith(CONDITIONS))
-    names = dict.fromkeys(name for name in (*dispersed, *measured) if name is not None and name != "terrain")
+    measured = [column for column in map(str, frame.columns) if column.startswith(CONDITIONS)]
+    dispersed = [path for path in run.dispersed_paths if path in frame and not path.endswith("terrain")]
+    names = distinct_columns(frame, [*dict.fromkeys((*dispersed, *measured))])
     return [name for name in names if pd.api.types.is_numeric_dtype(frame[name]) and frame[name].nunique() > 2]
 
 

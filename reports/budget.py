@@ -21,7 +21,8 @@ from marsyard.reports.section import (
     svg_figure,
 )
 from marsyard.reports.stored import table
-from marsyard.reports.wording import count, format_fraction, label, number, split_unit
+from marsyard.reports.wording import count, format_fraction, label, number
+from marsyard.scenarios.columns import split_unit
 
 #: Difference of the closure (contributions and remaining part divided by the total) from 1 that is reported.
 MAX_CLOSURE_ERROR = 0.1

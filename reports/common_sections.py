@@ -57,8 +57,8 @@ from marsyard.reports.wording import (
     numbers,
     p_text,
     percent,
-    split_unit,
 )
+from marsyard.scenarios.columns import split_unit
 
 #: Boolean column: whether the images of each pair show enough common ground.
 FEASIBLE_OVERLAP = "feasible_overlap"
@@ -168,7 +168,7 @@ def drivers_section(subject: Subject) -> Section | None:
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
         responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
-    columns = driver_columns(frame, metric, MAX_CONDITIONS, subject.run.conditions)
+    columns = driver_columns(frame, metric, MAX_CONDITIONS, subject.run.is_condition)
     ranked_drivers = {
         name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
     }

@@ -43,8 +43,8 @@ from marsyard.reports.wording import (
     p_text,
     percent,
     primary_metric,
-    split_unit,
 )
+from marsyard.scenarios.columns import split_unit
 
 
 @dataclass(frozen=True)

@@ -28,14 +28,15 @@ from marsyard.reports.wording import (
     numbers,
     percent,
     plain_value,
-    split_unit,
 )
+from marsyard.scenarios.columns import split_unit
 
 #: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.
 CONDITIONS = (
     "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "terrain_kind", "relief", "rms_slope",
-    "sun_elevation", "sun_azimuth", "image_contrast", "image_patchiness", "dust_opacity", "rocks_abundance", "defocus",
-    "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max", "pose_error_fraction",
+    "sun_elevation", "sun_azimuth", "image_contrast", "image_patchiness", "dust_opacity", "abundance", "rock_abundance",
+    "defocus", "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max",
+    "pose_error_fraction",
 )  # fmt: skip
 #: A column with at most `MAX_VALUES` values has a row for each value, if the mean number of cases per value is at least
 #: `CASES_PER_VALUE`.
@@ -85,7 +86,7 @@ def conditions_section(subject: Subject) -> Section | None:
 def bin_conditions(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
     """Yield each condition that varies: its column, and the names and masks of its bins."""
     for prefix in CONDITIONS:
-        columns = [str(name) for name in frame.columns if name == prefix or str(name).startswith(f"{prefix}_")]
+        columns = [name for name in map(str, frame.columns) if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_")]
         for column in columns[:1]:
             n_values = frame[column].dropna().nunique()
             if 2 <= n_values <= MAX_VALUES and len(frame) >= CASES_PER_VALUE * n_values:

@@ -22,10 +22,9 @@ from marsyard.reports.rates import engine_failed
 from marsyard.reports.remedy import find_remedy
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
-from marsyard.reports.stored import StoredRun, read_run, table
+from marsyard.reports.stored import StoredRun, read_columns, read_run, table
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count
-from marsyard.scenarios.systems import RowColumns, row_columns
 
 #: Headline of a study that decides no requirement.
 _NO_VERDICT = "NO VERDICT"
@@ -161,7 +160,7 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     joint = read_joint_evidence(evidence)
     evidence = replace(evidence, notes=joint.notes)
-    columns = _read_columns(str(run.configuration.get("scenario") or ""))
+    columns = read_columns(str(run.configuration.get("scenario") or ""))
     # columns that are computed from the truth, and columns that the configuration of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     design = sampling.with_open_end if evidence.is_confirmation else sampling
@@ -236,14 +235,6 @@ def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVer
         return OverallVerdict(Status.INSUFFICIENT, crashed, text)
     statement = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
     return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
-
-
-def _read_columns(scenario: str) -> RowColumns | None:
-    """Read the columns of a scenario; None if they are unknown or their file is invalid."""
-    try:
-        return row_columns(scenario)
-    except ValueError:
-        return None
 
 
 def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool = True) -> Evidence:

@@ -29,9 +29,9 @@ from marsyard.reports.wording import (
     magnitude_label,
     numbers,
     plain_value,
-    split_unit,
 )
 from marsyard.reports.wording import count as count_text
+from marsyard.scenarios.columns import split_unit
 
 #: Probability of the ellipse about the errors.
 ELLIPSE = 0.95

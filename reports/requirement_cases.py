@@ -23,7 +23,8 @@ from marsyard.reports.presentation import Cause, system_presentation, thumbnail,
 from marsyard.reports.section import Grid, build_grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import NOTHING, count, label, number, numbers, percent, split_unit
+from marsyard.reports.wording import NOTHING, count, label, number, numbers, percent
+from marsyard.scenarios.columns import split_unit
 
 #: Maximum number of violations, and of the cases nearest to the limit, that are listed for a requirement.
 MAX_VIOLATIONS, MAX_NEAREST = 9, 3

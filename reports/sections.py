@@ -45,8 +45,8 @@ from marsyard.reports.wording import (
     numbers,
     percent,
     requirement_text,
-    split_unit,
 )
+from marsyard.scenarios.columns import split_unit
 from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.cache import hide_folders
 
@@ -163,24 +163,16 @@ def _case_table(
 _NON_PARAMETER_KEYS = ("distribution", "source", "unit", "description")
 
 
-def find_dispersed_column(frame: pd.DataFrame, path: str) -> str | None:
-    """Find the column of a dispersed parameter: its path, or the end of the path joined by underscores."""
-    parts = path.split(".")
-    names = [path, *("_".join(parts[start:]) for start in range(len(parts)))]
-    return next((name for name in names if name in frame), None)
-
-
 def dispersion_grid(run: StoredRun) -> Grid:
     """Create a table of the dispersions, with the minimum, mean and maximum of the stored values."""
     rows, model = [], _parameters_type(run)
     for path, entry in table(run.recorded("dispersions")).items():
         dispersion, path_parts = table(entry), str(path).split(".")
-        column = find_dispersed_column(run.frame, str(path))
         statistics = [NOTHING] * 3
-        if column is not None:
-            values = pd.to_numeric(run.frame[column], errors="coerce").dropna()
-            statistics[1] = f"{run.frame[column].nunique()} values"
-            if len(values) and not pd.api.types.is_bool_dtype(run.frame[column].dtype):
+        if path in run.frame:
+            values = pd.to_numeric(run.frame[path], errors="coerce").dropna()
+            statistics[1] = f"{run.frame[path].nunique()} values"
+            if len(values) and not pd.api.types.is_bool_dtype(run.frame[path].dtype):
                 statistics = [_format_value(float(value)) for value in (values.min(), values.mean(), values.max())]
                 if path_parts[-1] == "terrain":
                     statistics[1] = NOTHING  # the mean of numbers of terrains has no meaning

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
 from marsyard.campaigns.store.table import check_table
-from marsyard.reports.wording import axis_columns, driver_columns, primary_metric
-from marsyard.scenarios.systems import row_columns
+from marsyard.reports.wording import axis_columns, driver_columns, looks_like_condition, primary_metric
+from marsyard.scenarios.columns import Columns, row_columns
 from marsyard.sim.files import report_damage
 
 #: Maximum number of cases of which all columns are read. In a larger campaign, all columns are read only for the first
@@ -75,13 +75,20 @@ class StoredRun:
         )
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """Names or patterns of the columns that the scenario declares as conditions; empty if unknown."""
-        return _read_conditions(self.record)
+    def dispersed_paths(self) -> tuple[str, ...]:
+        """Paths of the dispersed parameters, whose sampled values are columns of the rows."""
+        return tuple(str(path) for path in table(self.recorded("dispersions")))
+
+    def is_condition(self, name: str) -> bool:
+        """Return whether a column is a sampled value, or a condition that the scenario declares.
+
+        A scenario without declared columns has the conditions that their names suggest.
+        """
+        return _is_condition(self.record, name)
 
     def driver_columns(self, metric: str, max_columns: int = 6) -> list[str]:
         """Select conditions that may affect a metric; see `marsyard.reports.wording.driver_columns`."""
-        return driver_columns(self.frame, metric, max_columns, self.conditions)
+        return driver_columns(self.frame, metric, max_columns, self.is_condition)
 
     @property
     def command(self) -> tuple[str, tuple[str, ...]] | None:
@@ -179,19 +186,27 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         )
     metric = primary_metric(first_rows, requirements)
     if metric is not None:
-        drivers = driver_columns(first_rows, metric, max_columns=3, conditions=_read_conditions(record))
+        drivers = driver_columns(first_rows, metric, max_columns=3, is_condition=partial(_is_condition, record))
         columns.update([metric, *axis_columns(metric, stored_names), *drivers])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if name in columns])
     return _sort_rows(first_rows), _sort_rows(all_cases)
 
 
-def _read_conditions(record: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the conditions that the scenario of a record declares; empty if they are unknown."""
-    scenario = record.get("scenario") or table(record.get("configuration")).get("scenario")
-    with suppress(ValueError):  # an invalid file of another package
-        columns = row_columns(str(scenario or ""))
-        return () if columns is None else columns.conditions
-    return ()
+def _is_condition(record: Mapping[str, Any], name: str) -> bool:
+    configuration = table(record.get("configuration"))
+    paths = table(record.get("dispersions") or configuration.get("dispersions"))
+    if any(name == path or name.startswith(f"{path}.") for path in paths):
+        return True
+    columns = read_columns(str(record.get("scenario") or configuration.get("scenario") or ""))
+    return looks_like_condition(name) if columns is None else columns.is_condition(name)
+
+
+def read_columns(scenario: str) -> Columns | None:
+    """Return the columns of a scenario; None if they are unknown, or invalid in another package."""
+    try:
+        return row_columns(scenario)
+    except ValueError:
+        return None
 
 
 def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:

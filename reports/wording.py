@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
+
+from marsyard.scenarios.columns import find_column, split_unit
+from marsyard.scenarios.columns import label as column_label
 
 #: Text of a missing value.
 NOTHING = "–"
@@ -35,26 +37,29 @@ def requirement_text(requirement: Any) -> str:
 
 
 def _metric_text(requirement: Any) -> str:
-    """Describe when a case meets a requirement; columns of other packages are quoted by name."""
-    metric, (name, unit) = requirement.metric, split_unit(requirement.metric)
-    words = _read_notes()["metrics"].get(metric)
+    """Describe when a case meets a requirement; flags that no system declares are quoted by name."""
+    columns = requirement.metric.split(" + ")
     if requirement.bound is None or math.isnan(requirement.bound):
-        return words or f"'{metric}' is true"
-    quantity = words or f"the magnitude of '{_to_words(name)}'"
+        flag = find_column(requirement.metric)
+        return f"'{requirement.metric}' is true" if flag is None or flag.type is not bool else flag.meaning
+    texts = [
+        column_label(column) if find_column(column) else f"magnitude of '{column_label(column)}'" for column in columns
+    ]
+    quantity = f"the {texts[0]}" if len(texts) == 1 else f"the sum of {_enumerate(texts)}"
     factor = "" if requirement.scale == 1.0 else f"{requirement.scale:g} times "
-    return f"{factor}{quantity} is at most {requirement.bound:g} {unit}".rstrip()
+    return f"{factor}{quantity} is at most {requirement.bound:g} {split_unit(columns[-1])[1]}".rstrip()
 
 
 def population_text(population: str) -> str:
-    """Describe a population: ``valid answers``, ``cases with feasible overlap``; other packages' columns by name."""
-    phrases, parts = _read_notes()["populations"], population.split(" and ")
-    if len(parts) > 1 and population in phrases:
-        return phrases[population]
+    """Describe a population: ``valid answers``, ``cases with feasible overlap``; undeclared flags by name."""
+    parts = population.split(" and ")
     base = next((_POPULATIONS[part] for part in parts if part in _POPULATIONS), "cases")
     flags = [part for part in parts if part and part not in _POPULATIONS]
-    text = " ".join([base, _enumerate([phrases[flag] for flag in flags if flag in phrases])]).rstrip()
-    unknown = [f"'{flag}'" for flag in flags if flag not in phrases]
-    return f"{text} for which {_enumerate(unknown)} {'is' if len(unknown) == 1 else 'are'} true" if unknown else text
+    columns = {part: find_column(part) for part in flags}
+    phrases = [column.population_of(part) for part, column in columns.items() if column is not None]
+    unknown = [f"'{part}'" for part, column in columns.items() if column is None]
+    phrases += [f"for which {_enumerate(unknown)} {'is' if len(unknown) == 1 else 'are'} true"] if unknown else []
+    return f"{base} {_enumerate(phrases)}".rstrip()
 
 
 def _enumerate(texts: Sequence[str]) -> str:
@@ -149,12 +154,6 @@ def note_text(key: str, **values: object) -> str:
     return _read_notes()[table][name].format(**values)
 
 
-#: Suffixes of column names and their units, longest first.
-_UNITS = {
-    "_deg_h_k": "deg/h/K", "_m_s2": "m/s²", "_deg_s": "deg/s", "_rad_s": "rad/s", "_m_s": "m/s", "_deg": "deg",
-    "_rad": "rad", "_km": "km", "_mm": "mm", "_cm": "cm", "_px": "px", "_dn": "DN", "_ms": "ms", "_m": "m", "_s": "s",
-    "_k": "K",
-}  # fmt: skip
 _AXES = ("x", "y", "z")
 #: Pattern of columns that describe the run or the results, for scenarios that do not declare their conditions.
 _EXCLUDED_COLUMNS = re.compile(
@@ -171,30 +170,17 @@ _PREFERRED_DRIVERS = (
 _MAX_CATEGORIES = 6
 
 
-def split_unit(column: str) -> tuple[str, str]:
-    """Split a column name into name and unit; the unit may be empty.
-
-    >>> split_unit("attitude_rate_max_deg_s")
-    ('attitude_rate_max', 'deg/s')
-    """
-    for ending, unit in _UNITS.items():
-        if column.endswith(ending) and len(column) > len(ending):
-            return column.removesuffix(ending), unit
-    return column, ""
-
-
 def label(column: str) -> str:
     """Return the column in words, with its unit: ``velocity error (m/s)``."""
-    name, unit = split_unit(column)
-    words = _read_notes()["labels"].get(column, _to_words(name))
+    unit = split_unit(column)[1]
+    words = _read_notes()["labels"].get(column) or column_label(column)
     return f"{words} ({unit})" if unit else words
 
 
 def magnitude_label(column: str) -> str:
     """Return the magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
-    name, unit = split_unit(column)
-    words = _read_notes()["labels"].get(column, _to_words(name))
-    return f"|{words}| ({unit})" if unit else f"|{words}|"
+    unit = split_unit(column)[1]
+    return f"|{label(column).removesuffix(f' ({unit})')}|{f' ({unit})' if unit else ''}"
 
 
 def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
@@ -221,21 +207,26 @@ def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
     return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
 
 
-def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6, conditions: Sequence[str] = ()) -> list[str]:
+def looks_like_condition(name: str) -> bool:
+    """Whether the name of a column, of a scenario that declares none, does not look like a result."""
+    return not _EXCLUDED_COLUMNS.search(name)
+
+
+def driver_columns(
+    frame: pd.DataFrame, metric: str, max_columns: int = 6, is_condition: Callable[[str], bool] = looks_like_condition
+) -> list[str]:
     """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation.
 
-    conditions: names or patterns of the scenario's conditions; empty if unknown
+    A sampled value that a column of the scenario repeats is not listed again.
     """
     names = [str(name) for name in frame.columns]
     excluded_names = {metric, *axis_columns(metric, names), "terrain"}
     candidates = [
         name
         for name in names
-        if name not in excluded_names
-        and _is_condition(name, conditions)
-        and _is_number(frame, name)
-        and frame[name].nunique() > 1
+        if name not in excluded_names and is_condition(name) and _is_number(frame, name) and frame[name].nunique() > 1
     ]
+    candidates = distinct_columns(frame, candidates)
     preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
     magnitude = np.abs(numbers(frame, metric))
     others = sorted(
@@ -245,11 +236,15 @@ def driver_columns(frame: pd.DataFrame, metric: str, max_columns: int = 6, condi
     return [*preferred_names, *others][:max_columns]
 
 
-def _is_condition(name: str, conditions: Sequence[str]) -> bool:
-    """Whether a column matches one of the patterns; without patterns, whether its name does not look like a result."""
-    if conditions:
-        return any(fnmatchcase(name, pattern) for pattern in conditions)
-    return not _EXCLUDED_COLUMNS.search(name)
+def distinct_columns(frame: pd.DataFrame, names: Sequence[str]) -> list[str]:
+    """Remove sampled values that equal another column; their names are paths of parameters."""
+    others = [name for name in names if "." not in name]
+    known = [numbers(frame, name) for name in others]
+    is_repeated = (
+        "." in name and any(np.allclose(numbers(frame, name), values, rtol=1e-9, equal_nan=True) for values in known)
+        for name in names
+    )
+    return [name for name, repeated in zip(names, is_repeated, strict=True) if not repeated]
 
 
 def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
@@ -273,10 +268,6 @@ def category_column(frame: pd.DataFrame) -> str | None:
 def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
     """Whether a column contains numbers of more than one value."""
     return _is_number(frame, column) and frame[column].nunique() > 1
-
-
-def _to_words(name: str) -> str:
-    return name.replace("_", " ").replace(".", " ")
 
 
 def _is_number(frame: pd.DataFrame, column: str) -> bool:

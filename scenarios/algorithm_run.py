@@ -20,7 +20,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
 from marsyard.scenarios.estimators import Task, check_algorithms, labels
-from marsyard.scenarios.interface import CaseResult, Failure, Scalar, record_conditions
+from marsyard.scenarios.interface import CaseResult, Failure, Scalar
 from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.sim.parameters import Parameters
 
@@ -179,8 +179,7 @@ def answer_time_s(answer: object, processor_s: float) -> float:
 def case_result(
     algorithms: Sequence[str], evaluate: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """Record the conditions, score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
-    record_conditions(conditions)
+    """Score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
     names = labels(algorithms)
     first, *compared_results = [evaluate(spec) for spec in algorithms]
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}

@@ -11,15 +11,14 @@ from jaxtyping import Float64, UInt16
 from pydantic import Field
 
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import State
+from marsyard.sim.error_sources import DETECTOR, OPTICS
 from marsyard.sim.image_statistics import local_contrast
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters
-from marsyard.sim.sensor.optics import OpticsParameters
 
 
 def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
@@ -28,22 +27,6 @@ def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
         "sun_azimuth_deg": float(np.degrees(np.arctan2(direction[0], direction[1])) % 360.0),
         "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
     }
-
-
-def ground_columns(ground: SiteGround | None) -> dict[str, Scalar]:
-    """Return the optical depth of a site's air and the abundance of its rocks; NaN without a site."""
-    if ground is None:
-        return {"dust_opacity": np.nan, "rocks_abundance": np.nan}
-    rocks = ground.terrain.rocks
-    return {
-        "dust_opacity": ground.site.environment.optical_depth,
-        "rocks_abundance": 0.0 if rocks is None else rocks.abundance,
-    }
-
-
-def optics_columns(optics: OpticsParameters) -> dict[str, Scalar]:
-    """Return the dispersed errors of a camera's optics."""
-    return optics.model_dump(include={"defocus_px", "stray_light", "dust_discs", "dust_depth"})
 
 
 def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:
@@ -87,9 +70,11 @@ Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 class SizedFaults(Parameters):
     """Sizes of the faults by name; size 0 means no fault."""
 
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="number of specks of dust on the camera window")] = 0
+    dust_discs: Annotated[
+        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on the camera window")
+    ] = 0
     bad_pixels: Annotated[
-        NonNegative, Field(le=0.5, description="fraction of dead pixels, and fraction of hot pixels")
+        NonNegative, DETECTOR, Field(le=0.5, description="fraction of dead pixels, and fraction of hot pixels")
     ] = 0.0
 
     @property

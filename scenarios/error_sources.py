@@ -2,39 +2,43 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from marsyard.scenarios.systems import find_system
+from pydantic import BaseModel
+
 from marsyard.scenarios.systems import scenario as find_scenario
+from marsyard.sim.error_sources import ErrorSource
+from marsyard.sim.parameters import list_alternatives, list_models
 
 
 @dataclass(frozen=True)
-class ErrorSource:
-    """A source of error.
+class ScenarioSource:
+    """A source of error of a scenario, and the dotted paths of the parameters that cause it."""
 
-    - name: short name, unique in its scenario; title: noun phrase for tables and figures
-    - parameters: dotted paths of the parameters that cause the error
-    - remaining: factor by which numeric parameters are multiplied to remove the error. It is 0 in general, and above 0
-      if the on-board filter is tuned with the same parameter: with 0 the filter would assume a perfect sensor
-    """
-
-    name: str
-    title: str
+    source: ErrorSource
     parameters: tuple[str, ...]
-    remaining: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """Short name, unique in the scenario."""
+        return self.source.name
+
+    @property
+    def title(self) -> str:
+        """Noun phrase for tables and figures."""
+        return self.source.title
 
     def exact_values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values of the parameters without this error, by path; missing parameters are omitted.
 
-        A number, or each number of a list, is multiplied by `remaining`. A switch becomes false, a table becomes None.
-        Raises ValueError for a text.
+        A number, or each number of a list, is multiplied by `ErrorSource.remaining`. A switch becomes false, a table
+        becomes None. Raises ValueError for a text.
         """
         values = {path: value for path in self.parameters for value in _find(parameters, path)}
-        return {path: _exact_value(path, value, self.remaining) for path, value in values.items()}
+        return {path: _exact_value(path, value, self.source.remaining) for path, value in values.items()}
 
 
 def _find(tree: Any, path: str) -> Iterator[Any]:
@@ -59,34 +63,28 @@ def _exact_value(path: str, value: Any, factor: float) -> Any:
 
 
 @cache
-def error_sources(scenario: str) -> tuple[ErrorSource, ...]:
-    """Return the sources of error of a scenario, which is given by its name in campaign files; empty if it has none.
+def error_sources(scenario: str) -> tuple[ScenarioSource, ...]:
+    """Return the sources of error of a scenario, which is given by its name or ``module:Class``; empty without any.
 
-    A system under test defines the sources of its scenarios in a TOML file (`System.error_sources`). A scenario
-    ``module:Class`` that belongs to no system defines them in the attribute `error_sources` of its class. Raises
-    ValueError for an invalid file.
+    They are the marks (`marsyard.sim.error_sources`) on its parameters.
     """
-    system = find_system(scenario)
-    if system is None:
-        return tuple(getattr(find_scenario(scenario), "error_sources", ()))
-    if system.error_sources is None:
-        return ()
-    try:
-        # a table contains sources by name; or `sources_of`, another scenario with the same sources, and `prefix`, the
-        # table of their parameters in this scenario
-        scenarios = tomllib.loads(system.error_sources.read_text(encoding="utf-8"))
-        tables = scenarios.get(scenario, {})
-        prefix = tables.get("prefix", "")
-        tables = scenarios[tables["sources_of"]] if "sources_of" in tables else tables
-        return tuple(
-            ErrorSource(
-                name,
-                str(table["title"]),
-                tuple(f"{prefix}{path}" for path in table["parameters"]),
-                float(table.get("remaining", 0.0)),
-            )
-            for name, table in tables.items()
-        )
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        message = f"{system.error_sources}: invalid sources of error: {type(error).__name__}: {error}"
-        raise ValueError(message) from error
+    paths: dict[ErrorSource, dict[str, None]] = {}
+    for path, source in _walk_marks(find_scenario(scenario).parameters_type):
+        paths.setdefault(source, {})[path] = None
+    return tuple(ScenarioSource(source, tuple(parameters)) for source, parameters in paths.items())
+
+
+def _walk_marks(
+    model: type[BaseModel], prefix: str = "", outer: ErrorSource | None = None
+) -> Iterator[tuple[str, ErrorSource]]:
+    """Yield the path and source of each marked parameter of a model; `outer` replaces the sources inside."""
+    for name, field in model.model_fields.items():
+        path, own = f"{prefix}{name}", next((mark for mark in field.metadata if isinstance(mark, ErrorSource)), None)
+        alternatives = list_alternatives(field.annotation)
+        tables = list_models(field.annotation)
+        is_optional_table = bool(tables) and type(None) in alternatives
+        if own is not None and (is_optional_table or not tables):
+            yield path, outer or own
+            continue
+        for table in tables:
+            yield from _walk_marks(table, f"{path}.", outer or own)

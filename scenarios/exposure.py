@@ -14,6 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
 from marsyard.sim.dynamics import State
+from marsyard.sim.error_sources import CALIBRATION
 from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import Backend
@@ -44,14 +45,14 @@ class CalibrationParameters(Parameters):
     The values of the descent camera are assumed for all cameras.
     """
 
-    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")] = (
-        0.0002
-    )
+    focal_error: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")
+    ] = 0.0002
     centre_error_px: Annotated[
-        float, bounded_field(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")
+        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")
     ] = 0.5
     distortion_error_px: Annotated[
-        float, bounded_field(0.0, 50.0, "RMS error of the calibrated distortion in the image corners, px")
+        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the calibrated distortion in the image corners, px")
     ] = 0.3
 
 

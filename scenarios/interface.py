@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -20,30 +20,7 @@ if TYPE_CHECKING:
 Scalar = float | int | str | bool
 
 
-_recorder: ContextVar[Callable[[Mapping[str, Scalar]], None] | None] = ContextVar("_recorder", default=None)
 _is_recording_timelines: ContextVar[bool] = ContextVar("_is_recording_timelines", default=False)
-
-
-def record_conditions(columns: Mapping[str, Scalar]) -> None:
-    """Record columns of the running case that do not depend on an algorithm, before an algorithm runs.
-
-    The engine stores these columns even if the case raises an exception or its process is killed, because they
-    determine the populations of the case. `CaseResult.row` must contain them as well. A case may call this function
-    several times. It has no effect outside of a campaign.
-    """
-    recorder = _recorder.get()
-    if recorder is not None:
-        recorder(columns)
-
-
-@contextmanager
-def conditions_recorded_by(recorder: Callable[[Mapping[str, Scalar]], None]) -> Iterator[None]:
-    """Pass the columns of `record_conditions` to a recorder while the context is active."""
-    token = _recorder.set(recorder)
-    try:
-        yield
-    finally:
-        _recorder.reset(token)
 
 
 @contextmanager
@@ -80,8 +57,8 @@ class CaseResult:
 
     - outcome: a member of the estimate's enumeration, or the name of the failure
     - answered: whether the algorithm under test reported an answer (the population `valid` of requirements)
-    - row: values by column: errors (NaN without an answer) and sampled values, read from the simulated objects. Columns
-      that may differ between two runs of one case have `time` in their name.
+    - row: values by column: errors (NaN without an answer), and conditions, read from the simulated objects. The engine
+      adds the sampled values. Columns that may differ between two runs of one case have `time` in their name.
     - products: arrays and texts for the case's figures; stored only for cases that the campaign retains
     - failure: None if the algorithm under test answered
     """
@@ -111,7 +88,7 @@ class Scenario(Protocol):
         """Build one shared input into the cache on disk if it is missing. Safe to call in parallel."""
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Run one case with its sampled parameters and its random streams; see `record_conditions`."""
+        """Run one case with its sampled parameters and its random streams."""
 
 
 @runtime_checkable

@@ -12,10 +12,8 @@ A system that cannot be loaded is omitted, with one message in `problems`.
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -55,9 +53,8 @@ class System:
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
     - catalogue: campaign files, as a folder and a pattern (``folder/altitude-*.toml``)
     - requirements: file of the requirements that campaigns reference by id, as `scenarios/requirements.toml`
-    - columns: file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it, requirements are
-      checked against the first finished case.
-    - error_sources: file of the sources of error of each scenario's cases, as `scenarios/error_sources.toml`
+    - columns: columns of the rows, each a `marsyard.scenarios.columns.Columns`, by scenario. Without them, requirements
+      are checked against the first finished case.
     - compilation_campaigns: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small. One case
       of each calls, and so compiles, all numeric kernels of its scenario (`marsyard compile`).
     - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
@@ -73,8 +70,7 @@ class System:
     tasks: tuple[str, ...] = ()
     catalogue: Path | None = None
     requirements: Path | None = None
-    columns: Path | None = None
-    error_sources: Path | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
     compilation_campaigns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     templates: Mapping[str, str] = field(default_factory=dict)
     ingest: str = ""
@@ -93,8 +89,7 @@ GROUP = "marsyard.systems"
 
 #: Files that the systems of Marsyard share.
 _CATALOGUE = SCENARIOS_FOLDER / "catalogue"
-_REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
-_ERROR_SOURCES = SCENARIOS_FOLDER / "error_sources.toml"
+_REQUIREMENTS = SCENARIOS_FOLDER / "requirements.toml"
 
 #: The systems of Marsyard. Recorded images come first, because their cases also contain products of other systems.
 BUILT_IN = (
@@ -108,7 +103,11 @@ BUILT_IN = (
             "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
         },
         tasks=("marsyard.scenarios.estimators:VELOCITY", "marsyard.scenarios.estimators:LANDING"),
-        columns=_COLUMNS,
+        columns={
+            "measured-velocity": "marsyard.scenarios.measured.row:VELOCITY_COLUMNS",
+            "measured-landing": "marsyard.scenarios.measured.row:LANDING_COLUMNS",
+            "measured-matching": "marsyard.scenarios.measured.row:MATCHING_COLUMNS",
+        },
         ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
         report="marsyard.reports.measured.presentation:MEASURED",
     ),
@@ -120,8 +119,7 @@ BUILT_IN = (
         tasks=("marsyard.scenarios.estimators:VELOCITY",),
         catalogue=_CATALOGUE / "dimes-*.toml",
         requirements=_REQUIREMENTS,
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
+        columns={"descent": "marsyard.scenarios.descent.row:COLUMNS"},
         compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
         templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
         report="marsyard.reports.dimes.presentation:DIMES",
@@ -133,8 +131,7 @@ BUILT_IN = (
         scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
         tasks=("marsyard.scenarios.estimators:VELOCITY",),
         catalogue=_CATALOGUE / "dimes-fieldtest.toml",
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
+        columns={"fieldtest": "marsyard.scenarios.fieldtest.row:COLUMNS"},
         report="marsyard.reports.dimes.presentation:FIELD_TEST",
     ),
     System(
@@ -148,8 +145,10 @@ BUILT_IN = (
         tasks=("marsyard.scenarios.estimators:TRACKING",),
         catalogue=_CATALOGUE / "vtt-*.toml",
         requirements=_REQUIREMENTS,
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
+        columns={
+            "rover": "marsyard.scenarios.rover.row:COLUMNS",
+            "rover-drive": "marsyard.scenarios.rover.row:DRIVE_COLUMNS",
+        },
         compilation_campaigns={
             "vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")
         },
@@ -164,8 +163,7 @@ BUILT_IN = (
         tasks=("marsyard.scenarios.estimators:LANDING",),
         catalogue=_CATALOGUE / "hda-*.toml",
         requirements=_REQUIREMENTS,
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
+        columns={"landing": "marsyard.scenarios.landing.row:COLUMNS"},
         compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
         templates={"landing": "marsyard.scenarios.template:LANDING"},
         report="marsyard.reports.hda.presentation:HDA",
@@ -232,11 +230,7 @@ def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
         raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.systems.System")
-    missing = [
-        str(path)
-        for path in (system.requirements, system.columns, system.error_sources)
-        if path is not None and not path.is_file()
-    ]
+    missing = [] if system.requirements is None or system.requirements.is_file() else [str(system.requirements)]
     if system.catalogue is not None and not system.campaigns:
         missing.append(str(system.catalogue))
     if missing:
@@ -249,60 +243,6 @@ def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
         if conflicts:
             raise ValueError(f"the system '{earlier.name}' already has the {conflicts[0]}")
     return system
-
-
-@dataclass(frozen=True)
-class RowColumns:
-    """Columns of a scenario's rows; `flags` and `numbers` contain names or patterns, in which `*` matches any text.
-
-    - flags: boolean columns
-    - numbers: numeric columns
-    - named_flags: path of a list among the parameters; the `name` of each entry is a further boolean column; empty for
-      none
-    - from_truth: boolean columns that the flight system cannot know, because they are computed from the truth, and the
-      definition of each; a list in the file has empty definitions
-    - configured: boolean columns that the configuration of a case determines, such as its camera or its driving mode
-    - conditions: names or patterns of the numbers that describe the conditions of a case, not results of the algorithm;
-      empty if unknown
-    """
-
-    flags: tuple[str, ...]
-    numbers: tuple[str, ...]
-    named_flags: str = ""
-    from_truth: Mapping[str, str] = field(default_factory=dict)
-    configured: tuple[str, ...] = ()
-    conditions: tuple[str, ...] = ()
-
-    def has_flag(self, name: str) -> bool:
-        """Return whether a boolean column may have this name."""
-        return any(fnmatchcase(name, pattern) for pattern in self.flags)
-
-    def has_number(self, name: str) -> bool:
-        """Return whether a numeric column may have this name."""
-        return any(fnmatchcase(name, pattern) for pattern in self.numbers)
-
-
-@cache
-def row_columns(scenario: str) -> RowColumns | None:
-    """Return the columns of a scenario; None if its system has no such file. Raises ValueError for an invalid file."""
-    system = find_system(scenario)
-    if system is None or system.columns is None:
-        return None
-    try:
-        columns = tomllib.loads(system.columns.read_text(encoding="utf-8")).get(scenario)
-        if columns is None:
-            return None
-        from_truth = columns.get("from_truth", {})
-        return RowColumns(
-            tuple(columns["flags"]),
-            tuple(columns["numbers"]),
-            columns.get("named_flags", ""),
-            dict(from_truth) if isinstance(from_truth, Mapping) else dict.fromkeys(from_truth, ""),
-            tuple(columns.get("configured", ())),
-            tuple(columns.get("conditions", ())),
-        )
-    except (OSError, ValueError, LookupError, TypeError) as error:
-        raise ValueError(f"{system.columns}: invalid columns: {type(error).__name__}: {error}") from error
 
 
 class UnknownScenarioError(LookupError):

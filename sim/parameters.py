@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import tomllib
+import types
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -81,3 +82,18 @@ def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[
             value = merge_settings(current, value)
         settings[key] = value
     return settings
+
+
+def list_models(annotation: Any) -> list[type[BaseModel]]:
+    """List the tables among the alternatives of a parameter's type."""
+    return [item for item in list_alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
+
+
+def list_alternatives(annotation: Any) -> list[Any]:
+    """List the members of a union, or the type itself; metadata of `Annotated` types are removed."""
+    origin = get_origin(annotation)
+    if origin is Annotated:
+        return list_alternatives(get_args(annotation)[0])
+    if origin in (Union, types.UnionType):
+        return [inner for choice in get_args(annotation) for inner in list_alternatives(choice)]
+    return [annotation]

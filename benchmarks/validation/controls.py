@@ -19,7 +19,6 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.verdicts import Status
-from marsyard.scenarios.interface import conditions_recorded_by
 from marsyard.scenarios.systems import catalogue, systems
 
 MODULE = "marsyard.algorithms.controls"
@@ -74,8 +73,7 @@ SETTINGS: Mapping[str, Settings] = {
 def run_controls(campaign_name: str, settings: Settings) -> tuple[Campaign, dict[str, pd.DataFrame]]:
     """Run all controls on cases of a campaign; return the campaign and the rows of each control, by its class.
 
-    A hanging algorithm has the rows that the engine stores for a case above its time limit: its conditions, and the
-    outcome TIMED_OUT.
+    A hanging algorithm has the rows of one that crashes, with the outcome TIMED_OUT.
     """
     rows: dict[str, list[Row]] = {name: [] for name in TITLES}
     groups: list[tuple[str, ...]] = [tuple(ANSWERING), tuple(FAILING)]
@@ -85,27 +83,25 @@ def run_controls(campaign_name: str, settings: Settings) -> tuple[Campaign, dict
         specs = [f"{MODULE}:{name}" for name in names]
         campaign = load_campaign(campaign_name, settings.overrides, algorithms=specs)
         for case in settings.cases:
-            conditions, rows_by_name = _run_case(campaign, names, case)
+            rows_by_name = _run_case(campaign, names, case)
             for name, row in rows_by_name.items():
                 rows[name].append(row)
             if "Crash" in names:
-                rows["Hang"].append({**conditions, "outcome": Fault.TIMED_OUT.name, "answered": False})
+                rows["Hang"].append({**rows_by_name["Crash"], "outcome": Fault.TIMED_OUT.name})
     return campaign, {name: pd.DataFrame(items) for name, items in rows.items()}
 
 
-def _run_case(campaign: Campaign, names: Sequence[str], case: int) -> tuple[Row, dict[str, Row]]:
-    """Run one case; return its recorded conditions, and the row of each algorithm as if it were under test."""
-    conditions: Row = {}
-    with conditions_recorded_by(conditions.update):
-        result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
+def _run_case(campaign: Campaign, names: Sequence[str], case: int) -> dict[str, Row]:
+    """Run one case; return the row of each algorithm as if it were under test."""
+    result = campaign.scenario.run(campaign.parameters(case), campaign.streams(case))
     prefixes = {name: f"{name}." for name in names[1:]}
     is_compared = tuple(prefixes.values())
     first = {column: value for column, value in result.row.items() if not column.startswith(is_compared)}
-    rows = {names[0]: {**conditions, **first, "outcome": result.outcome, "answered": result.answered}}
+    rows = {names[0]: {**first, "outcome": result.outcome, "answered": result.answered}}
     for name, prefix in prefixes.items():
         own = {column.removeprefix(prefix): result.row[column] for column in result.row if column.startswith(prefix)}
-        rows[name] = {**conditions, **own}
-    return conditions, rows
+        rows[name] = {**{column: value for column, value in first.items() if column not in own}, **own}
+    return rows
 
 
 def find_failed_requirements(campaign: Campaign, frame: pd.DataFrame) -> list[str]:

@@ -11,13 +11,13 @@ from jaxtyping import Float64
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.contributions import compute_budget
 from marsyard.reports.statistics.changes import compare_errors
-from marsyard.scenarios.error_sources import ErrorSource
+from marsyard.sim.error_sources import ErrorSource
 
 #: Two-sided confidence of the checked intervals, and largest permitted shortfall of the coverage for skewed values.
 CONFIDENCE, _SHORTFALL = 0.9, 0.05
 #: Standard deviations of two sources of error; that of the remaining error is 1.
 _DEVIATIONS = {"a": 3.0, "b": 2.0}
-_SOURCES = tuple(ErrorSource(name, name, ()) for name in _DEVIATIONS)
+_SOURCES = tuple(ErrorSource(name, name) for name in _DEVIATIONS)
 #: Factor of the product of both errors, if they interact.
 _INTERACTION = 0.5
 #: Degrees of freedom of Student's t for errors with heavy tails.

@@ -191,15 +191,15 @@ class Campaign:
 
     def parameters_at(self, point: Point) -> BaseModel:
         """Create the parameters of a case at a point of a study. Raises ValueError like `parameters`."""
-        tree = replace_values(self.configuration.parameters, self.draws_at(point))
-        for source in error_sources(self.configuration.scenario):
-            if source.name in point.removed:
+        return self.with_values(self.draws_at(point), point.removed)
+
+    def with_values(self, values: Mapping[str, Any], removed: Sequence[str] = ()) -> BaseModel:
+        """Create the campaign's parameters with other values at some paths, and without the `removed` error sources."""
+        tree = replace_values(self.configuration.parameters, values)
+        for source in error_sources(self.configuration.scenario) if removed else ():
+            if source.name in removed:
                 tree = replace_values(tree, source.exact_values(tree))
         return self.scenario.parameters_type.model_validate(tree)
-
-    def with_values(self, values: Mapping[str, Any]) -> BaseModel:
-        """Create the campaign's parameters with other values at some paths."""
-        return self.scenario.parameters_type.model_validate(replace_values(self.configuration.parameters, values))
 
 
 def replace_values(tree: Any, values: Mapping[str, Any]) -> Any:

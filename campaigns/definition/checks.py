@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from pydantic import ValidationError
@@ -16,10 +15,10 @@ from marsyard.campaigns.definition.identity import list_algorithms
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
+from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag, row_columns
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasParts
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.systems import RowColumns, row_columns
 
 #: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
 _CHECKED_CASES = 32
@@ -28,8 +27,6 @@ _CHECKED_CASES = 32
 _MAX_VARYING = 8
 #: Types of columns in requirements, as named in messages.
 FLAGS, NUMBERS = "column of true and false", "column of numbers"
-#: Columns that the campaign engine adds to those of the scenario.
-_ENGINE_FLAGS, _ENGINE_NUMBERS = ("answered",), ("wall_time_s", "cpu_time_s")
 
 
 def find_campaign_problems(campaign: Campaign) -> list[tuple[Key, str]]:
@@ -188,9 +185,10 @@ def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
 
     def is_known(name: str, kind: str) -> bool:
         column = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
-        return columns.has_number(column) if kind == NUMBERS else columns.has_flag(column)
+        return columns.has(column, float if kind == NUMBERS else bool)
 
-    return find_unknown_columns(campaign.configuration.requirements, columns.flags, columns.numbers, is_known)
+    flags, numbers = columns.names(bool), columns.names(float)
+    return find_unknown_columns(campaign.configuration.requirements, flags, numbers, is_known)
 
 
 def find_unknown_columns(
@@ -212,22 +210,22 @@ def find_unknown_columns(
     return problems
 
 
-def _collect_columns(campaign: Campaign) -> RowColumns | None:
-    """Collect the columns of the scenario and of the campaign's parameters; None if they are unknown."""
+def _collect_columns(campaign: Campaign) -> Columns | None:
+    """Collect the columns of the scenario, of the engine and of the campaign's parameters; None if they are unknown."""
     configuration = campaign.configuration
     columns = row_columns(configuration.scenario)
     if columns is None:
         return None
-    scores: list[str] = []
+    scores: list[Column] = []
     keys = campaign.scenario.part_keys if isinstance(campaign.scenario, HasParts) else {}
     for path in (path for path, kind in keys.items() if kind is SCORE):
         if path in configuration.dispersions:
             return None
-        scores += [f"{label}_*" for label in labels(find_value(configuration.parameters, path))]
-    # boolean columns that the campaign file defines by name
-    flags = find_value(configuration.parameters, columns.named_flags) if columns.named_flags else ()
-    return replace(
-        columns,
-        flags=(*columns.flags, *_ENGINE_FLAGS, *(str(flag["name"]) for flag in flags), *scores),
-        numbers=(*columns.numbers, *_ENGINE_NUMBERS, *scores),
-    )
+        for label in labels(find_value(configuration.parameters, path)):
+            scores += [Column(f"{label}_*", Kind.ERROR, "custom score", type=kind) for kind in (float, bool)]
+    draws = [Column(path, Kind.CONDITION, "sampled value") for path in configuration.dispersions]
+    declared = list(columns)
+    if columns.named_flags:  # flags that the campaign file names
+        declared = [column for column in columns if column.type is not bool or "*" not in column.name]
+        declared += [flag(str(item["name"]), "") for item in find_value(configuration.parameters, columns.named_flags)]
+    return Columns((*declared, *ENGINE, *draws, *scores))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tomllib
-import types
 from collections.abc import Iterable, Mapping
 from functools import reduce
 from pathlib import Path
@@ -261,7 +260,7 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
     for detail in error.errors(include_url=False):
         location, value, message = detail["loc"], detail["input"], str(detail["msg"])
         if detail["type"] == "extra_forbidden":
-            models = _list_models(reduce(_find_inner_type, location[:-1], model))
+            models = list_models(reduce(_find_inner_type, location[:-1], model))
             allowed = sorted({name for option in models for name in option.model_fields})
             message = f"unknown key{suggest_similar(str(location[-1]), allowed)}; allowed: {', '.join(allowed)}"
         elif detail["type"] == "missing":
@@ -275,7 +274,7 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
         node: Any = model
         for part in location:
             # pydantic adds the names of alternative models, which are no keys of the file
-            if not any(option.__name__ == part for option in _list_models(node)):
+            if not any(option.__name__ == part for option in list_models(node)):
                 key = (*key, part)
             node = _find_inner_type(node, part)
         if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
@@ -299,14 +298,14 @@ def key_text(key: Iterable[str | int]) -> str:
 def description_at(model: type[BaseModel], path: str) -> str:
     """Return the description of a model's field at a dotted path; empty if the field has none."""
     *tables, name = path.split(".")
-    models = _list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
+    models = list_models(reduce(_find_inner_type, (int(part) if part.isdigit() else part for part in tables), model))
     return next((option.model_fields[name].description or "" for option in models if name in option.model_fields), "")
 
 
 def _find_inner_type(annotation: Any, key: str | int) -> Any:
     """Find the type of the field, entry or element `key` of a type; None if there is none."""
     inner_types: list[Any] = []
-    for choice in _list_alternatives(annotation):
+    for choice in list_alternatives(annotation):
         if isinstance(choice, type) and issubclass(choice, BaseModel):
             if key in choice.model_fields:
                 inner_types.append(choice.model_fields[str(key)].annotation)
@@ -317,18 +316,3 @@ def _find_inner_type(annotation: Any, key: str | int) -> Any:
         elif get_origin(choice) in (dict, Mapping) and isinstance(key, str):
             inner_types.append(get_args(choice)[1])
     return Union[tuple(inner_types)] if inner_types else None  # noqa: UP007
-
-
-def _list_models(annotation: Any) -> list[type[BaseModel]]:
-    """List the pydantic models among the alternatives of a type."""
-    return [item for item in _list_alternatives(annotation) if isinstance(item, type) and issubclass(item, BaseModel)]
-
-
-def _list_alternatives(annotation: Any) -> list[Any]:
-    """List the members of a union, or the type itself; metadata of `Annotated` types are removed."""
-    origin = get_origin(annotation)
-    if origin is Annotated:
-        return _list_alternatives(get_args(annotation)[0])
-    if origin in (Union, types.UnionType):
-        return [inner for choice in get_args(annotation) for inner in _list_alternatives(choice)]
-    return [annotation]

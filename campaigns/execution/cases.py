@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import time
 import traceback
@@ -16,7 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 from marsyard.algorithms.faults import describe_error
-from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign import Campaign, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
 from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
@@ -25,7 +24,7 @@ from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Wo
 from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
-from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by, recording_timelines
+from marsyard.scenarios.interface import CaseResult, Scalar, recording_timelines
 from marsyard.scenarios.systems import scenario
 from marsyard.sim.cache import CacheWarning, hide_folders
 
@@ -77,26 +76,21 @@ def run_case(configuration: str, selection: ProductSelection, points: Mapping[in
     """
     wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
     products: Mapping[str, Any] = {}
-    conditions: dict[str, Scalar] = {}
-
-    def record(columns: Mapping[str, Scalar]) -> None:
-        """Record columns that are known before the result, for the row of an unfinished case."""
-        conditions.update(_convert_columns(columns))
-        worker_process.record_note(json.dumps({"case": case, "conditions": conditions}))
-
+    point, draws = points.get(case), {}
     try:
         campaign = _load_campaign(configuration)
         wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
-        with conditions_recorded_by(record), recording_timelines(selection.timelines):
-            point = points.get(case)
-            parameters = campaign.parameters(case) if point is None else campaign.parameters_at(point)
+        values = campaign.draws(case) if point is None else campaign.draws_at(point)
+        draws = list_draws(values)
+        with recording_timelines(selection.timelines):
+            parameters = campaign.with_values(values, () if point is None else point.removed)
             streams = campaign.streams(case) if point is None else campaign.streams_at(point)
             result = campaign.scenario.run(parameters, streams)
-        row = _build_finished_row(case, result, campaign.configuration.requirements)
+        row = _build_finished_row(case, result, draws, campaign.configuration.requirements)
         products = result.products
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
-        row = make_unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), conditions)
+        row = make_unfinished_row(case, outcome, describe_error(error), traceback.format_exc(), draws)
     wall_time_s, cpu_time_s = time.perf_counter() - wall_start_s, time.process_time() - cpu_start_s
     row = {**row, "wall_time_s": wall_time_s, "cpu_time_s": cpu_time_s}
     if row["outcome"] in (CRASHED, OUT_OF_MEMORY):
@@ -143,7 +137,7 @@ def run_cases(
         for task_result in results:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
             case_result = task_result.result or CompletedCase(
-                {**_build_terminated_row(task_result.item, task_result.error), **times}
+                {**_build_terminated_row(configuration, task_result, points.get(task_result.item)), **times}
             )
             note = "; ".join(filter(None, (case_result.note, *_describe_changes(task_result, note_counts))))
             row, point = case_result.row, points.get(task_result.item)
@@ -158,11 +152,15 @@ def work_limits(limits: Limits, time_s: float) -> WorkLimits:
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
-def _build_terminated_row(case: int, error: Exception | None) -> Row:
-    """Create the row of a case whose process ended early, with the conditions that the case recorded."""
+def _build_terminated_row(configuration: CampaignConfiguration, result: TaskResult[Any], point: Point | None) -> Row:
+    """Create the row of a case whose process ended early, with the sampled values of the case."""
+    case, error, draws = result.item, result.error, {}
+    campaign = Campaign(configuration, scenario(configuration.scenario))
+    with suppress(ValueError):  # an undefined formula also ends the case in its worker
+        draws = list_draws(campaign.draws(case) if point is None else campaign.draws_at(point))
     if not isinstance(error, WorkerExitError):
-        return make_unfinished_row(case, CRASHED, describe_error(error), "")
-    trace, conditions = error.trace, {}
+        return make_unfinished_row(case, CRASHED, describe_error(error), "", draws)
+    trace = error.trace
     lines = trace.splitlines()
     call_index = next((index for index, line in enumerate(lines) if line.endswith(" in run_case")), None)
     if call_index is not None:
@@ -171,22 +169,23 @@ def _build_terminated_row(case: int, error: Exception | None) -> Row:
             (index for index in range(call_index + 1, len(lines)) if not lines[index].startswith("  File ")), len(lines)
         )
         trace = "\n".join([*lines[: call_index + 1], *lines[next_thread:]])
-    # the process may have ended while writing the note, and other code may have written to the file
-    with suppress(ValueError, TypeError, LookupError, AttributeError, RecursionError):
-        note = json.loads(error.note)
-        conditions = _convert_columns(note["conditions"]) if note["case"] == case else {}
-    return make_unfinished_row(case, error.outcome, str(error), trace, conditions)
+    return make_unfinished_row(case, error.outcome, str(error), trace, draws)
+
+
+def list_draws(values: Mapping[str, Any]) -> dict[str, Scalar]:
+    """List the sampled values of a case by parameter path, the values of a table by their own paths."""
+    return _convert_columns({path: value for path, value in leaves(dict(values)) if value is not None and value != []})
 
 
 def make_unfinished_row(
-    case: int, outcome: str, error: str, trace: str, conditions: Mapping[str, Scalar] | None = None
+    case: int, outcome: str, error: str, trace: str, draws: Mapping[str, Scalar] | None = None
 ) -> Row:
-    """Create the row of an unfinished case, with the conditions that the case recorded."""
+    """Create the row of an unfinished case, with its sampled values."""
     return {
         "case": case,
         "outcome": outcome,
         "answered": False,
-        **(conditions or {}),
+        **(draws or {}),
         "error": _clean_text(error),
         "traceback": _clean_text(trace),
     }
@@ -202,16 +201,19 @@ def _clean_text(text: str) -> str:
     return _replace_surrogates(text)
 
 
-def _build_finished_row(case: int, result: CaseResult, requirements: Sequence[Requirement]) -> Row:
+def _build_finished_row(
+    case: int, result: CaseResult, draws: Mapping[str, Scalar], requirements: Sequence[Requirement]
+) -> Row:
     """Create the row of a finished case, in plain Python values.
 
+    A column of the scenario takes precedence over a sampled value of this name, which shows that it applied.
     Raises TypeError or ValueError if a column cannot be stored, or if a metric or population column has a wrong type.
     One value of a wrong type would convert the stored column to text, so that the requirement could not be evaluated.
     """
     failure = result.failure
     if (result.outcome in ENGINE_FAILURES) != (failure is not None):
         raise ValueError(f"the outcome {result.outcome} is reserved for cases that do not finish")
-    columns = _convert_columns(result.row)
+    columns = {**draws, **_convert_columns(result.row)}
     for requirement in requirements:
         metrics, has_bound = requirement.metric_columns, requirement.bound is not None
         for name in (*requirement.population_columns, *(() if has_bound else metrics)):

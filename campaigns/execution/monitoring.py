@@ -42,8 +42,8 @@ POLL_INTERVAL_S = 0.05
 _MAX_GAP_S = 1.0
 #: Maximum seconds for starting a process and loading the code of its items, in addition to their time limits.
 _LOADING_S = 300.0
-#: Maximum bytes of the stored output of a dead process, and of a task's note.
-_MAX_OUTPUT, _MAX_NOTE = 2000, 1_000_000
+#: Maximum bytes of the stored output of a dead process.
+_MAX_OUTPUT = 2000
 #: Maximum seconds for a worker to write its stack trace.
 _DUMP_S = 0.3
 #: Maximum seconds for a worker to end after all work, and for its supervisor to kill all descendants.
@@ -118,8 +118,6 @@ class MonitoredWorker:
         (self._folder / "tmp").mkdir(parents=True)
         self._mark = f"{_MARK}={self._folder}"
         self._board = worker_process.StatusBoard.create(self._folder / "board")
-        # anonymous memory: a file of this note, with true conditions, could be read by the algorithm under test
-        self._note = os.memfd_create("note")
         self._termination: WorkerDeath | None = None
         self._loaded: Work[Any] | None = None
         self.is_loading = False
@@ -129,7 +127,7 @@ class MonitoredWorker:
         self._executor: Any = ProcessPoolExecutor(
             max_workers=1,
             initializer=worker_process.start_worker,
-            initargs=(os.getpid(), str(self._folder), self._note),
+            initargs=(os.getpid(), str(self._folder)),
             env={
                 **_WORKER_ENVIRONMENT,
                 _MARK: str(self._folder),
@@ -247,7 +245,6 @@ class MonitoredWorker:
             item = self._clock.item if self._clock.has_started else None
             death = WorkerDeath(item, cause, self._clock.was_suspended)
         self._kill()
-        death.error.note = os.pread(self._note, _MAX_NOTE, 0).decode(errors="replace")
         self.replace()
         return death
 
@@ -269,7 +266,7 @@ class MonitoredWorker:
         """Kill the process, if it is running, and prepare a new one."""
         self._kill()
         self._executor.shutdown(wait=False)
-        self._close()
+        self._board.close()
         shutil.rmtree(self._folder, ignore_errors=True)
         self._start()
 
@@ -286,9 +283,4 @@ class MonitoredWorker:
             if manager.is_alive():
                 kill_processes(find_marked_processes(self._mark))
                 manager.join(_KILLING_S)
-        self._close()
-
-    def _close(self) -> None:
-        """Release the shared memory."""
         self._board.close()
-        os.close(self._note)

@@ -144,7 +144,7 @@ class _WorkerContext:
     """Context of this worker process: status board, files, current item, and reference process state.
 
     - trace: file of the stack trace
-    - output, note: descriptors of the output file, and of the shared memory of the task's note
+    - output: descriptor of the output file
     - item, crashed: latest item, and whether it requested a fresh worker
     - files: open descriptors that an item must not close, with their identities
     """
@@ -152,7 +152,6 @@ class _WorkerContext:
     board: StatusBoard
     trace: Path
     output: int
-    note: int
     files: Mapping[int, process_state.FileIdentity]
     item: int | None = None
     state: process_state.ProcessState = field(default_factory=process_state.ProcessState)
@@ -162,12 +161,12 @@ class _WorkerContext:
 _context: _WorkerContext | None = None
 
 
-def start_worker(parent: int, folder: str, note: int) -> None:
+def start_worker(parent: int, folder: str) -> None:
     """Set up a fresh worker process.
 
     The worker leads a process group below a supervisor (`marsyard.campaigns.execution.supervisor`), which ends with the
     parent and kills the worker's descendants. The worker writes its output, and its stack trace on a fatal signal, to
-    files in `folder`. `note` is the parent's descriptor of the shared memory of notes.
+    files in `folder`.
     """
     from joblib.externals.loky import process_executor
 
@@ -187,9 +186,8 @@ def start_worker(parent: int, folder: str, note: int) -> None:
     faulthandler.register(DUMP_SIGNAL, trace_descriptor, all_threads=False, chain=False)
     # loky would end workers that grow by 300 MB; cached terrains need more memory, and the parent enforces the limits
     process_executor._USE_PSUTIL = False
-    own_note = os.open(f"/proc/{parent}/fd/{note}", os.O_RDWR)
     board = StatusBoard(Path(folder, "board"))
-    _context = _WorkerContext(board, trace, output, own_note, process_state.list_open_files())
+    _context = _WorkerContext(board, trace, output, process_state.list_open_files())
     _context.board.write(None)
 
 
@@ -261,13 +259,6 @@ def request_fresh_worker() -> None:
     """Request a fresh process for the next item, because the current item crashed and may have damaged the process."""
     if _context is not None:
         _context.crashed = True
-
-
-def record_note(text: str) -> None:
-    """Record a text for the parent in case the process ends during the task; it replaces the previous text."""
-    if _context is not None:
-        contents = text.encode(errors="replace")
-        os.ftruncate(_context.note, os.pwrite(_context.note, contents, 0))
 
 
 def accept_process_state() -> None:

@@ -46,7 +46,7 @@ from marsyard.campaigns.store.table import (
     numeric_metrics,
     write_table,
 )
-from marsyard.scenarios.systems import RowColumns, row_columns
+from marsyard.scenarios.columns import Columns, row_columns
 
 
 class ProgressObserver(Protocol):
@@ -338,12 +338,12 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
     (`marsyard.campaigns.definition.loading`). Raises ConfigurationError if a column of a requirement is missing or has
     the wrong type: a metric with a bound needs numbers, a metric without a bound and a population need booleans.
     """
-    declared_columns = row_columns(configuration.scenario) or RowColumns((), ())
+    declared_columns = row_columns(configuration.scenario) or Columns(())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
 
     def is_known(name: str, kind: str) -> bool:
-        is_declared = name not in row and (declared_columns.has_flag(name) or declared_columns.has_number(name))
+        is_declared = name not in row and (declared_columns.has(name, bool) or declared_columns.has(name, float))
         return is_declared or name in (numbers if kind == NUMBERS else flags)
 
     unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)

@@ -38,7 +38,7 @@ from marsyard.campaigns.studies.runner import (
     read_study,
     start_study,
 )
-from marsyard.scenarios.error_sources import ErrorSource, error_sources
+from marsyard.scenarios.error_sources import ScenarioSource, error_sources
 from marsyard.sim.streams import Streams
 
 #: Value of the key `kind` in the settings of this study.
@@ -165,13 +165,13 @@ def continue_budget(directory: Path, executor: ExecutorConfig, observer: Progres
     return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
 
 
-def active_sources(campaign: Campaign) -> tuple[tuple[ErrorSource, ...], tuple[str, ...]]:
+def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:
     """Return the sources of error that act in the campaign, and the titles of the other sources.
 
     A source acts if one of its parameters is dispersed, or differs from its value without the error.
     """
     parameters, dispersed = campaign.configuration.parameters, campaign.configuration.dispersions
-    active: list[ErrorSource] = []
+    active: list[ScenarioSource] = []
     inactive: list[str] = []
     for source in error_sources(campaign.configuration.scenario):
         exact = source.exact_values(parameters)
@@ -183,7 +183,7 @@ def active_sources(campaign: Campaign) -> tuple[tuple[ErrorSource, ...], tuple[s
     return tuple(active), tuple(inactive)
 
 
-def list_configurations(sources: Sequence[ErrorSource]) -> list[Configuration]:
+def list_configurations(sources: Sequence[ScenarioSource]) -> list[Configuration]:
     """List the configurations of an error budget: all sources, none, without each one, and each one alone."""
     names = tuple(source.name for source in sources)
     return [
@@ -220,7 +220,9 @@ class _Study:
                 indices, index_samples = self._run_design()
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
-        budget = compute_budget(errors, groups, self._sources, self._is_centred, settings.confidence)
+        budget = compute_budget(
+            errors, groups, [item.source for item in self._sources], self._is_centred, settings.confidence
+        )
         if budget is None and n and not reason:
             reason = (
                 f"No budget: fewer than {MIN_COMMON} base cases were answered in every configuration, all are on one "

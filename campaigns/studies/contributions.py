@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from marsyard.campaigns.studies.bootstrap import studentized_intervals
-from marsyard.scenarios.error_sources import ErrorSource
+from marsyard.sim.error_sources import ErrorSource
 
 #: Minimum number of base cases whose error has a value in all configurations.
 MIN_COMMON = 10

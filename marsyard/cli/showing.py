@@ -19,7 +19,8 @@ from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
 from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.wording import count, requirement_text, split_unit
+from marsyard.reports.wording import count, requirement_text
+from marsyard.scenarios.columns import split_unit
 
 if TYPE_CHECKING:
     from marsyard.reports.section import Grid

@@ -58,8 +58,8 @@ from marsyard.reports.wording import (
     number,
     numbers,
     percent,
-    split_unit,
 )
+from marsyard.scenarios.columns import split_unit
 
 #: Rows of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {

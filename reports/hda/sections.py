@@ -220,7 +220,7 @@ _MAP_NOTE = (
 MAP_CONDITIONS = (
     Quantity("baseline_fraction", "baseline / height"),
     Quantity("texture", "texture contrast / nominal contrast"),
-    Quantity("grid_px", "grid spacing (px)"),
+    Quantity("hda.grid_px", "grid spacing (px)"),
     Quantity("level_error_deg", "error of the estimated vertical (deg)"),
     Quantity("altimeter_fraction", "|altimeter error| (% of range)", 100.0),
 )

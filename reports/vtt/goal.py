@@ -58,7 +58,7 @@ def is_tracking(frame: pd.DataFrame) -> bool:
 
 def is_closed_loop(frame: pd.DataFrame) -> bool:
     """Whether the tracker guides the rover; in other campaigns, many targets are tracked in the same images."""
-    return is_tracking(frame) and "skipped_stops" not in frame
+    return is_tracking(frame) and "step" not in frame
 
 
 def selectable_targets(frame: pd.DataFrame, face: bool = True) -> pd.DataFrame:
@@ -68,7 +68,7 @@ def selectable_targets(frame: pd.DataFrame, face: bool = True) -> pd.DataFrame:
     the target is also on the rock's face, where the campaign defines it.
     """
     names = ["selectable", "in_view", *(["on_face"] if face else [])]
-    if "skipped_stops" in frame:
+    if "step" in frame:
         names.append("no_rover_shadow_on_target")
     return frame[rates.all_flags(frame, *names)]
 

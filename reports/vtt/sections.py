@@ -233,12 +233,12 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
     - all_targets: fraction of all targets that are tracked
     """
     frame, motion = subject.frame, _read_motion(subject)
-    if motion is None or not is_tracking(frame) or "step" not in frame or "skipped_stops" not in frame:
+    if motion is None or not is_tracking(frame) or "step" not in frame:
         return []
     cells = []
     for line, line_rows in _group_by_line(frame[frame["step"].notna()]):
         paper = motion["paper"].get(line) or motion["paper"].get("", {})
-        for _, step_rows in line_rows.groupby("skipped_stops"):
+        for _, step_rows in line_rows.groupby("step"):
             step = float(step_rows["step"].iloc[0]) * (100.0 if motion["per_cent"] else 1.0)
             selectable_rows = selectable_targets(step_rows)
             cells.append(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float64
@@ -35,13 +35,13 @@ class DescentFlight:
     - lead_s: duration of the motion before the first image
     - firing_s: time of the thrusters' firing: at the height `thruster_firing_m` above the ground, or at the end of a
       motion that ends above this height
-    - row: result columns that describe the motion
+    - row: result columns of a custom motion
     """
 
     motion: Trajectory
     lead_s: float
     firing_s: float
-    row: Mapping[str, Scalar]
+    row: Mapping[str, Scalar] = field(default_factory=dict)
 
 
 def gravity_m_s2(p: DescentScenarioParameters) -> float:
@@ -66,10 +66,9 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
             gravity_m_s2=gravity_m_s2(p),
             lead_s=SIMULATED_LEAD_S,
         )
-        columns = {f"descent_{name}": value for name, value in descent.parameters.model_dump().items()}
-        return DescentFlight(descent, SIMULATED_LEAD_S, descent.thruster_firing_s, columns)
+        return DescentFlight(descent, SIMULATED_LEAD_S, descent.thruster_firing_s)
     motion: RecordedMotion
-    row: Mapping[str, Scalar]
+    row: Mapping[str, Scalar] = {}
     if isinstance(p.flight, CustomMotion):
         inputs = MotionInputs(
             ground_height=lambda east, north: float(surface.height(site_m[0] + east, site_m[1] + north) - site_m[2]),
@@ -83,7 +82,6 @@ def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Strea
         check_looks_down(p.flight.motion, motion, times)
     else:
         motion = p.flight.motion(site_m, gravity_m_s2(p))
-        row = {"flight_file": p.flight.file, "flight_first_image_s": p.flight.start_s}
     positions = motion.motion(np.array(times)).positions_m
     heights = positions[:, 2] - surface.height(positions[:, 0], positions[:, 1])
     invalid_indices = np.flatnonzero(heights <= 0.0)

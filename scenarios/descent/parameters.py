@@ -21,6 +21,7 @@ from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
 from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
 from marsyard.sim.dynamics import SwingParameters
+from marsyard.sim.error_sources import CALIBRATION, CLOUDS, DETECTOR, SHADOW
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field, merge_settings
 from marsyard.sim.render.backend import Backend, default_backend
@@ -54,10 +55,14 @@ class Faults(SizedFaults):
     heat_shield_deg: Annotated[
         NonNegative, Field(le=90.0, description="angular diameter of the falling heat shield in the first image")
     ] = 0.0
-    cloud_cover: Annotated[NonNegative, Field(le=0.9, description="fraction of the ground in cloud shadows")] = 0.0
+    cloud_cover: Annotated[
+        NonNegative, CLOUDS, Field(le=0.9, description="fraction of the ground in cloud shadows")
+    ] = 0.0
     haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
     dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on the whole terrain")] = 0.0
-    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="mean interference bursts per image")] = 0.0
+    cable_bursts: Annotated[NonNegative, DETECTOR, Field(le=1e4, description="mean interference bursts per image")] = (
+        0.0
+    )
     exposure_delay_s: Annotated[
         NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")
     ] = 0.0
@@ -179,7 +184,9 @@ class LanderParameters(Parameters):
     camera, which moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
     """
 
-    caster_diameter_m: Annotated[float, bounded_field(0.0, 100.0, "diameter of the disc that casts the shadow")] = 10.9
+    caster_diameter_m: Annotated[
+        float, SHADOW, bounded_field(0.0, 100.0, "diameter of the disc that casts the shadow")
+    ] = 10.9
 
 
 class LandingParameters(Parameters):
@@ -212,10 +219,18 @@ class CameraParameters(Parameters):
     radial_0: Annotated[float, bounded_field(-0.1, 0.1, "radial distortion R0 (CAHVOR)")] = 0.00096
     radial_1: Annotated[float, bounded_field(-0.5, 0.5, "radial distortion R1 (CAHVOR)")] = -0.002183
     radial_2: Annotated[float, bounded_field(-0.5, 0.5, "radial distortion R2 (CAHVOR)")] = 0.018547
-    alignment_error_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")] = 0.02
-    focal_error: Annotated[float, bounded_field(0.0, 0.05, "RMS relative error of the focal length")] = 0.0002
-    centre_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the calibrated centre, full-frame")] = 0.5
-    distortion_error_px: Annotated[float, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")] = 0.3
+    alignment_error_deg: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")
+    ] = 0.02
+    focal_error: Annotated[float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of the focal length")] = (
+        0.0002
+    )
+    centre_error_px: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the calibrated centre, full-frame")
+    ] = 0.5
+    distortion_error_px: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")
+    ] = 0.3
 
 
 class RenderParameters(Parameters):

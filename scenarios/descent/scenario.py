@@ -17,10 +17,8 @@ from marsyard.scenarios.conditions import (
     add_detector_faults,
     contrast_columns,
     corrupt_images,
-    ground_columns,
     hash_images,
     image_columns,
-    optics_columns,
 )
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import (
@@ -118,10 +116,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         shared = {
             **descent.overlap,
             **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
-            **ground_columns(descent.world.ground),
             **contrast_columns(descent.images[0], p.detector),
-            **optics_columns(p.detector.optics),
-            "altimeter_sidelobe_fraction": getattr(p.altimeter, "sidelobe_fraction", np.nan),
             **instrument_errors(descent.world, descent.states, descent.measurements),
             **descent.flight.row,
             **image_columns(p.render.backend, hash_images(descent.images)),

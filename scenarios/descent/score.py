@@ -92,19 +92,12 @@ def propagate_to_firing(
 def conditions(
     p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State, instruments: Instruments
 ) -> dict[str, Scalar]:
-    """Compute the columns of a case's conditions: true states, flight azimuth before entry, IMU temperature change.
-
-    The row also contains the columns of custom instruments.
-    """
-    approach = instruments.approach
-    entry_direction = -approach.attitudes(np.array([approach.start_s])).as_matrix()[0, :, 2]
+    """Compute the columns of a case's conditions: true states, and the columns of custom instruments."""
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     row: dict[str, Scalar] = {
         "site": p.site or "plain",
         "terrain": p.location.terrain,
         **p.faults.columns,
-        "location_east_m": float(states[0].position_m[0]),
-        "location_north_m": float(states[0].position_m[1]),
         **sun_columns(world.sun.direction),
         "horizontal_speed_m_s": float(np.hypot(*states[-1].velocity_m_s[:2])),
         "descent_rate_m_s": float(states[0].position_m[2] - states[-1].position_m[2])
@@ -117,8 +110,6 @@ def conditions(
         row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
     row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in states)
     row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in states)
-    row["approach_heading_deg"] = float(np.degrees(np.arctan2(entry_direction[0], entry_direction[1])) % 360.0)
-    row["imu_warm_up_change_k"] = float(instruments.imu.gyro.warm_up.temperature_k(np.array([np.inf]))[0])
     return {**row, **instruments.row}
 
 

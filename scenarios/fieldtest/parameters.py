@@ -15,6 +15,7 @@ from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
 from marsyard.scenarios.terrain_files import site_validator
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
+from marsyard.sim.error_sources import ATTITUDE, ErrorSource
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.render import CloudParameters
 from marsyard.sim.render.backend import Backend, default_backend
@@ -63,6 +64,7 @@ class DriftParameters(Parameters):
 
     across_deg_h_k: Annotated[
         float,
+        ATTITUDE,
         Field(description="gyro bias per temperature change, deg/h/K; axis along the line: tilts the camera across it"),
     ] = 1.0
     change_k: Annotated[
@@ -103,13 +105,18 @@ class TargetParameters(Parameters):
         return self
 
 
+ELEVATION = ErrorSource("elevation", "elevation map")
+
+
 class ElevationParameters(Parameters):
     """The elevation model subtracted from the GPS height, with the accuracy class of SRTM (paper, III.D.1)."""
 
     posting_m: Annotated[Positive, Field(description="spacing of the model's samples (posts), m")] = 30.0
-    error_m: Annotated[NonNegative, Field(description="standard deviation of a post's error, m")] = 6.0
+    error_m: Annotated[NonNegative, ELEVATION, Field(description="standard deviation of a post's error, m")] = 6.0
     correlation_m: Annotated[Positive, Field(description="correlation length of post errors, m (assumed)")] = 150.0
-    interpolation_m: Annotated[NonNegative, Field(description="standard deviation of the interpolation error, m")] = 1.0
+    interpolation_m: Annotated[
+        NonNegative, ELEVATION, Field(description="standard deviation of the interpolation error, m")
+    ] = 1.0
 
 
 class ImageParameters(Parameters):

@@ -10,7 +10,8 @@ unique because the filter is causal. The change of the path in the last iteratio
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
@@ -31,6 +32,7 @@ from marsyard.sim.dynamics.rotorcraft import (
     simulate_landing,
     simulate_transit,
 )
+from marsyard.sim.error_sources import COMPASS, INERTIAL, RECEIVER
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
@@ -52,9 +54,10 @@ class HelicopterParameters(Parameters):
     air: AirParameters = AirParameters()
     transit: TransitParameters = TransitParameters()
     guidance: LandingGuidance = LandingGuidance()
-    imu: ImuParameters = SMALL_UNIT
-    rtk: RtkParameters = RtkParameters()
-    compass: TiltCompassParameters = TiltCompassParameters()
+    # the filter is tuned with the parameters of its sensors
+    imu: Annotated[ImuParameters, INERTIAL] = SMALL_UNIT
+    rtk: Annotated[RtkParameters, replace(RECEIVER, remaining=0.1)] = RtkParameters()
+    compass: Annotated[TiltCompassParameters, replace(COMPASS, remaining=0.1)] = TiltCompassParameters()
     navigation: FilterParameters = FilterParameters()
     image_clock: ClockParameters = Field(
         default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005), description="errors of the time tags (assumed)"

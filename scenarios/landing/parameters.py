@@ -21,6 +21,7 @@ from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
+from marsyard.sim.error_sources import DETECTOR, ErrorSource
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
 from marsyard.sim.sensor import (
     PRESETS,
@@ -33,6 +34,11 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.sensor.satellite_navigation import Outage
 from marsyard.sim.terrain import Site, TerrainParameters, site, sites
+
+#: Sources of error of poses that are drawn without a flight.
+RATE = ErrorSource("motion", "motion: attitude rate")
+POSE_POSITION = ErrorSource("position", "position and motion")
+POSE_ATTITUDE = ErrorSource("attitude", "attitude and inclinometers")
 
 
 class Faults(SizedFaults):
@@ -52,7 +58,9 @@ class Faults(SizedFaults):
         float, bounded_field(0.0, 300.0, "duration of the GPS outage before image 1; it lasts to the end")
     ] = 0.0
     listed_bad_pixels: Annotated[
-        float, bounded_field(0.0, 0.5, "fraction of bad pixels in the camera's list, which it fills by interpolation")
+        float,
+        DETECTOR,
+        bounded_field(0.0, 0.5, "fraction of bad pixels in the camera's list, which it fills by interpolation"),
     ] = 0.0
     vehicle_shadow_m: Annotated[
         float, bounded_field(0.0, 100.0, "diameter of the disc that casts the vehicle's shadow; also raises the sun")
@@ -135,18 +143,32 @@ class ImagePoseParameters(Parameters):
     roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the images")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="rotation about the image's right direction")] = 0.0
     yaw_deg: Annotated[Angle, Field(description="rotation about the image's up direction")] = 0.0
-    rate_deg_s: Annotated[NonNegative, Field(le=100.0, description="RMS attitude rate per axis at an image")] = 0.0
+    rate_deg_s: Annotated[NonNegative, RATE, Field(le=100.0, description="RMS attitude rate per axis at an image")] = (
+        0.0
+    )
 
 
 class NavigationParameters(Parameters):
     """Standard deviations per axis of the on-board poses and of the inclinometers, sampled for a case."""
 
-    position_m: NonNegative = Field(default=0.02, le=100.0, description="SD of the position, common to both images")
-    motion_m: Annotated[NonNegative, Field(le=10.0, description="SD of the motion between images, m")] = 0.01
-    tilt_deg: NonNegative = Field(default=0.3, le=30.0, description="SD of roll and pitch, common to both images")
-    azimuth_deg: NonNegative = Field(default=1.0, le=30.0, description="SD of the azimuth, common to both images")
-    rotation_deg: Annotated[NonNegative, Field(le=10.0, description="SD of the rotation between images")] = 0.1
-    inclinometer_deg: NonNegative = Field(default=0.2, le=30.0, description="SD of the inclinometers' roll and pitch")
+    position_m: Annotated[NonNegative, POSE_POSITION] = Field(
+        default=0.02, le=100.0, description="SD of the position, common to both images"
+    )
+    motion_m: Annotated[
+        NonNegative, POSE_POSITION, Field(le=10.0, description="SD of the motion between images, m")
+    ] = 0.01
+    tilt_deg: Annotated[NonNegative, POSE_ATTITUDE] = Field(
+        default=0.3, le=30.0, description="SD of roll and pitch, common to both images"
+    )
+    azimuth_deg: Annotated[NonNegative, POSE_ATTITUDE] = Field(
+        default=1.0, le=30.0, description="SD of the azimuth, common to both images"
+    )
+    rotation_deg: Annotated[
+        NonNegative, POSE_ATTITUDE, Field(le=10.0, description="SD of the rotation between images")
+    ] = 0.1
+    inclinometer_deg: Annotated[NonNegative, POSE_ATTITUDE] = Field(
+        default=0.2, le=30.0, description="SD of the inclinometers' roll and pitch"
+    )
 
 
 class PairParameters(Parameters):

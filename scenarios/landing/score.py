@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.hda import STAGES, HdaDetails, MatchStatus, Safety, hda_products
 from marsyard.algorithms.hda.motion import camera_pose
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.conditions import contrast_columns, ground_columns, optics_columns, sun_columns
+from marsyard.scenarios.conditions import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
@@ -306,8 +306,6 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "site": p.site,
         "terrain": p.location.terrain,
         **p.faults.columns,
-        "location_east_m": p.location.east_m,
-        "location_north_m": p.location.north_m,
         **sun_columns(case.world.sun.direction),
         "height_m": height,
         "baseline_m": float(np.linalg.norm(motion)),
@@ -326,14 +324,10 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         "true_safe_fraction": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": bool(within_limits),
         "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else NAN,
-        "texture": p.texture,
-        "grid_px": p.hda.grid_px,
         "max_slope_deg": float(np.degrees(p.hda.max_slope_rad)),
         "max_roughness_m": p.hda.max_roughness_m,
         "strict_threshold": p.hda.max_roughness_m <= truth.limits.max_roughness_m,
-        **ground_columns(case.world.ground),
         **contrast_columns(pair.counts[0], p.detector),
-        **optics_columns(p.detector.optics),
     }
 
 

@@ -19,6 +19,7 @@ from marsyard.algorithms.localisation.interface import InitialState
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.sim.camera import Cahv, Cahvore, CameraModel
 from marsyard.sim.dynamics import State, Trajectory
+from marsyard.sim.error_sources import CALIBRATION, ErrorSource
 from marsyard.sim.measurements import AltitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, RadarAltimeter, RadarParameters
@@ -38,7 +39,7 @@ class CameraParameters(Parameters):
     field_deg: Annotated[float, Field(gt=10.0, le=120.0, description="field of view from edge to edge")] = 90.0
     focal_length_mm: Annotated[float, Field(gt=1.0, le=100.0, description="focal length; sets the pixel pitch")] = 5.8
     alignment_error_deg: Annotated[
-        float, bounded_field(0.0, 10.0, "RMS error of the calibrated mounting per axis (assumed)")
+        float, CALIBRATION, bounded_field(0.0, 10.0, "RMS error of the calibrated mounting per axis (assumed)")
     ] = 0.02
     calibration: Annotated[CalibrationParameters, Field(description="errors of the calibrated lens (assumed)")] = (
         CalibrationParameters()
@@ -178,6 +179,10 @@ def measure_altitudes(
     ]
 
 
+#: The filter begins with these standard deviations.
+INITIAL = ErrorSource("initial", "initial state", remaining=0.1)
+
+
 class InitialErrors(Parameters):
     """Errors of inertial navigation at the start of localisation; all are normally distributed.
 
@@ -186,11 +191,13 @@ class InitialErrors(Parameters):
     of each other and of the inertial unit's errors.
     """
 
-    horizontal_sd_m: Annotated[NonNegative, Field(description="sd per axis before truncation, m (assumed)")] = 1000.0
+    horizontal_sd_m: Annotated[
+        NonNegative, INITIAL, Field(description="sd per axis before truncation, m (assumed)")
+    ] = 1000.0
     horizontal_max_m: Annotated[float, Field(gt=0.0, description="largest horizontal position error, m")] = 3200.0
-    vertical_sd_m: Annotated[NonNegative, Field(description="sd of the height, m (assumed)")] = 100.0
-    velocity_sd_m_s: Annotated[NonNegative, Field(description="sd per axis, m/s (assumed)")] = 1.0
-    attitude_sd_deg: Annotated[NonNegative, Field(description="sd per axis, deg (assumed)")] = 0.1
+    vertical_sd_m: Annotated[NonNegative, INITIAL, Field(description="sd of the height, m (assumed)")] = 100.0
+    velocity_sd_m_s: Annotated[NonNegative, INITIAL, Field(description="sd per axis, m/s (assumed)")] = 1.0
+    attitude_sd_deg: Annotated[NonNegative, INITIAL, Field(description="sd per axis, deg (assumed)")] = 0.1
 
     def covariance(self) -> Float64[np.ndarray, "9 9"]:
         """Compute the covariance of position (m), velocity (m/s) and attitude (rad) as drawn, with the truncation."""

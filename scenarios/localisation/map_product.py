@@ -24,6 +24,7 @@ from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.localisation.fields import SmoothField
 from marsyard.scenarios.localisation.world import LocalisationWorld, sun_at
 from marsyard.scenarios.views import SiteGround, micro_relief
+from marsyard.sim.error_sources import ErrorSource
 from marsyard.sim.frames import rigid
 from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, Texture, process_renderer
@@ -47,6 +48,10 @@ _FIELD_MARGIN_M = 500.0
 _INVERSE_STEPS, _INVERSE_CHANGE_M = 12, 1e-9
 Grid = Float32[np.ndarray, "rows columns"]
 Coordinates = Float64[np.ndarray, "count"]
+
+REGISTRATION = ErrorSource("map-registration", "map: position as a whole")
+DISTORTION = ErrorSource("map-distortion", "map: distortion")
+ELEVATION = ErrorSource("map-elevation", "map: elevation")
 
 
 class MapParameters(Parameters):
@@ -78,15 +83,17 @@ class MapParameters(Parameters):
     ] = 0.25
     bits: Annotated[int | None, Field(ge=6, le=16, description="bits of a pixel; None: not quantised")] = 8
     registration_sd_m: Annotated[
-        NonNegative, Field(description="SD of the shift of the whole map, per axis, m; assumed: up to 150 m is 3 SD")
+        NonNegative,
+        REGISTRATION,
+        Field(description="SD of the shift of the whole map, per axis, m; assumed: up to 150 m is 3 SD"),
     ] = 50.0
     distortion_sd_m: Annotated[
-        NonNegative, Field(description="SD of the distortion, per axis, m; assumed: one pixel")
+        NonNegative, DISTORTION, Field(description="SD of the distortion, per axis, m; assumed: one pixel")
     ] = 6.0
     distortion_length_m: Annotated[Positive, Field(description="correlation length of the distortion, m; assumed")] = (
         1500.0
     )
-    elevation_sd_m: Annotated[NonNegative, Field(description="SD of the elevation error, m; assumed")] = 5.0
+    elevation_sd_m: Annotated[NonNegative, ELEVATION, Field(description="SD of the elevation error, m; assumed")] = 5.0
     elevation_length_m: Annotated[
         Positive, Field(description="correlation length of the elevation error, m; assumed")
     ] = 300.0

@@ -17,14 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.scenarios.conditions import (
-    attitude_rate_deg_s,
-    contrast_columns,
-    ground_columns,
-    off_nadir_deg,
-    optics_columns,
-    sun_columns,
-)
+from marsyard.scenarios.conditions import attitude_rate_deg_s, contrast_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.localisation.map_product import MapTruth
 from marsyard.scenarios.localisation.stream import StreamAnswers
@@ -53,17 +46,9 @@ def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
     return {
         "site": p.site,
         "terrain": p.location.terrain,
-        "location_east_m": p.location.east_m,
-        "location_north_m": p.location.north_m,
-        "start_east_m": p.start_east_m,
-        "start_north_m": p.start_north_m,
         **sun_columns(world.sun.direction),
-        "map_sun_azimuth_deg": p.map.sun_azimuth_deg,
-        "map_sun_elevation_deg": p.map.sun_elevation_deg,
         "sun_difference_deg": float(np.degrees(np.arccos(cosine))),
-        **ground_columns(world.ground),
         **(contrast_columns(images[0].counts, p.detector) if images else {}),
-        **optics_columns(p.detector.optics),
         "images": len(images),
         "map_shift_m": float(np.hypot(*shift)),
         "initial_error_m": float(np.hypot(*(initial.position_m[:2] - reference))),

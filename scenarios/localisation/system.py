@@ -16,8 +16,7 @@ SYSTEM = System(
     tasks=("marsyard.scenarios.localisation.task:LOCALISATION",),
     catalogue=_FOLDER / "catalogue" / "loc-*.toml",
     requirements=_FOLDER / "requirements.toml",
-    columns=_FOLDER / "columns.toml",
-    error_sources=_FOLDER / "error_sources.toml",
+    columns={"localisation": "marsyard.scenarios.localisation.row:COLUMNS"},
     compilation_campaigns={
         "loc-smoke": (
             "terrain.samples=1024",

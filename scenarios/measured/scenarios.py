@@ -22,7 +22,7 @@ from marsyard.scenarios.base import BaseScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.descent.parameters import check_binning
 from marsyard.scenarios.estimators import LANDING, VELOCITY
-from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing.score import motion_errors, stage_row
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
@@ -160,7 +160,6 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
             "truth_known": p.case.truth.velocity_m_s is not None,
         }
-        record_conditions(conditions)
         runs = _run_algorithms(
             p, p.dimes, measurements, lambda answer: check_last_interval(answer, measurements), streams.case
         )
@@ -225,7 +224,6 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             "truth_known": true_poses is not None,
             **agreement_row(pairs),
         }
-        record_conditions(conditions)
         runs = _run_algorithms(p, p.hda, measurements, check_site, streams.case)
 
         def evaluate(algorithm: str) -> CaseResult:

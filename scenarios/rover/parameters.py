@@ -19,6 +19,7 @@ from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.scenarios.terrain_files import site_validator
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import SlipParameters
+from marsyard.sim.error_sources import CLOUDS, DETECTOR, OPTICS, SHADOW, ErrorSource
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
@@ -181,13 +182,16 @@ class LegParameters(Parameters):
         return self
 
 
+SUN_MOTION = ErrorSource("sun", "motion of the sun")
+
+
 class SunParameters(Parameters):
     """Position of the sun at the start, and motion of the sun."""
 
     azimuth_deg: Annotated[Azimuth, Field(description="azimuth of the sun, clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun above the horizon")] = 45.0
     hour_angle_deg_min: Annotated[
-        float, bounded_field(-1.0, 1.0, "rotation rate of the sun, deg/min; Table IV: 16 deg in 66 min")
+        float, SUN_MOTION, bounded_field(-1.0, 1.0, "rotation rate of the sun, deg/min; Table IV: 16 deg in 66 min")
     ] = 16.0 / 66.0
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="latitude of the site, north positive")] = -2.0
     update_interval_s: Annotated[Positive, Field(description="interval between updates of the sun's position, s")] = (
@@ -261,14 +265,18 @@ class CameraParameters(Parameters):
     )
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="both detectors; default: the preset's")
-    detector_noise: Annotated[bool, Field(description="whether images have detector noise and response")] = True
+    detector_noise: Annotated[bool, DETECTOR, Field(description="whether images have detector noise and response")] = (
+        True
+    )
     defocus_px: Annotated[
-        NonNegative, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
+        NonNegative, OPTICS, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
     ] = 0.0
     stray_light: Annotated[
-        float, bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly")
+        float, OPTICS, bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly")
     ] = 0.0
-    dust_discs: Annotated[int, Field(ge=0, le=1000, description="number of specks of dust on each camera window")] = 0
+    dust_discs: Annotated[
+        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on each camera window")
+    ] = 0
     dust_depth: Annotated[Fraction, Field(description="fraction of the light absorbed by a speck")] = 0.3
 
     @field_validator("preset")
@@ -376,8 +384,10 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     camera: CameraParameters = CameraParameters()
     exposure: ExposureParameters = ExposureParameters()
     sun: SunParameters = SunParameters()
-    clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the run")] = None
-    rover_shadow: Annotated[bool, Field(description="whether the rover and its mast cast shadows")] = True
+    clouds: Annotated[CloudParameters | None, CLOUDS, Field(description="clouds whose shadows drift over the run")] = (
+        None
+    )
+    rover_shadow: Annotated[bool, SHADOW, Field(description="whether the rover and its mast cast shadows")] = True
     timing: TimingParameters = TimingParameters()
     algorithm: str = Field(default="vtt", description="vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'")
     vtt: VttOptions = Field(default=VttOptions(), description="tracker options; pure-ncc ignores scale and roll")

@@ -314,11 +314,6 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         visibility, shadow_columns = self._visibility(key, point, p.drive.vtt)
         shared = {
             **score.fixed_conditions(case, prepare_shared_run(p, drive)),
-            "run": p.run,
-            "target": p.target,
-            "point_across": point.across,
-            "point_up": point.up,
-            "skipped_stops": p.skipped_stops,
             "step": p.step,
             "with_scale": algorithm != "pure-ncc" and p.drive.vtt.scale,
             "pure_ncc": algorithm == "pure-ncc",

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
-from marsyard.scenarios.conditions import ground_columns, optics_columns, sun_columns
+from marsyard.scenarios.conditions import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -186,16 +186,10 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "search_px": p.vtt.search_px,
         "rock_diameter_m": float(rocks.diameter_m[number]),
         "rock_height_m": float(rocks.height_m[number]),
-        "rock_shape": int(rocks.shape[number]),
-        "rock_yaw_deg": float(np.degrees(rocks.yaw_rad[number])),
-        "point_across": p.target.across,
-        "point_up": p.target.up,
         "point_on_edge": target.on_edge,
         "point_lit": target.lit,
         "selectable": target.lit and not target.on_edge,
         "incline": p.world.incline.name,
-        "slope_deg": p.world.incline.slope_deg,
-        "bearing_deg": float(np.degrees(p.bearing_rad)) % 360.0,
         "visual_odometry": any(leg.visual_odometry for leg in p.legs),
         "autonav": any(leg.autonav for leg in p.legs),
         "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
@@ -206,9 +200,6 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
         "disparity_error_goal_px": run.rig.head.disparity_error_px(GOAL_M),
         "mast_azimuth_error_deg": float(azimuth_error),
         "mast_elevation_error_deg": float(elevation_error),
-        **ground_columns(run.world.ground),
-        **optics_columns(p.camera.settings().optics),
-        "pointing_zero_deg": p.pointing.zero_deg,
     }
 
 

@@ -53,6 +53,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.dynamics.kernels import swing as kernels
 from marsyard.sim.dynamics.kernels.swing import CANOPY, Chain
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, Wind, WindParameters, check_times
+from marsyard.sim.error_sources import SWING
 from marsyard.sim.parameters import bounded_field
 
 Vector = Float64[np.ndarray, "3"]
@@ -88,9 +89,9 @@ class SwingParameters(WindParameters):
     density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "density scale height: CO2 at 220 K")] = (
         11200.0
     )
-    cone_angle_deg: Annotated[float, bounded_field(0.0, 45.0, "largest angle between the lander's axis and nadir")] = (
-        15.0
-    )
+    cone_angle_deg: Annotated[
+        float, SWING, bounded_field(0.0, 45.0, "largest angle between the lander's axis and nadir")
+    ] = 15.0
     cone_minor_fraction: Annotated[
         float, bounded_field(-1.0, 1.0, "minor / major axis of the coning; sign: sense of rotation")
     ] = 0.5
@@ -100,7 +101,7 @@ class SwingParameters(WindParameters):
         0.01
     )
     nod_rate_deg_s: Annotated[
-        float, bounded_field(0.0, 120.0, "largest rate of the nodding: fast swing of the lander on its bridle")
+        float, SWING, bounded_field(0.0, 120.0, "largest rate of the nodding: fast swing of the lander on its bridle")
     ] = 20.0
     nod_direction_deg: Annotated[
         Degrees, Field(description="azimuth of the nodding, relative to the coning's major axis")
@@ -111,7 +112,7 @@ class SwingParameters(WindParameters):
     )
     heading_deg: Annotated[Degrees, Field(description="rotation about the lander's axis at the first image")] = 0.0
     spin_rate_deg_s: Annotated[
-        float, bounded_field(-30.0, 30.0, "spin rate about the lander's axis at the first image")
+        float, SWING, bounded_field(-30.0, 30.0, "spin rate about the lander's axis at the first image")
     ] = 0.0
     line_length_m: Annotated[float, bounded_field(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
     bridle_length_m: Annotated[float, bounded_field(1.0, 100.0, "from the backshell to the hinge")] = 20.0

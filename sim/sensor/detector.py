@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from scipy.ndimage import uniform_filter
 from scipy.optimize import brentq
 
+from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
 from marsyard.sim.sensor.optics import (
@@ -43,9 +44,9 @@ Delivered = UInt16[np.ndarray, "delivered_rows columns"]
 class DefectParameters(Parameters):
     """Defective pixels; none by default."""
 
-    hot_fraction: Annotated[Fraction, Field(description="fraction of hot pixels")] = 0.0
+    hot_fraction: Annotated[Fraction, DETECTOR, Field(description="fraction of hot pixels")] = 0.0
     hot_e_s: Annotated[NonNegative, Field(description="mean dark current of a hot pixel at 0 deg C, e/s")] = 20000.0
-    dead_fraction: Annotated[Fraction, Field(description="fraction of pixels without response")] = 0.0
+    dead_fraction: Annotated[Fraction, DETECTOR, Field(description="fraction of pixels without response")] = 0.0
     listed: Annotated[bool, Field(description="bad pixels are listed and interpolated")] = False
 
 
@@ -57,7 +58,7 @@ BURST_DN, BURST_PX = 300.0, 2048.0
 class BurstParameters(Parameters):
     """Bursts of noise on the cable during the readout; none by default."""
 
-    bursts: Annotated[NonNegative, Field(le=1e4, description="mean number of bursts in an image")] = 0.0
+    bursts: Annotated[NonNegative, DETECTOR, Field(le=1e4, description="mean number of bursts in an image")] = 0.0
     length_px: Annotated[float, Field(gt=0.0, le=1e7, description="mean length of a burst, delivered pixels")] = 2000.0
     amplitude_dn: Annotated[NonNegative, Field(description="RMS of the noise in a burst, counts")] = 300.0
 
@@ -78,15 +79,19 @@ class DetectorParameters(Parameters):
     readout_row_s: Annotated[NonNegative, Field(description="time to read out a delivered row, s")] = 5.3e-3
     full_well_e: Annotated[Positive, Field(description="full well, electrons")] = 170000.0
     gain_e_dn: Annotated[Positive, Field(description="electrons per count")] = 41.5
-    photon_noise: Annotated[bool, Field(description="whether the charge has Poisson noise")] = True
-    read_noise_e: Annotated[NonNegative, Field(description="read noise, electrons")] = 25.0
+    photon_noise: Annotated[bool, DETECTOR, Field(description="whether the charge has Poisson noise")] = True
+    read_noise_e: Annotated[NonNegative, DETECTOR, Field(description="read noise, electrons")] = 25.0
     offset_dn: Annotated[NonNegative, Field(description="counts without light")] = 20.0
     bits: Annotated[int, Field(ge=8, le=16, description="bits of a count")] = 12
     temperature_c: Annotated[float, Field(ge=-150.0, le=80.0, description="temperature of the detector, deg C")] = -34.0
     dark_e_s: Annotated[NonNegative, Field(description="dark current of a pixel at 0 deg C, electrons/s")] = 159.0
     dark_doubling_c: Annotated[float, Field(gt=0.0, le=50.0, description="temperature rise for doubling, deg C")] = 6.0
-    response_spread: Annotated[_RelativeError, Field(description="RMS of the pixels' relative response")] = 0.01
-    calibration_error: Annotated[_RelativeError, Field(description="RMS error of the calibrated response")] = 0.002
+    response_spread: Annotated[_RelativeError, DETECTOR, Field(description="RMS of the pixels' relative response")] = (
+        0.01
+    )
+    calibration_error: Annotated[
+        _RelativeError, DETECTOR, Field(description="RMS error of the calibrated response")
+    ] = 0.002
     companded: Annotated[bool, Field(description="compress counts to 8 bits and expand them again")] = False
     optics: OpticsParameters = OpticsParameters()
     defects: DefectParameters = DefectParameters()

@@ -22,6 +22,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.error_sources import ACCELERATION, ATTITUDE
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.imu import Imu, Vector, Vectors, accumulate_quaternions, multiply_quaternions
@@ -119,9 +120,15 @@ class ApproachParameters(Parameters):
     scale factor error of the spin-axis gyro after its calibration against the stars during cruise.
     """
 
-    attitude_sd_deg: Annotated[NonNegative, Field(description="attitude error at the reference per axis, deg")] = 0.05
-    velocity_sd_m_s: Annotated[NonNegative, Field(description="velocity error at the reference per axis, m/s")] = 1.0
-    spin_scale_ppm: Annotated[NonNegative, Field(description="scale factor error of the spin gyro, ppm")] = 100.0
+    attitude_sd_deg: Annotated[
+        NonNegative, ATTITUDE, Field(description="attitude error at the reference per axis, deg")
+    ] = 0.05
+    velocity_sd_m_s: Annotated[
+        NonNegative, ACCELERATION, Field(description="velocity error at the reference per axis, m/s")
+    ] = 1.0
+    spin_scale_ppm: Annotated[NonNegative, ATTITUDE, Field(description="scale factor error of the spin gyro, ppm")] = (
+        100.0
+    )
     cruise_s: Annotated[NonNegative, Field(le=20000.0, description="time from star reference to entry, s")] = 900.0
     entry_s: Annotated[Positive, Field(le=2000.0, description="time from entry to parachute deployment, s")] = 240.0
     parachute_s: Annotated[Positive, Field(le=2000.0, description="time from deployment to the descent, s")] = 80.0

@@ -12,6 +12,7 @@ from numpy.random import Generator
 from pydantic import Field
 from scipy.interpolate import make_interp_spline
 
+from marsyard.sim.error_sources import TIME_TAGS
 from marsyard.sim.parameters import Parameters
 
 #: Knots per correlation time. Linear interpolation between knots reduces the variance by at most 1 %.
@@ -58,9 +59,9 @@ class Sampling:
 class ClockParameters(Parameters):
     """Errors of time tags: tag minus true time."""
 
-    offset_s: Annotated[float, Field(ge=-10.0, le=10.0, description="mean of the constant offset, s")] = 0.0
-    offset_sd_s: Annotated[_Deviation, Field(description="sd of the constant offset between units, s")] = 0.0
-    jitter_sd_s: Annotated[_Deviation, Field(description="sd of the random part of each tag, s")] = 0.0
+    offset_s: Annotated[float, TIME_TAGS, Field(ge=-10.0, le=10.0, description="mean of the constant offset, s")] = 0.0
+    offset_sd_s: Annotated[_Deviation, TIME_TAGS, Field(description="sd of the constant offset between units, s")] = 0.0
+    jitter_sd_s: Annotated[_Deviation, TIME_TAGS, Field(description="sd of the random part of each tag, s")] = 0.0
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera import CameraModel
+from marsyard.sim.error_sources import POINTING, STEREO
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry
 from marsyard.sim.parameters import Parameters
@@ -58,20 +59,24 @@ class PointingParameters(Parameters):
     the other values are assumed.
     """
 
-    zero_deg: Annotated[Degrees, Field(description="zero offset of the mast's encoders, constant in a run, deg")] = 0.1
-    backlash_deg: Annotated[Degrees, Field(description="full width of the backlash, deg")] = 0.1
-    settling_deg: Annotated[Degrees, Field(description="motor stop minus command, deg")] = 0.01
-    count_deg: Annotated[Degrees, Field(description="encoder resolution, deg; 0: no rounding")] = 0.005
+    zero_deg: Annotated[
+        Degrees, POINTING, Field(description="zero offset of the mast's encoders, constant in a run, deg")
+    ] = 0.1
+    backlash_deg: Annotated[Degrees, POINTING, Field(description="full width of the backlash, deg")] = 0.1
+    settling_deg: Annotated[Degrees, POINTING, Field(description="motor stop minus command, deg")] = 0.01
+    count_deg: Annotated[Degrees, POINTING, Field(description="encoder resolution, deg; 0: no rounding")] = 0.005
 
 
 class StereoCalibrationParameters(Parameters):
     """Calibration errors of a stereo pair; all except the disparity error are standard deviations."""
 
-    disparity_error_px: Annotated[Pixels, Field(description="limit of the uniform disparity error, px")] = 0.5
-    epipolar_error_px: Annotated[Pixels, Field(description="perpendicular to the epipolar lines, px")] = 0.2
-    alignment_deg: Annotated[Degrees, Field(description="alignment error of the pair per axis, deg")] = 0.05
-    roll_deg: Annotated[Degrees, Field(description="roll error of each camera, deg")] = 0.01
-    focal_error: Annotated[float, Field(ge=0.0, le=0.05, description="relative error of each focal length")] = 1e-4
+    disparity_error_px: Annotated[Pixels, STEREO, Field(description="limit of the uniform disparity error, px")] = 0.5
+    epipolar_error_px: Annotated[Pixels, STEREO, Field(description="perpendicular to the epipolar lines, px")] = 0.2
+    alignment_deg: Annotated[Degrees, STEREO, Field(description="alignment error of the pair per axis, deg")] = 0.05
+    roll_deg: Annotated[Degrees, STEREO, Field(description="roll error of each camera, deg")] = 0.01
+    focal_error: Annotated[float, STEREO, Field(ge=0.0, le=0.05, description="relative error of each focal length")] = (
+        1e-4
+    )
 
 
 @dataclass(frozen=True)

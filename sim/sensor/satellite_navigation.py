@@ -19,6 +19,7 @@ from numpy.random import Generator
 from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.error_sources import RECEIVER
 from marsyard.sim.parameters import Fraction, Parameters, Positive
 from marsyard.sim.sensor.imu import Vectors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Readings, Sampling, Times
@@ -31,12 +32,12 @@ class GpsParameters(Parameters):
     """Parameters of a GPS receiver; errors are standard deviations per axis."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=1000.0, description="fixes per second")] = 10.0
-    horizontal_noise_m: Annotated[NonNegative, Field(description="white noise per fix, m")] = 0.3
-    vertical_noise_m: Annotated[NonNegative, Field(description="white noise per fix, m")] = 0.6
-    horizontal_wander_m: Annotated[NonNegative, Field(description="time-correlated error, m")] = 1.5
-    vertical_wander_m: Annotated[NonNegative, Field(description="time-correlated error, m")] = 3.0
+    horizontal_noise_m: Annotated[NonNegative, RECEIVER, Field(description="white noise per fix, m")] = 0.3
+    vertical_noise_m: Annotated[NonNegative, RECEIVER, Field(description="white noise per fix, m")] = 0.6
+    horizontal_wander_m: Annotated[NonNegative, RECEIVER, Field(description="time-correlated error, m")] = 1.5
+    vertical_wander_m: Annotated[NonNegative, RECEIVER, Field(description="time-correlated error, m")] = 3.0
     correlation_s: Annotated[float, Field(gt=0.0, description="correlation time, s")] = 300.0
-    latency_s: Annotated[float, Field(ge=0.0, le=10.0, description="delay from fix to delivery, s")] = 0.1
+    latency_s: Annotated[float, RECEIVER, Field(ge=0.0, le=10.0, description="delay from fix to delivery, s")] = 0.1
     clock: ClockParameters = ClockParameters()
 
 
@@ -76,8 +77,8 @@ class Gps:
 class SolutionErrors(Parameters):
     """Errors of one type of solution: standard deviations along east, north and up."""
 
-    wander_m: Annotated[PerAxis, Field(description="time-correlated error, m")]
-    noise_m: Annotated[PerAxis, Field(description="white noise per solution, m")]
+    wander_m: Annotated[PerAxis, RECEIVER, Field(description="time-correlated error, m")]
+    noise_m: Annotated[PerAxis, RECEIVER, Field(description="white noise per solution, m")]
     correlation_s: Annotated[Positive, Field(le=10000.0, description="correlation time, s")]
 
     @property
@@ -110,8 +111,12 @@ class RtkParameters(Parameters):
     floating: SolutionErrors = _FLOATING
     float_fraction: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
-    velocity_noise_m_s: Annotated[PerAxis, Field(description="velocity noise per solution")] = (0.03, 0.03, 0.05)
-    velocity_wander_m_s: Annotated[PerAxis, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
+    velocity_noise_m_s: Annotated[PerAxis, RECEIVER, Field(description="velocity noise per solution")] = (
+        0.03,
+        0.03,
+        0.05,
+    )
+    velocity_wander_m_s: Annotated[PerAxis, RECEIVER, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
     velocity_correlation_s: Annotated[Positive, Field(description="correlation time of the velocity error, s")] = 10.0
     reported_spread: Annotated[Fraction, Field(description="sd of log(reported / true deviation)")] = 0.1
     outages: Annotated[tuple[Outage, ...], Field(description="times without solutions")] = ()

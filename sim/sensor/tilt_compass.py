@@ -17,6 +17,7 @@ from jaxtyping import Float64
 from pydantic import Field
 
 from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.error_sources import COMPASS
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor.imu import Vectors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling, Times
@@ -35,13 +36,15 @@ class TiltCompassParameters(Parameters):
     """
 
     rate_hz: Annotated[float, Field(gt=0.0, le=100.0, description="readings per second")] = 16.0
-    tilt_bias_deg: Annotated[Degrees, Field(description="inclinometer bias, mounting included")] = 0.2
-    tilt_noise_deg: Annotated[Degrees, Field(description="inclinometer noise per reading")] = 0.15
+    tilt_bias_deg: Annotated[Degrees, COMPASS, Field(description="inclinometer bias, mounting included")] = 0.2
+    tilt_noise_deg: Annotated[Degrees, COMPASS, Field(description="inclinometer noise per reading")] = 0.15
     lag_s: Annotated[float, Field(gt=0.0, le=5.0, description="time constant of the inclinometers, s")] = 0.2
-    heading_bias_deg: Annotated[Degrees, Field(description="heading bias, mounting and declination included")] = 0.8
-    hard_iron_deg: Annotated[Degrees, Field(description="amplitudes of sine and cosine of the heading")] = 0.5
-    soft_iron_deg: Annotated[Degrees, Field(description="amplitudes for twice the heading")] = 0.25
-    heading_noise_deg: Annotated[Degrees, Field(description="heading noise per reading")] = 0.3
+    heading_bias_deg: Annotated[
+        Degrees, COMPASS, Field(description="heading bias, mounting and declination included")
+    ] = 0.8
+    hard_iron_deg: Annotated[Degrees, COMPASS, Field(description="amplitudes of sine and cosine of the heading")] = 0.5
+    soft_iron_deg: Annotated[Degrees, COMPASS, Field(description="amplitudes for twice the heading")] = 0.25
+    heading_noise_deg: Annotated[Degrees, COMPASS, Field(description="heading noise per reading")] = 0.3
     dip_deg: Annotated[float, Field(ge=-85.0, le=85.0, description="magnetic field below the horizon, deg")] = 59.0
     count_deg: Annotated[Degrees, Field(description="heading resolution, deg; 0: no rounding")] = 0.1
     heading_stuck_s: Annotated[float | None, Field(description="true time after which the heading is stuck")] = None

@@ -1,36 +1,32 @@
-"""Check in all scenario tests that rows contain only the columns that `scenarios/columns.toml` declares."""
+"""Check in all scenario tests that rows contain only the columns that the scenario declares, with their types."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
+from marsyard.scenarios.columns import ENGINE, Columns, row_columns
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.systems import RowColumns, row_columns, scenario_paths
+from marsyard.scenarios.systems import scenario_paths
 
 
-def _list_undeclared_columns(row: Any, declared_columns: RowColumns, custom_prefixes: tuple[str, ...]) -> list[str]:
-    """Return the undeclared columns of numbers and booleans.
+def _list_undeclared_columns(row: Any, declared_columns: Columns, custom_prefixes: tuple[str, ...]) -> list[str]:
+    """Return the undeclared columns, without the label of a compared algorithm, which precedes a dot.
 
-    The name of a compared algorithm, which precedes a dot, is removed before the check. In the name of a `footprints_`
-    column, a dot is a decimal point.
+    In the name of a `footprints_` column, a dot is a decimal point.
     """
+    declared = Columns((*declared_columns, *ENGINE))
     undeclared_names = []
     for name, value in row.items():
         column = name.rpartition(".")[2] if not name.startswith("footprints_") else name
-        is_flag = isinstance(value, bool)
-        is_declared = (
-            (declared_columns.has_flag(column) or column == "answered")
-            if is_flag
-            else declared_columns.has_number(column)
-        )
-        if not isinstance(value, str) and not is_declared and not column.startswith(custom_prefixes):
+        kind = float if isinstance(value, int | float) and not isinstance(value, bool) else type(value)
+        if not declared.has(column, kind) and not column.startswith(custom_prefixes):
             undeclared_names.append(name)
     return undeclared_names
 
 
-def add_column_check(run: Callable[..., CaseResult], declared_columns: RowColumns) -> Callable[..., CaseResult]:
+def add_column_check(run: Callable[..., CaseResult], declared_columns: Columns) -> Callable[..., CaseResult]:
     """Return a wrapper of a scenario's `run` method that checks the columns of each row."""
 
     def run_and_check(self: Any, parameters: Any, streams: Any) -> CaseResult:
@@ -41,9 +37,7 @@ def add_column_check(run: Callable[..., CaseResult], declared_columns: RowColumn
         score_specs: tuple[str, ...] = getattr(score_parameters, "scores", ())
         custom_prefixes = (*(flag.name for flag in flags), *(f"{spec.rpartition(':')[2]}_" for spec in score_specs))
         undeclared_columns = _list_undeclared_columns(result.row, declared_columns, custom_prefixes)
-        assert not undeclared_columns, (
-            f"columns that scenarios/columns.toml does not declare for {self.name}: {undeclared_columns}"
-        )
+        assert not undeclared_columns, f"columns that {self.name} does not declare: {undeclared_columns}"
         return result
 
     return run_and_check

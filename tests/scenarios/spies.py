@@ -133,12 +133,3 @@ class RaisingTracker(TrackerSpy):
         if any(isinstance(inputs, RoverMeasurements) for inputs in RECORDED_INPUTS):
             raise RuntimeError("the tracker raised")
         return super().update(measurements)
-
-
-class ExitingAlgorithm:
-    """Algorithm for any task that raises SystemExit in each method."""
-
-    def _exit(self, *_: object) -> None:
-        raise SystemExit("the algorithm exits")
-
-    estimate = designate = aim = update = clear = state = _exit

@@ -20,7 +20,7 @@ from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.verdicts import Status
 from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.conformance.inputs import descent
-from marsyard.scenarios.interface import CaseResult, Scalar, conditions_recorded_by
+from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import scenario
 from marsyard.scenarios.velocity import run_estimator
 from marsyard.sim.streams import Streams
@@ -145,23 +145,6 @@ def test_answers_are_converted_to_numpy_arrays_and_floats() -> None:
     )
     assert all(type(array) is np.ndarray and array.dtype == np.float64 for array in arrays)
     assert [type(entry) for entry in check_velocity(velocity).span_s or ()] == [float, float]
-
-
-@pytest.mark.parametrize(
-    ("name", "flags"),
-    [
-        ("descent", {"feasible_overlap", "terrain"}),
-        ("fieldtest", {"one_direction", "clear_sky"}),
-        ("landing", {"wide_site_exists", "no_safe_site_exists", "within_limits"}),
-        ("rover", {"selectable", "navcam", "roll_compensated"}),
-        ("rover-drive", {"selectable", "in_view", "on_face", "with_scale"}),
-    ],
-)
-def test_conditions_are_recorded_before_the_algorithm_runs(name: str, flags: set[str]) -> None:
-    conditions: dict[str, Scalar] = {}
-    with conditions_recorded_by(conditions.update), pytest.raises(SystemExit):
-        run_small_case(name, "ExitingAlgorithm")
-    assert flags <= conditions.keys()
 
 
 def test_runs_with_a_tracker_exception_count_as_failures() -> None:

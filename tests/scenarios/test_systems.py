@@ -1,8 +1,6 @@
 """Tests of the registry of systems: systems of installed packages are registered, invalid systems are omitted."""
 
-import fnmatch
 import json
-import re
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,6 +14,8 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
+from marsyard.scenarios import columns as column_declarations
+from marsyard.scenarios.columns import ENGINE, label, row_columns
 from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
     BUILT_IN,
@@ -24,7 +24,6 @@ from marsyard.scenarios.systems import (
     find_system,
     problems,
     registry,
-    row_columns,
     scenario,
     scenario_names,
     scenario_paths,
@@ -33,7 +32,16 @@ from marsyard.scenarios.systems import (
     template_paths,
 )
 
-CACHED_FUNCTIONS = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
+CACHED_FUNCTIONS = (
+    registry,
+    row_columns,
+    column_declarations._all_columns,
+    column_declarations.find_column,
+    column_declarations.label,
+    shipped_names,
+    requirements.shipped_requirements,
+    requirements._read_shipped,
+)
 HEADER = "from pathlib import Path\nfrom marsyard.scenarios.systems import System\nHERE = Path(__file__).parent\n"
 Install = Callable[..., None]
 
@@ -94,30 +102,28 @@ def test_built_in_systems_are_complete() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(scenario_paths()))
-def test_conditions_are_columns_and_no_results(name: str) -> None:
+def test_columns_are_declared_once_with_a_meaning(name: str) -> None:
     columns = row_columns(name)
     assert columns is not None
-    assert columns.conditions
-    # a pattern is a column or matches one
-    assert [
-        pattern for pattern in columns.conditions if not fnmatch.filter([*columns.numbers, *columns.flags], pattern)
-    ] == []
-    conditions = {number for pattern in columns.conditions for number in fnmatch.filter(columns.numbers, pattern)}
-    results = re.compile(
-        r"estimat|footprint|touchdown|^site_|^position_error|^velocity_error|^firing|inliers|tracks|tracked|matche[sd]"
-        r"|^elevation_|_safe$|_unflagged$|_time_s$|residual|nees|_sd_|^lost|^false|^updates$|^update_"
-    )
-    assert [column for column in conditions if results.search(column)] == []
+    declared = [(column.name, column.type) for column in (*columns, *ENGINE)]
+    assert len(declared) == len(set(declared))
+    assert all(column.meaning for column in columns)
+    # a result has the name of a condition in no system, because reports find declarations by name
+    results = {column.name for column in columns if column.type is float and not columns.is_condition(column.name)}
+    others = [other for scenario_name in scenario_paths() if (other := row_columns(scenario_name)) is not None]
+    assert [column for column in results if any(other.is_condition(column) for other in others)] == []
 
 
 def test_system_of_another_package_is_registered(install: Install) -> None:
-    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'limits.toml', columns=HERE / 'columns.toml'"
+    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'limits.toml', columns={'mine-case': 'mine:COLUMNS'}"
+    columns_source = "from marsyard.scenarios.columns import Columns, error\n"
+    columns_source += "COLUMNS = Columns((error('metres', 'length of a metre'),))\n"
     requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
-        _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
+        columns_source
+        + _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
         **{"mine-one": 'scenario = "mine-case"\n', "limits": f'[[requirements]]\nid = "MINE"\n{requirement}'},
-        columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
     assert not problems()
     assert systems()[-1].name == "mine"
@@ -126,8 +132,8 @@ def test_system_of_another_package_is_registered(install: Install) -> None:
     assert requirements.shipped_requirements()["MINE"].bound == 1.0
     columns = row_columns("mine-case")
     assert columns is not None
-    assert columns.has_number("metres")
-    assert columns.conditions == ()
+    assert columns.has("metres", float)
+    assert label("metres") == "metres"
     campaigns = json.loads(CliRunner().invoke(app, ["list", "--json"]).stdout)
     assert "mine-one" in [entry["name"] for entry in campaigns]
 
@@ -158,7 +164,6 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
             _format_system("mine", ", catalogue=HERE / 'hda-*.toml'"),
             "the system 'hda' already has the campaign 'hda-map'",
         ),
-        (_format_system("mine", ", columns=HERE / 'none.toml'"), "these files do not exist: "),
         (_format_system("mine", ", catalogue=HERE / 'none-*.toml'"), "these files do not exist: "),
     ],
 )
@@ -198,9 +203,7 @@ def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path)
 
 def test_invalid_columns_affect_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
     scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
-    install(
-        "mine", _format_system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = ["
-    )
-    with pytest.raises(ValueError, match=r"columns\.toml: invalid columns: TOMLDecodeError"):
+    install("mine", _format_system("mine", ", columns={'mine-case': 'mine:HERE'}").replace("x:Y", scenario_path))
+    with pytest.raises(ValueError, match=r"mine:HERE is a PosixPath; allowed: a marsyard\.scenarios\.columns\.Columns"):
         row_columns("mine-case")
     assert row_columns("descent") is not None

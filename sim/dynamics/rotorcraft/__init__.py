@@ -29,6 +29,7 @@ from pydantic import Field
 
 from marsyard.sim.dynamics.rotorcraft import kernels
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates, check_times
+from marsyard.sim.error_sources import VIBRATION, WIND
 from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 
 Gain = Annotated[float, Field(gt=0.0, le=10.0)]
@@ -44,17 +45,19 @@ class VibrationParameters(Parameters):
     """
 
     rate_hz: Annotated[Positive, Field(le=45.0, description="frequency of the rotor, 1/s")] = 22.0
-    acceleration_m_s2: Annotated[NonNegative, Field(le=20.0, description="amplitude along each world axis")] = 1.5
-    angle_deg: Annotated[NonNegative, Field(le=1.0, description="amplitude of yaw, pitch and roll")] = 0.03
+    acceleration_m_s2: Annotated[
+        NonNegative, VIBRATION, Field(le=20.0, description="amplitude along each world axis")
+    ] = 1.5
+    angle_deg: Annotated[NonNegative, VIBRATION, Field(le=1.0, description="amplitude of yaw, pitch and roll")] = 0.03
 
 
 class AirParameters(Parameters):
     """Wind at the helicopter: mean wind, and gusts as first-order Markov processes (Dryden's longitudinal spectrum)."""
 
-    east_m_s: Annotated[float, bounded_field(-15.0, 15.0, "mean wind to the east")] = 1.0
-    north_m_s: Annotated[float, bounded_field(-15.0, 15.0, "mean wind to the north")] = 1.0
-    gust_m_s: Annotated[NonNegative, Field(le=5.0, description="RMS of the gusts per horizontal axis")] = 0.7
-    vertical_gust_m_s: Annotated[NonNegative, Field(le=5.0, description="RMS of the vertical gusts")] = 0.2
+    east_m_s: Annotated[float, WIND, bounded_field(-15.0, 15.0, "mean wind to the east")] = 1.0
+    north_m_s: Annotated[float, WIND, bounded_field(-15.0, 15.0, "mean wind to the north")] = 1.0
+    gust_m_s: Annotated[NonNegative, WIND, Field(le=5.0, description="RMS of the gusts per horizontal axis")] = 0.7
+    vertical_gust_m_s: Annotated[NonNegative, WIND, Field(le=5.0, description="RMS of the vertical gusts")] = 0.2
     correlation_s: Annotated[Positive, Field(le=60.0, description="correlation time of the gusts")] = 2.0
 
 

@@ -21,14 +21,7 @@ import pytest
 from marsyard.algorithms.processes import used_memory
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
 from marsyard.campaigns.execution.batches import MAX_BATCH, Batches
-from marsyard.campaigns.execution.worker_process import (
-    StatusBoard,
-    TaskResult,
-    Work,
-    WorkLimits,
-    record_note,
-    run_batch,
-)
+from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits, run_batch
 from marsyard.campaigns.execution.workers import LocalExecutor
 
 pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
@@ -301,27 +294,6 @@ def test_status_board_shows_item(tmp_path: Path) -> None:
     StatusBoard(tmp_path / "board").write(2**40)
     assert board.read() == 2**40
     board.close()
-
-
-def record_note_and_end(case_text: str, item: int) -> list[str]:
-    """Record a note; return the files of the worker, found as a child process would find them, that contain it."""
-    record_note(case_text)
-    if item == 1:
-        os.abort()
-    worker_folder = Path(os.environ["MARSYARD_WORKER"])
-    paths = [path for path in worker_folder.parents[1].rglob("*") if path.is_file()]
-    assert worker_folder / "board" in paths
-    return [path.name for path in paths if case_text.encode() in path.read_bytes()]
-
-
-def test_notes_with_true_conditions_are_in_no_file_and_reach_the_parent() -> None:
-    task = partial(record_note_and_end, "true velocity 12.5")
-    with LocalExecutor(1) as workers:
-        results = {result.item: result for result in run_items(workers, task, range(2))}
-    assert results[0].result == []
-    error = results[1].error
-    assert isinstance(error, WorkerExitError)
-    assert error.note == "true velocity 12.5"
 
 
 def get_worker_number(_: int) -> str:

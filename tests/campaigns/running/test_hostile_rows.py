@@ -1,10 +1,11 @@
-"""Tests of cases with invalid rows or closed files: they are recorded as crashed, with reason and conditions."""
+"""Tests of cases with invalid rows or closed files: they are recorded as crashed, with reason and sampled values."""
 
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.stored import read_run
@@ -18,6 +19,10 @@ TOP_LEVEL_KEYS = """
 name = "hostile"
 scenario = "tests.campaigns.hostile_scenario:HostileScenario"
 cases = 24
+"""
+DISPERSIONS = """
+[dispersions]
+height_m = { distribution = "uniform", low = 10.0, high = 20.0, source = "test" }
 """
 REQUIREMENTS = """
 [[requirements]]
@@ -46,7 +51,7 @@ REASONS = {
 def hostile_campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run a campaign with two cases per fault on two workers."""
     folder = tmp_path_factory.mktemp("hostile")
-    path = write_campaign(folder, top_level_keys=TOP_LEVEL_KEYS, dispersions="", requirement=REQUIREMENTS)
+    path = write_campaign(folder, top_level_keys=TOP_LEVEL_KEYS, dispersions=DISPERSIONS, requirement=REQUIREMENTS)
     return run(path, folder / "hostile", RecordingWatch())
 
 
@@ -66,9 +71,11 @@ def test_invalid_rows_are_recorded_as_crashed_with_reason(rows: list[Any]) -> No
             assert reason in row["error"], row
 
 
-def test_conditions_of_crashed_cases_are_stored(rows: list[Any]) -> None:
-    """Conditions are stored even if the worker process of the case died."""
-    assert [(row["is_low"], row["height_m"]) for row in rows] == [(True, 10.0 + row["case"]) for row in rows]
+def test_sampled_values_of_crashed_cases_are_stored(hostile_campaign: Path, rows: list[Any]) -> None:
+    """Sampled values are stored even if the worker process of the case died."""
+    campaign = load_campaign(str(hostile_campaign.parent / "campaign.toml"))
+    assert len({row["height_m"] for row in rows}) == len(rows)
+    assert [row["height_m"] for row in rows] == [campaign.draws(row["case"])["height_m"] for row in rows]
 
 
 def test_crashed_cases_count_as_failures_of_their_population(hostile_campaign: Path) -> None:

@@ -2,12 +2,12 @@
 
 import math
 import time
-from typing import ClassVar
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
 
-from marsyard.scenarios.error_sources import ErrorSource
 from marsyard.scenarios.interface import CaseResult
+from marsyard.sim.error_sources import ErrorSource
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 
@@ -44,6 +44,11 @@ confidence = 0.9
 """
 
 
+GYRO, RADAR, FAN = (
+    ErrorSource(name, title) for name, title in (("gyro", "gyroscope"), ("radar", "radar"), ("fan", "fan"))
+)
+
+
 class ErrorModelParameters(BaseModel):
     """Parameters of `ErrorModelScenario`; all errors have the same unit.
 
@@ -62,12 +67,12 @@ class ErrorModelParameters(BaseModel):
 
     load: float = 0.0
     unused: float = 0.0
-    gyro_sd: float = 3.0
-    radar_sd: float = 2.0
-    drift: float = 1.0
+    gyro_sd: Annotated[float, GYRO] = 3.0
+    radar_sd: Annotated[float, RADAR] = 2.0
+    drift: Annotated[float, RADAR] = 1.0
     interaction: float = 0.0
     floor_sd: float = 1.0
-    fan: bool = False
+    fan: Annotated[bool, FAN] = False
     sleep_s: float = 0.0
     refused_fraction: float = 0.0
 
@@ -82,12 +87,6 @@ class ErrorModelScenario(ScenarioWithoutInputs):
 
     name = "error-model"
     parameters_type = ErrorModelParameters
-    #: Sources may name parameters that the scenario does not have.
-    error_sources: ClassVar[tuple[ErrorSource, ...]] = (
-        ErrorSource("gyro", "gyroscope", ("gyro_sd", "parameter_of_another_scenario")),
-        ErrorSource("radar", "radar", ("radar_sd", "drift")),
-        ErrorSource("fan", "fan", ("fan",)),
-    )
 
     def run(self, parameters: ErrorModelParameters, streams: Streams) -> CaseResult:
         p = parameters

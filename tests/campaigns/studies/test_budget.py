@@ -25,8 +25,9 @@ from marsyard.campaigns.studies.contributions import compute_budget
 from marsyard.reports.budget import budget_sentences, read_budget
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
-from marsyard.scenarios.error_sources import ErrorSource, error_sources
+from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.systems import scenario_names
+from marsyard.sim.error_sources import ErrorSource
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read_case_rows
 from tests.campaigns.studies.error_model import CAMPAIGN
 from tests.campaigns.studies.killing import kill_and_resume
@@ -68,7 +69,7 @@ def count_covered(cases: int, trials: int, seed: int) -> int:
     number from 0 to 2, whose mean square is 4/3.
     """
     rng = np.random.default_rng(seed)
-    sources = [ErrorSource("a", "a", ()), ErrorSource("b", "b", ())]
+    sources = [ErrorSource("a", "a"), ErrorSource("b", "b")]
     truth = {"a": 9.0, "b": 4.0 * 4.0 / 3.0}
     hits = 0
     for _ in range(trials):
@@ -97,7 +98,7 @@ def test_intervals_account_for_the_skewness_of_mean_squares() -> None:
     """The interval of a mean of squares is longer above than below, and contains that of Student."""
     rng = np.random.default_rng(4)
     errors = rng.standard_normal((6, 50)) * np.array([3.0, 1.0, 2.0, 2.0, 2.0, 2.0])[:, None]
-    sources = [ErrorSource("a", "a", ()), ErrorSource("b", "b", ())]
+    sources = [ErrorSource("a", "a"), ErrorSource("b", "b")]
     error_budget = compute_budget(errors, np.arange(50), sources, is_centred=False, confidence=0.9)
     assert error_budget is not None
     squares = errors[0] ** 2
@@ -110,7 +111,7 @@ def test_groups_are_the_sampling_unit() -> None:
     """Equal errors on a terrain are no further evidence; an interval needs two terrains."""
     rng = np.random.default_rng(5)
     errors = rng.standard_normal((6, 20))
-    sources = [ErrorSource("a", "a", ()), ErrorSource("b", "b", ())]
+    sources = [ErrorSource("a", "a"), ErrorSource("b", "b")]
     single = compute_budget(errors, np.arange(20), sources, is_centred=True, confidence=0.9)
     repeated = compute_budget(np.repeat(errors, 3, axis=1), np.repeat(np.arange(20), 3), sources, True, 0.9)
     assert single is not None
@@ -236,7 +237,7 @@ def test_invalid_settings_are_rejected(
 
 
 def test_sources_of_all_scenarios_have_valid_values() -> None:
-    """Every source of the included scenarios names at least one parameter, and its case is valid without the error."""
+    """The case of the included scenarios is valid without each source of error."""
     campaigns = {"descent": "dimes-offnominal", "fieldtest": "dimes-fieldtest", "landing": "hda-benign"}
     campaigns |= {"rover": "vtt-montecarlo", "rover-drive": "vtt-straight", "localisation": "loc-faults"}
     for scenario, name in campaigns.items():
@@ -245,7 +246,7 @@ def test_sources_of_all_scenarios_have_valid_values() -> None:
         parameters = campaign.configuration.parameters
         for source in error_sources(scenario):
             exact = source.exact_values(parameters)
-            assert set(exact) == set(source.parameters), source.name
+            assert set(exact) <= set(source.parameters), source.name
             assert campaign.with_values(exact)
         assert len(active_sources(campaign)[0]) >= 5
     assert set(campaigns) == {name for name in scenario_names() if error_sources(name)}

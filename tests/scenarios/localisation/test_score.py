@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.campaigns.store.products import pack_products
+from marsyard.scenarios.columns import row_columns
 from marsyard.scenarios.localisation.fields import SmoothField
 from marsyard.scenarios.localisation.map_product import MapTruth
 from marsyard.scenarios.localisation.score import REQUIRED_M, EstimateErrors, answer_row, compute_errors, products
 from marsyard.scenarios.localisation.stream import ProcessorTimes, StreamAnswers
-from marsyard.scenarios.systems import row_columns
 from marsyard.sim.dynamics import State
 
 #: Shift of the map relative to the world, east and north, m.
@@ -223,7 +223,7 @@ def test_rows_have_equal_declared_columns() -> None:
     declared = row_columns("localisation")
     assert declared is not None
     for name, value in valid.items():
-        assert declared.has_flag(name) if isinstance(value, bool) else declared.has_number(name)
+        assert declared.has(name, bool if isinstance(value, bool) else float)
 
 
 def test_products_of_valid_and_refused_estimates() -> None:

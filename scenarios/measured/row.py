@@ -1,0 +1,54 @@
+"""Columns of the rows of recorded images: agreement of images and poses, and answers of algorithms."""
+
+from marsyard.scenarios import common_columns as common
+from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, outcome, text
+
+_CASE = (
+    text("measured_case", "name of the case"),
+    text("image_hash", "hash of the counts of all images", Kind.PROVENANCE),
+    condition("images", "number of images"),
+    condition("duration_s", "time from the first to the last image"),
+    condition("max_rotation_deg", "largest rotation between two images", "largest rotation between two images"),
+    condition("max_translation_m", "largest distance between two images", "largest distance between two images"),
+    outcome("matches", "matched points of all image pairs"),
+    outcome("pairs_matched", "pairs of images with enough matches"),
+    error("outlier_fraction", "fraction of the matches that disagree with the poses"),
+    error("residual_median_px", "median distance of the matches from the poses' epipolar lines"),
+    error("residual_90_percent_px", "90 % quantile of the distance from the epipolar lines"),
+    error("residual_worst_pair_px", "median distance of the worst pair"),
+)
+
+MATCHING_COLUMNS = Columns(_CASE)
+
+VELOCITY_COLUMNS = Columns(
+    (
+        *_CASE,
+        *common.ALGORITHM,
+        *common.VELOCITY,
+        condition("altitude_*_m", "measured altitude at an image", "altitude at image *"),
+        condition("off_nadir_max_deg", "maximum off-nadir angle at the images", "maximum off-nadir angle"),
+        condition("sun_elevation_deg", "elevation of the sun above the horizon"),
+        flag("truth_known", "the true velocity is known"),
+        error("inertial_difference_m_s", "difference from the inertial velocity, which has an unknown constant error"),
+        error(
+            "pair_discrepancy_m_s", "difference of the velocity changes between both pairs: estimated minus inertial"
+        ),
+        error("difference_m_s", "difference from the answer of the algorithm under test"),
+    )
+)
+
+LANDING_COLUMNS = Columns(
+    (
+        *_CASE,
+        *common.ALGORITHM,
+        *common.MATCHING,
+        condition("slant_range_m", "measured distance to the ground along the optical axis"),
+        flag("truth_known", "the true poses are known"),
+        outcome("site_up_m", "height of the site"),
+        error("difference_m", "distance from the site of the algorithm under test"),
+        error("rotation_pose_difference_deg", "difference of the estimated rotation from that of the measured poses"),
+        error("direction_pose_difference_deg", "difference of the estimated direction from that of the measured poses"),
+        error("length_pose_difference_m", "difference of the estimated length from that of the measured poses"),
+        error("baseline_pose_difference_fraction", "difference of the estimated translation, divided by its length"),
+    )
+)
