@@ -15,7 +15,7 @@ from marsyard.campaigns.errors import ConfigurationError, Problem, suggest_simil
 from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
 from marsyard.sim.files import check_regular
-from marsyard.sim.parameters import Parameters
+from marsyard.sim.parameters import Parameters, list_alternatives, list_models
 
 if TYPE_CHECKING:
     pass
