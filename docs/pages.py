@@ -16,6 +16,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from marsyard.scenarios.columns import row_columns
+from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
 from marsyard.scenarios.systems import catalogue, scenario, scenario_names
 
@@ -31,6 +33,7 @@ def write_pages() -> None:
     (FOLDER / "real-images.md").write_text(format_ingest_keys())
     for name in scenario_names():
         (FOLDER / f"parameters-{name}.md").write_text(format_parameters(name))
+        (FOLDER / f"columns-{name}.md").write_text(format_columns(name))
 
 
 def format_commands() -> str:
@@ -60,6 +63,7 @@ def format_catalogue() -> str:
 def format_parameters(name: str) -> str:
     """Format a table of every key that a campaign of a scenario can set or disperse."""
     description = (scenario(name).__doc__ or "").strip().splitlines()[0]
+    sources = {path: f" (*{source.name}*)" for source in error_sources(name) for path in source.parameters}
     header = [
         f"# Parameters of `{name}`",
         "",
@@ -67,14 +71,36 @@ def format_parameters(name: str) -> str:
         "",
         "This table lists every parameter that a campaign of this scenario can set or disperse. Keys are below",
         "`[parameters]` in the campaign file, or in `--set KEY=VALUE` on the command line. Units are in the names of",
-        "the keys (`_m`, `_deg`, `_s`, `_px`) or in the description; SD is the standard deviation.",
+        "the keys (`_m`, `_deg`, `_s`, `_px`) or in the description; SD is the standard deviation. A",
+        "[source of error](../../error-budget.md#sources-of-error) follows the description of its parameters.",
         "",
     ]
     rows = [
-        f"| `{key}` | {_format_type(field)} | {_format_default(field)} | {field.description or ''} |"
+        f"| `{key}` | {_format_type(field)} | {_format_default(field)} | {field.description or ''}{sources.get(key, '')} |"
         for key, field in _walk_fields(scenario(name).parameters_type)
     ]
     return "\n".join([*header, "| key | type, allowed | default | description |", "|---|---|---|---|", *rows, ""])
+
+
+def format_columns(name: str) -> str:
+    """Format a table of the columns of a scenario's rows."""
+    header = [
+        f"# Columns of `{name}`",
+        "",
+        "This table lists the columns that the scenario writes in each row, in addition to those of the engine (`case`,",
+        "`outcome`, `answered`, times, errors) and to the sampled values of dispersed parameters, whose names are the",
+        "paths of the parameters. A star stands for any text, such as the number of an image. The columns of a compared",
+        "algorithm begin with its label and a dot.",
+        "",
+    ]
+    rows = [
+        f"| `{column.name}` | {column.kind} | {_COLUMN_TYPES.get(column.type, column.unit)} | {column.meaning} |"
+        for column in row_columns(name) or ()
+    ]
+    return "\n".join([*header, "| column | kind | type or unit | meaning |", "|---|---|---|---|", *rows, ""])
+
+
+_COLUMN_TYPES = {bool: "true or false", str: "text"}
 
 
 def format_ingest_keys() -> str:

@@ -85,4 +85,4 @@ def test_every_scenario_has_a_parameter_page(site: dict[Path, PageParser]) -> No
     from marsyard.scenarios.systems import scenario_names
 
     names = {path.stem for path in site}
-    assert {f"parameters-{name}" for name in scenario_names()} <= names
+    assert {f"{page}-{name}" for page in ("parameters", "columns") for name in scenario_names()} <= names
