@@ -76,7 +76,8 @@ def format_parameters(name: str) -> str:
         "",
     ]
     rows = [
-        f"| `{key}` | {_format_type(field)} | {_format_default(field)} | {field.description or ''}{sources.get(key, '')} |"
+        f"| `{key}` | {_format_type(field)} | {_format_default(field)} "
+        f"| {field.description or ''}{sources.get(key, '')} |"
         for key, field in _walk_fields(scenario(name).parameters_type)
     ]
     return "\n".join([*header, "| key | type, allowed | default | description |", "|---|---|---|---|", *rows, ""])
@@ -87,10 +88,10 @@ def format_columns(name: str) -> str:
     header = [
         f"# Columns of `{name}`",
         "",
-        "This table lists the columns that the scenario writes in each row, in addition to those of the engine (`case`,",
-        "`outcome`, `answered`, times, errors) and to the sampled values of dispersed parameters, whose names are the",
-        "paths of the parameters. A star stands for any text, such as the number of an image. The columns of a compared",
-        "algorithm begin with its label and a dot.",
+        "This table lists the columns that the scenario writes in each row. The engine adds the columns `case`,",
+        "`outcome`, `answered`, times and errors, and the sampled values of dispersed parameters, whose names are the",
+        "paths of the parameters. A star stands for any text, such as the number of an image. The columns of a",
+        "compared algorithm begin with its label and a dot.",
         "",
     ]
     rows = [

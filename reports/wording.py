@@ -58,14 +58,23 @@ def population_text(population: str) -> str:
     columns = {part: find_column(part) for part in flags}
     phrases = [column.population_of(part) for part, column in columns.items() if column is not None]
     unknown = [f"'{part}'" for part, column in columns.items() if column is None]
-    phrases += [f"for which {_enumerate(unknown)} {'is' if len(unknown) == 1 else 'are'} true"] if unknown else []
-    return f"{base} {_enumerate(phrases)}".rstrip()
+    # "with A, B, and C without D": phrases with the same preposition share it
+    groups: dict[str, list[str]] = {}
+    for phrase in phrases:
+        preposition, _, rest = phrase.partition(" ")
+        groups.setdefault(preposition, []).append(rest)
+    texts = [
+        f"{preposition} {_enumerate(rests, 'or' if preposition == 'without' else 'and')}"
+        for preposition, rests in sorted(groups.items())
+    ]
+    unknown_text = f" for which {_enumerate(unknown)} {'is' if len(unknown) == 1 else 'are'} true" if unknown else ""
+    return f"{base} {' and '.join(texts)}".rstrip() + unknown_text
 
 
-def _enumerate(texts: Sequence[str]) -> str:
+def _enumerate(texts: Sequence[str], conjunction: str = "and") -> str:
     """Join texts: ``a``, ``a and b``, ``a, b, and c``."""
     head, last = texts[:-1], "".join(texts[-1:])
-    return f"{', '.join(head)}{',' if len(head) > 1 else ''} and {last}" if head else last
+    return f"{', '.join(head)}{',' if len(head) > 1 else ''} {conjunction} {last}" if head else last
 
 
 def number(value: float) -> str:

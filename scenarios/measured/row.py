@@ -28,7 +28,7 @@ VELOCITY_COLUMNS = Columns(
         condition("altitude_*_m", "measured altitude at an image", "altitude at image *"),
         condition("off_nadir_max_deg", "maximum off-nadir angle at the images", "maximum off-nadir angle"),
         condition("sun_elevation_deg", "elevation of the sun above the horizon"),
-        flag("truth_known", "the true velocity is known"),
+        flag("truth_known", "the truth is known"),
         error("inertial_difference_m_s", "difference from the inertial velocity, which has an unknown constant error"),
         error(
             "pair_discrepancy_m_s", "difference of the velocity changes between both pairs: estimated minus inertial"
@@ -43,7 +43,7 @@ LANDING_COLUMNS = Columns(
         *common.ALGORITHM,
         *common.MATCHING,
         condition("slant_range_m", "measured distance to the ground along the optical axis"),
-        flag("truth_known", "the true poses are known"),
+        flag("truth_known", "the truth is known"),
         outcome("site_up_m", "height of the site"),
         error("difference_m", "distance from the site of the algorithm under test"),
         error("rotation_pose_difference_deg", "difference of the estimated rotation from that of the measured poses"),

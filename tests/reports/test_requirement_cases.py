@@ -148,7 +148,7 @@ def test_conditions_of_a_landing_contain_no_results(make_run: MakeRun) -> None:
     frame = synthetic_landing.landing_frame(30).assign(answered=True)
     rng = np.random.default_rng(1)
     results = ["footprints_roughness_below_1_unflagged", "gross_hazards_unflagged", "tracks", "points", "inliers"]
-    conditions = ["sun_elevation_deg", "pose_tilt_error_deg", "rocks_abundance"]
+    conditions = ["sun_elevation_deg", "pose_tilt_error_deg", "image_contrast"]
     frame = frame.assign(**{name: rng.random(len(frame)) for name in (*results, *conditions)})
     evaluation = evaluate_run(make_run(frame, [AVAILABLE], configuration={"scenario": "landing"}, scenario="landing"))
     summary = CaseFinder(evaluation.run, evaluation.verdicts).summary(0)

@@ -161,7 +161,7 @@ def test_requirement_texts_describe_metric_and_population() -> None:
         for name, entry in entries.items()
     }
     assert texts["VTT-POS"] == (
-        "the position error is at most 0.03 m in at least 99 % of valid answers for selectable targets, "
+        "the position error is at most 0.03 m in at least 99 % of valid answers with a selectable target, "
         "at 90 % confidence"
     )
     assert texts["HDA-SAFE"].startswith("the reported site is safe in at least 99 % of cases with a reported site")
@@ -175,7 +175,9 @@ def test_requirement_texts_describe_metric_and_population() -> None:
         "confidence": 0.9,
     }
     scaled = requirement_text(Requirement.model_validate(times))
-    assert scaled.startswith("60 times the run time of all stages is at most 2 s in at least 95 % of all cases")
+    assert scaled.startswith(
+        "60 times the sum of tracking time, motion time, structure time, and hazards time is at most 2 s in at least 95 % of all cases"
+    )
     by_rate = Requirement.model_validate({**times, "metric": "my_error_m", "decide_by": "estimate"})
     assert requirement_text(by_rate) == (
         "60 times the magnitude of 'my error' is at most 2 m in at least 95 % of all cases, "
@@ -186,8 +188,8 @@ def test_requirement_texts_describe_metric_and_population() -> None:
 @pytest.mark.parametrize(
     ("population", "text"),
     [
-        ("valid and selectable and navcam", "valid answers with the navcam for selectable targets"),
-        ("fault_free and navcam and clear_sky", "cases without a fault, with the navcam, and without clouds"),
+        ("valid and selectable and navcam", "valid answers with a selectable target and the navcam"),
+        ("fault_free and navcam and clear_sky", "cases with the navcam and without a fault or clouds"),
         ("in_the_dark", "cases for which 'in_the_dark' is true"),
         ("valid and navcam and wet and cold", "valid answers with the navcam for which 'wet' and 'cold' are true"),
     ],

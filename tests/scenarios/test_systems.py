@@ -108,10 +108,12 @@ def test_columns_are_declared_once_with_a_meaning(name: str) -> None:
     declared = [(column.name, column.type) for column in (*columns, *ENGINE)]
     assert len(declared) == len(set(declared))
     assert all(column.meaning for column in columns)
-    # a result has the name of a condition in no system, because reports find declarations by name
-    results = {column.name for column in columns if column.type is float and not columns.is_condition(column.name)}
-    others = [other for scenario_name in scenario_paths() if (other := row_columns(scenario_name)) is not None]
-    assert [column for column in results if any(other.is_condition(column) for other in others)] == []
+    # reports find labels, and texts of flags, by name: declarations of one name agree in all scenarios
+    for column in columns:
+        found = column_declarations.find_column(column.name)
+        assert found is not None
+        assert (column.label, column.population) == (found.label, found.population), column.name
+        assert column.type is not bool or column.meaning == found.meaning, column.name
 
 
 def test_system_of_another_package_is_registered(install: Install) -> None:
