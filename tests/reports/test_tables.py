@@ -176,7 +176,8 @@ def test_requirement_texts_describe_metric_and_population() -> None:
     }
     scaled = requirement_text(Requirement.model_validate(times))
     assert scaled.startswith(
-        "60 times the sum of tracking time, motion time, structure time, and hazards time is at most 2 s in at least 95 % of all cases"
+        stages="tracking time, motion time, structure time, and hazards time"
+        f"60 times the sum of {stages} is at most 2 s in at least 95 % of all cases"
     )
     by_rate = Requirement.model_validate({**times, "metric": "my_error_m", "decide_by": "estimate"})
     assert requirement_text(by_rate) == (
