@@ -102,8 +102,8 @@ def test_velocities_are_scored_against_truth(runs: Path) -> None:
 def test_dispersed_values_are_simulated(runs: Path) -> None:
     rows = _read_rows(runs / "A")
     assert set(rows["terrain"]) == {0, 1}
-    assert rows["location_east_m"].between(0.0, 3000.0).all()
-    assert rows["location_east_m"].nunique() == 3
+    assert rows["location.east_m"].between(0.0, 3000.0).all()
+    assert rows["location.east_m"].nunique() == 3
     assert rows["attitude_rate_max_deg_s"].nunique() == 3
 
 

@@ -69,8 +69,6 @@ def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
     # The instruments have the same errors.
     for name in ("attitude_error_common_deg", "altitude_error_2_m", "tag_error_1_s"):
         assert recorded_case.row[name] == pytest.approx(simulated_case.row[name], rel=0.02, abs=1e-4), name
-    assert recorded_case.row["flight_file"] == file
-    assert not any(name.startswith("descent_wind") for name in recorded_case.row)
 
 
 def test_flight_is_rotated_and_moved_to_its_start(tmp_path: Path) -> None:

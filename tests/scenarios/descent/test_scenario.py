@@ -186,8 +186,6 @@ def test_condition_columns_have_the_simulated_values(nominal_case: CaseResult) -
     assert row["sun_azimuth_deg"] == pytest.approx(270.0)
     assert row["sun_elevation_deg"] == pytest.approx(40.0)
     assert len(row["image_hash"]) == 64
-    assert row["descent_wind_east_m_s"] == 14.0
-    assert row["descent_heading_deg"] == 70.0
     assert (row["fault"], row["fault_size"], row["site"]) == ("none", 0.0, "plain")
     # 1300 m at about 72 m/s.
     assert 15.0 < float(row["firing_after_s"]) < 21.0
