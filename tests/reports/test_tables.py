@@ -175,10 +175,8 @@ def test_requirement_texts_describe_metric_and_population() -> None:
         "confidence": 0.9,
     }
     scaled = requirement_text(Requirement.model_validate(times))
-    assert scaled.startswith(
-        stages="tracking time, motion time, structure time, and hazards time"
-        f"60 times the sum of {stages} is at most 2 s in at least 95 % of all cases"
-    )
+    stages = "tracking time, motion time, structure time, and hazards time"
+    assert scaled.startswith(f"60 times the sum of {stages} is at most 2 s in at least 95 % of all cases")
     by_rate = Requirement.model_validate({**times, "metric": "my_error_m", "decide_by": "estimate"})
     assert requirement_text(by_rate) == (
         "60 times the magnitude of 'my error' is at most 2 m in at least 95 % of all cases, "
