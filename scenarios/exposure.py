@@ -22,6 +22,9 @@ from marsyard.sim.sensor import DetectorParameters, ImageMotion, natural_fall_of
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment
 
+#: Path length for which the fault `haze` states an optical depth, m: about the height of the first image.
+HAZE_PATH_M = 2000.0
+
 
 @dataclass(frozen=True)
 class Optics:

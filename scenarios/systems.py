@@ -1,7 +1,8 @@
 """Registry of the systems under test and their scenarios: those of Marsyard, and those of installed packages.
 
-A system is, for example, the velocity estimator DIMES with its scenarios, campaigns, requirements and reports. A
-package adds a system by an entry point of the group `marsyard.systems`::
+A system is, for example, the velocity estimator DIMES with its scenarios, campaigns, requirements and reports. Each
+folder of `scenarios` with a module `system` defines one. Another package adds one by an entry point of the group
+`marsyard.systems`::
 
     [project.entry-points."marsyard.systems"]
     altitude = "mypackage.system:SYSTEM"
@@ -17,7 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -26,7 +27,7 @@ from marsyard.scenarios.imports import import_object
 if TYPE_CHECKING:  # its imports take longer than `marsyard list`
     from marsyard.scenarios.interface import Scenario
 
-#: Folder of the files that the systems of Marsyard share.
+#: Folder of Marsyard's systems, each in a folder of its own, and of the files that they share.
 SCENARIOS_FOLDER = Path(__file__).resolve().parent
 
 
@@ -44,9 +45,6 @@ class Ingested:
 class System:
     """A system under test; plain data, whose ``module:NAME`` objects are imported when they are needed.
 
-    A system of another package is a module-level object of this class, in an entry point of the group
-    `marsyard.systems` (`marsyard.scenarios.systems`).
-
     - name: short unique name; the dashboard groups campaigns by it
     - title: title in reports
     - summary: one sentence on the tests
@@ -54,7 +52,7 @@ class System:
     - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
     - catalogue: campaign files, as a folder and a pattern (``folder/altitude-*.toml``)
-    - requirements: file of the requirements that campaigns reference by id, as `scenarios/requirements.toml`
+    - requirements: file of the requirements that campaigns reference by id (docs/reports.md)
     - columns: file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it, requirements are
       checked against the first finished case.
     - error_sources: file of the sources of error of each scenario's cases, as `scenarios/error_sources.toml`
@@ -91,87 +89,6 @@ class System:
 #: Entry point group of other packages' systems.
 GROUP = "marsyard.systems"
 
-#: Files that the systems of Marsyard share.
-_CATALOGUE = SCENARIOS_FOLDER / "catalogue"
-_REQUIREMENTS, _COLUMNS = SCENARIOS_FOLDER / "requirements.toml", SCENARIOS_FOLDER / "columns.toml"
-_ERROR_SOURCES = SCENARIOS_FOLDER / "error_sources.toml"
-
-#: The systems of Marsyard. Recorded images come first, because their cases also contain products of other systems.
-BUILT_IN = (
-    System(
-        name="measured",
-        title="Recorded images",
-        summary="Algorithms on real images, compared with the measured poses.",
-        scenarios={
-            "measured-velocity": "marsyard.scenarios.measured.scenarios:MeasuredVelocityScenario",
-            "measured-landing": "marsyard.scenarios.measured.scenarios:MeasuredLandingScenario",
-            "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
-        },
-        tasks=("marsyard.scenarios.estimators:VELOCITY", "marsyard.scenarios.estimators:LANDING"),
-        columns=_COLUMNS,
-        ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
-        report="marsyard.reports.measured.presentation:MEASURED",
-    ),
-    System(
-        name="dimes",
-        title="Descent Image Motion Estimation System (DIMES)",
-        summary="Horizontal velocity of a lander under its parachute, from three images.",
-        scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
-        tasks=("marsyard.scenarios.estimators:VELOCITY",),
-        catalogue=_CATALOGUE / "dimes-*.toml",
-        requirements=_REQUIREMENTS,
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
-        compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
-        templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
-        report="marsyard.reports.dimes.presentation:DIMES",
-    ),
-    System(
-        name="fieldtest",
-        title="Field test of DIMES on a helicopter",
-        summary="Horizontal velocity of a helicopter from triples of images over desert ground.",
-        scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
-        tasks=("marsyard.scenarios.estimators:VELOCITY",),
-        catalogue=_CATALOGUE / "dimes-fieldtest.toml",
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
-        report="marsyard.reports.dimes.presentation:FIELD_TEST",
-    ),
-    System(
-        name="vtt",
-        title="Visual target tracking (VTT)",
-        summary="Position of a target that a rover approaches, tracked in the images of its mast cameras.",
-        scenarios={
-            "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
-            "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
-        },
-        tasks=("marsyard.scenarios.estimators:TRACKING",),
-        catalogue=_CATALOGUE / "vtt-*.toml",
-        requirements=_REQUIREMENTS,
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
-        compilation_campaigns={
-            "vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")
-        },
-        templates={"tracking": "marsyard.scenarios.template:TRACKING"},
-        report="marsyard.reports.vtt.presentation:VTT",
-    ),
-    System(
-        name="hda",
-        title="Hazard detection and avoidance (HDA)",
-        summary="A safe landing site from two images of a moving camera.",
-        scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
-        tasks=("marsyard.scenarios.estimators:LANDING",),
-        catalogue=_CATALOGUE / "hda-*.toml",
-        requirements=_REQUIREMENTS,
-        columns=_COLUMNS,
-        error_sources=_ERROR_SOURCES,
-        compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
-        templates={"landing": "marsyard.scenarios.template:LANDING"},
-        report="marsyard.reports.hda.presentation:HDA",
-    ),
-)
-
 
 @dataclass(frozen=True)
 class Registry:
@@ -181,21 +98,30 @@ class Registry:
     problems: tuple[str, ...]
 
 
+def own_paths() -> dict[str, str]:
+    """Return the systems of Marsyard as ``module:SYSTEM``, by the name of their folder."""
+    folders = sorted(file.parent.name for file in SCENARIOS_FOLDER.glob("*/system.py"))
+    return {folder: f"marsyard.scenarios.{folder}.system:SYSTEM" for folder in folders}
+
+
 @cache
 def registry() -> Registry:
     """Read the systems of this installation, once per process."""
-    loaded_systems = list(BUILT_IN)
+    paths = [*own_paths().items()]
+    points = sorted((point.name, point.value) for point in entry_points(group=GROUP))
+    paths += [(name, path) for name, path in points if path not in own_paths().values()]
+    loaded_systems: list[System] = []
     problems: list[str] = []
-    for point in sorted(entry_points(group=GROUP), key=lambda item: (item.name, item.value)):
+    for name, path in paths:
         try:
-            loaded_systems.append(_load(point, loaded_systems))
+            loaded_systems.append(_load(path, loaded_systems))
         except ValueError as error:
-            problems.append(f"system '{point.name}' ({point.value}) is omitted: {error}")
+            problems.append(f"system '{name}' ({path}) is omitted: {error}")
     return Registry(tuple(loaded_systems), tuple(problems))
 
 
 def systems() -> tuple[System, ...]:
-    """Return all systems: those of Marsyard first, then those of other packages by name."""
+    """Return all systems: those of Marsyard by folder, then those of other packages by name."""
     return registry().systems
 
 
@@ -205,7 +131,7 @@ def catalogue() -> dict[str, Path]:
 
 
 def problems() -> tuple[str, ...]:
-    """Return one message for each system of another package that is omitted."""
+    """Return one message for each system that is omitted."""
     return registry().problems
 
 
@@ -224,10 +150,10 @@ def find_system(scenario: str) -> System | None:
     return next((item for item in systems() if scenario in {*item.scenarios, *item.scenarios.values()}), None)
 
 
-def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
-    """Load the system of an entry point. Raises ValueError if it is invalid or conflicts with an earlier system."""
+def _load(path: str, earlier_systems: list[System]) -> System:
+    """Load the system ``module:NAME``. Raises ValueError if it is invalid or conflicts with an earlier system."""
     try:
-        system = import_object(point.value)
+        system = import_object(path)
     except ImportError as error:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):

@@ -41,13 +41,13 @@ from marsyard.scenarios.descent.score import (
     propagate_to_firing,
 )
 from marsyard.scenarios.descent.timeline import descent_timeline
-from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
 from marsyard.scenarios.timeline import timeline_products
 from marsyard.scenarios.velocity import (
+    VELOCITY,
     Horizontal,
     Span,
     consistency_row,

@@ -12,7 +12,6 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images, image_columns
-from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.images import MAX_GROUNDS, RenderedFlight, measure
@@ -29,6 +28,7 @@ from marsyard.scenarios.landing.score import (
     times_row,
 )
 from marsyard.scenarios.landing.timeline import landing_timeline
+from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding, compute_scores
 from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.streams import Streams

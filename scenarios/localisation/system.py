@@ -1,4 +1,4 @@
-"""Register localisation on a map as a system under test, by an entry point of the group `marsyard.systems`."""
+"""Localisation on a map as a system: position of a lander."""
 
 from __future__ import annotations
 

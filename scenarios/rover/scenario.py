@@ -29,7 +29,6 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
 from marsyard.scenarios.conditions import image_columns
-from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import compute_scores
@@ -45,6 +44,7 @@ from marsyard.scenarios.rover.run import (
     track_target,
 )
 from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, designate_point, evaluate_visibility
+from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.timeline import run_timeline
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.timeline import timeline_products

@@ -5,7 +5,7 @@ are immutable, accept arrays with any leading dimensions and share the interface
 column and row, with the centre of the upper left pixel at (0, 0).
 """
 
-from marsyard.sim.camera.base import CameraModel, mount_looking_down
+from marsyard.sim.camera.base import CameraModel, camera_pose, mount_looking_down
 from marsyard.sim.camera.calibrations import Calibration, read_calibrations
 from marsyard.sim.camera.label_frames import Frame, FramedCamera
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
@@ -36,6 +36,7 @@ __all__ = [
     "FramedCamera",
     "Pds3Product",
     "Residual",
+    "camera_pose",
     "from_opencv",
     "from_opencv_fisheye",
     "mount_looking_down",

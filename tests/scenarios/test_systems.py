@@ -115,7 +115,7 @@ def test_system_of_another_package_is_registered(install: Install) -> None:
     requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
-        _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
+        _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.matching:MatchingScenario'"),
         **{"mine-one": 'scenario = "mine-case"\n', "limits": f'[[requirements]]\nid = "MINE"\n{requirement}'},
         columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
@@ -197,7 +197,7 @@ def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path)
 
 
 def test_invalid_columns_affect_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
-    scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
+    scenario_path = "marsyard.scenarios.measured.matching:MatchingScenario"
     install(
         "mine", _format_system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = ["
     )

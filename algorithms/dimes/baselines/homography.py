@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from marsyard.algorithms.arrays import Points2, Raster, Vector2
-from marsyard.algorithms.baselines.pairs import (
+from marsyard.algorithms.dimes.baselines.pairs import (
     DEFAULT_COMMON_OPTIONS,
     CommonOptions,
     PairMatch,

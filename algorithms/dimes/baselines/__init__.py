@@ -1,7 +1,7 @@
 """Baseline velocity estimators to compare with DIMES: image registration with OpenCV, with the same interface."""
 
-from marsyard.algorithms.baselines.homography import HomographyEstimator, HomographyOptions
-from marsyard.algorithms.baselines.pairs import (
+from marsyard.algorithms.dimes.baselines.homography import HomographyEstimator, HomographyOptions
+from marsyard.algorithms.dimes.baselines.pairs import (
     BaselineDetails,
     PairMatch,
     PairPatches,

@@ -1,0 +1,20 @@
+"""Recorded images as a system: other systems' algorithms on real images, compared with measured poses."""
+
+from __future__ import annotations
+
+from marsyard.scenarios.systems import SCENARIOS_FOLDER, System
+
+SYSTEM = System(
+    name="measured",
+    title="Recorded images",
+    summary="Algorithms on real images, compared with the measured poses.",
+    scenarios={
+        "measured-velocity": "marsyard.scenarios.measured.velocity:MeasuredVelocityScenario",
+        "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
+        "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
+    },
+    tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_site:LANDING"),
+    columns=SCENARIOS_FOLDER / "columns.toml",
+    ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
+    report="marsyard.reports.measured.presentation:MEASURED",
+)

@@ -1,0 +1,27 @@
+"""Visual target tracking as a system: a rover drives to a target."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from marsyard.scenarios.systems import SCENARIOS_FOLDER, System
+
+_FOLDER = Path(__file__).resolve().parent
+
+SYSTEM = System(
+    name="vtt",
+    title="Visual target tracking (VTT)",
+    summary="Position of a target that a rover approaches, tracked in the images of its mast cameras.",
+    scenarios={
+        "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
+        "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
+    },
+    tasks=("marsyard.scenarios.rover.task:TRACKING",),
+    catalogue=_FOLDER / "catalogue" / "*.toml",
+    requirements=_FOLDER / "requirements.toml",
+    columns=SCENARIOS_FOLDER / "columns.toml",
+    error_sources=SCENARIOS_FOLDER / "error_sources.toml",
+    compilation_campaigns={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
+    templates={"tracking": "marsyard.scenarios.rover.template:TRACKING"},
+    report="marsyard.reports.vtt.presentation:VTT",
+)
