@@ -1,1 +1,1 @@
-"""Scenarios, which combine world, trajectory, instruments and score into cases, and the catalogue of campaign files."""
+"""Scenarios: world, trajectory, instruments and score of a case. A folder with a module `system` is a system under test."""

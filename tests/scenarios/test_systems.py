@@ -5,6 +5,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -18,10 +19,11 @@ from marsyard.cli.app import app
 from marsyard.doctor import Verdict, check_systems
 from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
-    BUILT_IN,
+    SCENARIOS_FOLDER,
     UnknownScenarioError,
     catalogue,
     find_system,
+    own_paths,
     problems,
     registry,
     row_columns,
@@ -75,7 +77,7 @@ def _format_system(name: str, arguments: str = "") -> str:
 
 def test_built_in_systems_are_complete() -> None:
     assert not problems()
-    assert [entry.name for entry in systems()][: len(BUILT_IN)] == ["measured", "dimes", "fieldtest", "vtt", "hda"]
+    assert [entry.name for entry in systems()] == ["dimes", "fieldtest", "hda", "localisation", "measured", "vtt"]
     for system in systems():
         assert system.title, system.name
         assert system.summary.endswith("."), system.name
@@ -87,9 +89,8 @@ def test_built_in_systems_are_complete() -> None:
             assert catalogue()[name] == path
         assert set(system.compilation_campaigns) <= set(system.campaigns)
     # Each campaign file in the folders belongs to a system.
-    folders = {path.parent for path in catalogue().values()}
-    assert set(catalogue()) == {path.stem for folder in folders for path in folder.glob("*.toml")}
-    assert list(template_paths()) == ["velocity", "tracking", "landing"]
+    assert set(catalogue()) == {path.stem for path in SCENARIOS_FOLDER.glob("*/catalogue/*.toml")}
+    assert list(template_paths()) == ["velocity", "landing", "tracking"]
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
 
@@ -168,12 +169,12 @@ def test_invalid_system_does_not_affect_others(install: Install, source: str, re
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
-    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["localisation", "valid"]
+    assert [entry.name for entry in systems()[len(own_paths()) :]] == ["valid"]
     result = CliRunner().invoke(app, ["list"])
     assert (result.exit_code, result.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in result.stdout
     checks = list(check_systems())
-    assert checks[0].finding.endswith("plug-ins: localisation, valid")
+    assert checks[0].finding.endswith("plug-ins: valid")
     assert [entry.finding for entry in checks if entry.verdict is Verdict.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is omitted"):
         scenario("unknown-scenario")
@@ -183,6 +184,14 @@ def test_first_of_two_entry_points_is_used(install: Install) -> None:
     install("mine", _format_system("mine"), "a", "b")
     assert [entry.name for entry in systems()].count("mine") == 1
     assert problems() == ("system 'b' (mine:SYSTEM) is omitted: the system 'mine' already has the name 'mine'",)
+
+
+def test_entry_point_of_a_system_of_marsyard_adds_nothing(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    install("mine", _format_system("mine"))
+    points = [EntryPoint(folder, path, "marsyard.systems") for folder, path in own_paths().items()]
+    monkeypatch.setattr("marsyard.scenarios.systems.entry_points", lambda group: points)
+    assert len(systems()) == len(own_paths())
+    assert not problems()
 
 
 def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path) -> None:
