@@ -349,13 +349,13 @@ def check_systems() -> Iterator[Check]:
     try:
         from marsyard.scenarios.systems import own_paths, registry
 
-        systems, own_systems = registry(), len(own_paths())
+        (systems, problems), own_systems = registry(), len(own_paths())
     except ImportError as error:
         yield Check("systems", f"cannot be read: {error}", Verdict.FAIL, REINSTALL)
         return
-    others = ", ".join(system.name for system in systems.systems[own_systems:])
+    others = ", ".join(system.name for system in systems[own_systems:])
     yield Check("systems", f"{own_systems} built in; plug-ins: {others or 'none'}")
-    for problem in systems.problems:
+    for problem in problems:
         yield Check("systems", problem, Verdict.WARN, "correct or uninstall the package that defines the system")
 
 

@@ -1,1 +1,1 @@
-"""Scenarios: world, trajectory, instruments and score of a case. A folder with a module `system` is a system under test."""
+"""Scenarios: world, trajectory, instruments and score of cases. Each folder with a module `system` is a system."""

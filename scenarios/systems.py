@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from marsyard.scenarios.imports import import_object
+from marsyard.scenarios.template import CampaignTemplate
 
 if TYPE_CHECKING:  # its imports take longer than `marsyard list`
     from marsyard.scenarios.interface import Scenario
@@ -58,7 +59,7 @@ class System:
     - error_sources: file of the sources of error of each scenario's cases, as `scenarios/error_sources.toml`
     - compilation_campaigns: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small. One case
       of each calls, and so compiles, all numeric kernels of its scenario (`marsyard compile`).
-    - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
+    - templates: of campaign files, by the values of ``marsyard new --system``
     - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder
       for the new cases, and folder to which the new cases are moved. Returns `Ingested`.
     - report: a `marsyard.reports.presentation.Presentation`: report sections, and the figures of a case
@@ -74,7 +75,7 @@ class System:
     columns: Path | None = None
     error_sources: Path | None = None
     compilation_campaigns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    templates: Mapping[str, str] = field(default_factory=dict)
+    templates: Mapping[str, CampaignTemplate] = field(default_factory=dict)
     ingest: str = ""
     report: str = ""
 
@@ -90,14 +91,6 @@ class System:
 GROUP = "marsyard.systems"
 
 
-@dataclass(frozen=True)
-class Registry:
-    """The systems in order, and one message for each omitted system."""
-
-    systems: tuple[System, ...]
-    problems: tuple[str, ...]
-
-
 def own_paths() -> dict[str, str]:
     """Return the systems of Marsyard as ``module:SYSTEM``, by the name of their folder."""
     folders = sorted(file.parent.name for file in SCENARIOS_FOLDER.glob("*/system.py"))
@@ -105,8 +98,8 @@ def own_paths() -> dict[str, str]:
 
 
 @cache
-def registry() -> Registry:
-    """Read the systems of this installation, once per process."""
+def registry() -> tuple[tuple[System, ...], tuple[str, ...]]:
+    """Read the systems of this installation, once per process; also return one message for each omitted system."""
     paths = [*own_paths().items()]
     points = sorted((point.name, point.value) for point in entry_points(group=GROUP))
     paths += [(name, path) for name, path in points if path not in own_paths().values()]
@@ -117,12 +110,12 @@ def registry() -> Registry:
             loaded_systems.append(_load(path, loaded_systems))
         except ValueError as error:
             problems.append(f"system '{name}' ({path}) is omitted: {error}")
-    return Registry(tuple(loaded_systems), tuple(problems))
+    return tuple(loaded_systems), tuple(problems)
 
 
 def systems() -> tuple[System, ...]:
     """Return all systems: those of Marsyard by folder, then those of other packages by name."""
-    return registry().systems
+    return registry()[0]
 
 
 def catalogue() -> dict[str, Path]:
@@ -132,7 +125,7 @@ def catalogue() -> dict[str, Path]:
 
 def problems() -> tuple[str, ...]:
     """Return one message for each system that is omitted."""
-    return registry().problems
+    return registry()[1]
 
 
 def scenario_paths() -> Mapping[str, str]:
@@ -140,9 +133,9 @@ def scenario_paths() -> Mapping[str, str]:
     return {name: path for system in systems() for name, path in system.scenarios.items()}
 
 
-def template_paths() -> Mapping[str, str]:
-    """Return the templates of `marsyard new` as ``module:NAME`` by value of its option ``--system``."""
-    return {name: path for system in systems() for name, path in system.templates.items()}
+def templates() -> Mapping[str, CampaignTemplate]:
+    """Return the templates of `marsyard new` by value of its option ``--system``."""
+    return {name: template for system in systems() for name, template in system.templates.items()}
 
 
 def find_system(scenario: str) -> System | None:

@@ -7,12 +7,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+if TYPE_CHECKING:  # its import takes longer than `marsyard list`
+    from jinja2 import Environment
 
-from marsyard.scenarios.systems import SCENARIOS_FOLDER
-from marsyard.sim.terrain import MAX_TERRAINS
 
 #: Minimum number of terrains of a new campaign's bank, enough for cases appended later and for studies.
 MIN_TERRAINS = 100_000
@@ -67,13 +66,17 @@ class CampaignTemplate:
         reasons = [reason for option, reason in self.unsupported_options.items() if getattr(choices, option)]
         if reasons:
             raise ValueError(reasons[0])
-        template = toml_environment(self.file.parent, SCENARIOS_FOLDER).get_template(self.file.name)
+        from marsyard.sim.terrain import MAX_TERRAINS
+
+        template = toml_environment(self.file.parent, Path(__file__).resolve().parent).get_template(self.file.name)
         bank = min(MAX_TERRAINS, max(MIN_TERRAINS, choices.cases))
         return template.render(asdict(choices), bank=bank, **self.values(choices))
 
 
 def toml_environment(*folders: Path) -> Environment:
     """Return the environment of TOML templates in folders; the filter ``toml`` formats a value as TOML."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     environment = Environment(
         loader=FileSystemLoader(folders),
         undefined=StrictUndefined,

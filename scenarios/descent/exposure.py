@@ -17,6 +17,7 @@ from marsyard.scenarios.descent.parameters import (
 )
 from marsyard.scenarios.exposure import (
     HAZE_PATH_M,
+    HeatShield,
     Optics,
     add_calibration_error,
     add_haze,
@@ -24,7 +25,6 @@ from marsyard.scenarios.exposure import (
     sunlight_ratio,
 )
 from marsyard.scenarios.exposure import camera_optics as shared_optics
-from marsyard.scenarios.heat_shield import HeatShield
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.camera import Cahv, Cahvor, CameraModel

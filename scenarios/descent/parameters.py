@@ -14,7 +14,7 @@ from marsyard.algorithms.dimes.binning import check_binning
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
-from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
+from marsyard.scenarios.exposure import SHIELD_FALL_M_S
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
 from marsyard.scenarios.parts.motions import CustomMotion

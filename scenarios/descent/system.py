@@ -5,8 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from marsyard.scenarios.systems import SCENARIOS_FOLDER, System
+from marsyard.scenarios.template import CampaignTemplate, Choices
 
 _FOLDER = Path(__file__).resolve().parent
+
+
+def _camera_values(choices: Choices) -> dict[str, tuple[int, int]]:
+    """Return the size to which DIMES bins the images of a user's camera."""
+    from marsyard.algorithms.dimes.binning import binned_size_for
+    from marsyard.sim.camera import read_camera
+
+    return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
+
 
 SYSTEM = System(
     name="dimes",
@@ -19,6 +29,15 @@ SYSTEM = System(
     columns=SCENARIOS_FOLDER / "columns.toml",
     error_sources=SCENARIOS_FOLDER / "error_sources.toml",
     compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
-    templates={"velocity": "marsyard.scenarios.descent.template:VELOCITY"},
+    templates={
+        "velocity": CampaignTemplate(
+            file=_FOLDER / "new.toml.j2",
+            scale="descent",
+            site="gusev",
+            bound=5.0,
+            bound_text="maximum error of the horizontal velocity, m/s (DIMES requirement: 5)",
+            values=_camera_values,
+        )
+    },
     report="marsyard.reports.dimes.presentation:DIMES",
 )

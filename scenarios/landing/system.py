@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from marsyard.scenarios.systems import SCENARIOS_FOLDER, System
+from marsyard.scenarios.template import CampaignTemplate
 
 _FOLDER = Path(__file__).resolve().parent
 
@@ -19,6 +20,18 @@ SYSTEM = System(
     columns=SCENARIOS_FOLDER / "columns.toml",
     error_sources=SCENARIOS_FOLDER / "error_sources.toml",
     compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
-    templates={"landing": "marsyard.scenarios.landing.template:LANDING"},
+    templates={
+        "landing": CampaignTemplate(
+            file=_FOLDER / "new.toml.j2",
+            scale="ground",
+            site="heli-hazardous",
+            bound=0.99,
+            bound_text="minimum fraction of safe sites among the selected sites",
+            max_bound=1.0,
+            unsupported_options={
+                "flight": "--flight: only descents accept a recorded trajectory, and landing is not a descent"
+            },
+        )
+    },
     report="marsyard.reports.hda.presentation:HDA",
 )

@@ -16,8 +16,7 @@ from marsyard.algorithms.localisation.interface import InitialState, PositionEst
 from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
-from marsyard.scenarios.exposure import HAZE_PATH_M, add_haze, camera_optics, render_state
-from marsyard.scenarios.heat_shield import HeatShield
+from marsyard.scenarios.exposure import HAZE_PATH_M, HeatShield, add_haze, camera_optics, render_state
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation import score
 from marsyard.scenarios.localisation.flight import LanderFlight

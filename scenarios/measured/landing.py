@@ -18,8 +18,14 @@ from marsyard.scenarios.base import algorithm_result
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
 from marsyard.scenarios.landing_site import LANDING, motion_errors, stage_row
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance, run_algorithms
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
+from marsyard.scenarios.measured.scenarios import (
+    MeasuredParameters,
+    MeasuredScenario,
+    case_row,
+    distance,
+    run_algorithms,
+)
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, compute_scores
 from marsyard.sim.camera import camera_pose

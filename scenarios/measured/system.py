@@ -11,7 +11,7 @@ SYSTEM = System(
     scenarios={
         "measured-velocity": "marsyard.scenarios.measured.velocity:MeasuredVelocityScenario",
         "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
-        "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
+        "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
     },
     tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_site:LANDING"),
     columns=SCENARIOS_FOLDER / "columns.toml",

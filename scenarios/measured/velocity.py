@@ -17,8 +17,14 @@ from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result
 from marsyard.scenarios.base import algorithm_result
 from marsyard.scenarios.interface import CaseResult, Scalar, record_conditions
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance, run_algorithms
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
+from marsyard.scenarios.measured.scenarios import (
+    MeasuredParameters,
+    MeasuredScenario,
+    case_row,
+    distance,
+    run_algorithms,
+)
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity, compute_scores
 from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row

@@ -5,8 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from marsyard.scenarios.systems import SCENARIOS_FOLDER, System
+from marsyard.scenarios.template import CampaignTemplate
 
 _FOLDER = Path(__file__).resolve().parent
+_NO_CAMERA_FILE = (
+    "--camera and --detector: tracking uses the stereo cameras of a mast; see camera.preset and camera.custom"
+)
 
 SYSTEM = System(
     name="vtt",
@@ -22,6 +26,19 @@ SYSTEM = System(
     columns=SCENARIOS_FOLDER / "columns.toml",
     error_sources=SCENARIOS_FOLDER / "error_sources.toml",
     compilation_campaigns={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
-    templates={"tracking": "marsyard.scenarios.rover.template:TRACKING"},
+    templates={
+        "tracking": CampaignTemplate(
+            file=_FOLDER / "new.toml.j2",
+            scale="ground",
+            site="mars-yard",
+            bound=0.03,
+            bound_text="maximum error of the target's position at the goal, m",
+            unsupported_options={
+                "camera": _NO_CAMERA_FILE,
+                "detector": _NO_CAMERA_FILE,
+                "flight": "--flight: only descents accept a recorded trajectory, and tracking is not a descent",
+            },
+        )
+    },
     report="marsyard.reports.vtt.presentation:VTT",
 )

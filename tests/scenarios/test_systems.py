@@ -32,7 +32,7 @@ from marsyard.scenarios.systems import (
     scenario_paths,
     scenario_source,
     systems,
-    template_paths,
+    templates,
 )
 
 CACHED_FUNCTIONS = (registry, row_columns, shipped_names, requirements.shipped_requirements, requirements._read_shipped)
@@ -90,7 +90,7 @@ def test_built_in_systems_are_complete() -> None:
         assert set(system.compilation_campaigns) <= set(system.campaigns)
     # Each campaign file in the folders belongs to a system.
     assert set(catalogue()) == {path.stem for path in SCENARIOS_FOLDER.glob("*/catalogue/*.toml")}
-    assert list(template_paths()) == ["velocity", "landing", "tracking"]
+    assert list(templates()) == ["velocity", "landing", "tracking"]
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
 
@@ -116,7 +116,7 @@ def test_system_of_another_package_is_registered(install: Install) -> None:
     requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
-        _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.matching:MatchingScenario'"),
+        _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
         **{"mine-one": 'scenario = "mine-case"\n', "limits": f'[[requirements]]\nid = "MINE"\n{requirement}'},
         columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
@@ -152,7 +152,7 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
         (_format_system("dimes"), "the system 'dimes' already has the name 'dimes'"),
         (_format_system("descent").replace("-case", ""), "the system 'dimes' already has the scenario 'descent'"),
         (
-            _format_system("mine", ", templates={'tracking': 'x:Y'}"),
+            _format_system("mine", ", templates={'tracking': None}"),
             "the system 'vtt' already has the template 'tracking'",
         ),
         (
@@ -206,7 +206,7 @@ def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path)
 
 
 def test_invalid_columns_affect_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
-    scenario_path = "marsyard.scenarios.measured.matching:MatchingScenario"
+    scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
     install(
         "mine", _format_system("mine", ", columns=HERE / 'columns.toml'").replace("x:Y", scenario_path), columns="x = ["
     )

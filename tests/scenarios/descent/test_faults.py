@@ -20,8 +20,7 @@ from marsyard.scenarios.descent.parameters import (
     add_terrain_fault,
     add_time_fault,
 )
-from marsyard.scenarios.exposure import add_haze
-from marsyard.scenarios.heat_shield import SHIELD_DIAMETER_M, HeatShield
+from marsyard.scenarios.exposure import SHIELD_DIAMETER_M, HeatShield, add_haze
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
