@@ -52,8 +52,8 @@ class System:
     - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
     - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
-    - catalogue: campaign files, as a folder and a pattern (``folder/altitude-*.toml``)
-    - requirements: file of the requirements that campaigns reference by id (docs/reports.md)
+    - folder: its files: campaigns in the folder `catalogue`, and the requirements that campaigns reference by id in
+      `requirements.toml` (docs/reports.md)
     - columns: file of the columns of each scenario's rows, as `scenarios/columns.toml`. Without it, requirements are
       checked against the first finished case.
     - error_sources: file of the sources of error of each scenario's cases, as `scenarios/error_sources.toml`
@@ -70,8 +70,7 @@ class System:
     summary: str
     scenarios: Mapping[str, str]
     tasks: tuple[str, ...] = ()
-    catalogue: Path | None = None
-    requirements: Path | None = None
+    folder: Path | None = None
     columns: Path | None = None
     error_sources: Path | None = None
     compilation_campaigns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -82,9 +81,14 @@ class System:
     @property
     def campaigns(self) -> Mapping[str, Path]:
         """Files of the catalogue by campaign."""
-        if self.catalogue is None:
-            return {}
-        return {path.stem: path for path in sorted(self.catalogue.parent.glob(self.catalogue.name))}
+        files = () if self.folder is None else sorted((self.folder / "catalogue").glob("*.toml"))
+        return {path.stem: path for path in files}
+
+    @property
+    def requirements(self) -> Path | None:
+        """File of the requirements; None without one."""
+        path = None if self.folder is None else self.folder / "requirements.toml"
+        return path if path is not None and path.is_file() else None
 
 
 #: Entry point group of other packages' systems.
@@ -151,13 +155,8 @@ def _load(path: str, earlier_systems: list[System]) -> System:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
         raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.systems.System")
-    missing = [
-        str(path)
-        for path in (system.requirements, system.columns, system.error_sources)
-        if path is not None and not path.is_file()
-    ]
-    if system.catalogue is not None and not system.campaigns:
-        missing.append(str(system.catalogue))
+    paths = (path for path in (system.folder, system.columns, system.error_sources) if path is not None)
+    missing = [str(path) for path in paths if not path.exists()]
     if missing:
         raise ValueError(f"these files do not exist: {', '.join(missing)}")
     for earlier in earlier_systems:

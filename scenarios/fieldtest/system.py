@@ -6,15 +6,13 @@ from pathlib import Path
 
 from marsyard.scenarios.systems import SCENARIOS_FOLDER, System
 
-_FOLDER = Path(__file__).resolve().parent
-
 SYSTEM = System(
     name="fieldtest",
     title="Field test of DIMES on a helicopter",
     summary="Horizontal velocity of a helicopter from triples of images over desert ground.",
     scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
     tasks=("marsyard.scenarios.velocity:VELOCITY",),
-    catalogue=_FOLDER / "catalogue" / "*.toml",
+    folder=Path(__file__).resolve().parent,
     columns=SCENARIOS_FOLDER / "columns.toml",
     error_sources=SCENARIOS_FOLDER / "error_sources.toml",
     report="marsyard.reports.dimes.presentation:FIELD_TEST",

@@ -3,31 +3,22 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from marsyard.scenarios.systems import find_system, own_paths, scenario_paths
+from marsyard.scenarios.systems import find_system, own_paths, scenario_paths, systems
 
-#: Algorithms of each scenario. The field test evaluates DIMES, and recorded images the algorithms of their task.
-ALGORITHMS = {
-    "descent": {"dimes"},
+#: Packages of algorithms that a scenario uses in addition to that with the name of its system.
+FURTHER_ALGORITHMS = {
     "fieldtest": {"dimes"},
-    "landing": {"hda"},
-    "localisation": {"localisation"},
     "measured-landing": {"hda"},
-    "measured-matching": set(),
     "measured-velocity": {"dimes"},
-    "rover": {"navigation", "vtt"},
-    "rover-drive": {"navigation", "vtt"},
+    "rover": {"navigation"},
+    "rover-drive": {"navigation"},
 }
 #: Modules of the simulation that only rovers have.
-ROVER_MODULES = {
-    "sim.dynamics.driving",
-    "sim.dynamics.rover",
-    "sim.render.rover",
-    "sim.sensor.mast",
-    "sim.sensor.odometry",
-}
+ROVER = {"sim.dynamics.driving", "sim.dynamics.rover", "sim.render.rover", "sim.sensor.mast", "sim.sensor.odometry"}
 #: Import a scenario, check the parameters of a case of its first campaign, and print the imported modules.
 PROGRAM = """
 import json, sys
@@ -43,11 +34,7 @@ print(json.dumps([is_checked, modules]))
 """
 
 
-def test_each_scenario_is_in_the_table() -> None:
-    assert set(ALGORITHMS) == set(scenario_paths())
-
-
-@pytest.mark.parametrize("name", sorted(ALGORITHMS))
+@pytest.mark.parametrize("name", sorted(scenario_paths()))
 def test_scenario_imports_no_other_system(name: str) -> None:
     output = subprocess.run([sys.executable, "-c", PROGRAM, name], check=True, capture_output=True, text=True).stdout
     is_checked, modules = json.loads(output)
@@ -55,12 +42,16 @@ def test_scenario_imports_no_other_system(name: str) -> None:
     assert system is not None
     assert is_checked or not system.campaigns
     folder = scenario_paths()[name].split(".")[2]
-    others = {f"scenarios.{other}" for other in own_paths() if other != folder}
-    others |= {f"algorithms.{other}" for other in set().union(*ALGORITHMS.values()) - ALGORITHMS[name]}
-    others |= set() if folder == "rover" else ROVER_MODULES
+    algorithms = {entry.name for entry in systems()}.union(*FURTHER_ALGORITHMS.values())
+    others = {f"algorithms.{other}" for other in algorithms - {system.name, *FURTHER_ALGORITHMS.get(name, ())}}
+    others |= {f"scenarios.{other}" for other in {*own_paths()} - {folder}} | (set() if folder == "rover" else ROVER)
+    imported = {module for module in modules if f"{module}.".startswith(tuple(f"{other}." for other in others))}
     # the registry reads the declaration of each system, which imports nothing
-    declarations = {f"scenarios.{other}{module}" for other in own_paths() for module in ("", ".system")}
-    prefixes = tuple(f"{other}." for other in others)
-    imported = [module for module in modules if f"{module}.".startswith(prefixes)]
-    assert set(imported) <= declarations
-    assert [module for module in modules if module.startswith("reports.")] == []
+    assert imported <= {f"scenarios.{other}{module}" for other in own_paths() for module in ("", ".system")}
+    assert not any(module.startswith("reports.") for module in modules)
+
+
+def test_packages_of_algorithms_have_the_names_of_systems() -> None:
+    folder = Path(__file__).parents[2] / "algorithms"
+    packages = {path.name for path in folder.iterdir() if path.is_dir() and not path.name.startswith("_")}
+    assert packages - {system.name for system in systems()} == {"exchange", "image", "navigation"}

@@ -59,7 +59,9 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         (metadata_folder / "entry_points.txt").write_text(f"[marsyard.systems]\n{entry_points}")
         (tmp_path / f"{package}.py").write_text(HEADER + source)
         for name, text in files.items():
-            (tmp_path / f"{name}.toml").write_text(text)
+            path = tmp_path / f"{name}.toml"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
         modules.append(package)
         _clear_caches()
 
@@ -112,12 +114,13 @@ def test_conditions_are_columns_and_no_results(name: str) -> None:
 
 
 def test_system_of_another_package_is_registered(install: Install) -> None:
-    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'limits.toml', columns=HERE / 'columns.toml'"
+    files = ", folder=HERE, columns=HERE / 'columns.toml'"
     requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
     install(
         "mine",
         _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
-        **{"mine-one": 'scenario = "mine-case"\n', "limits": f'[[requirements]]\nid = "MINE"\n{requirement}'},
+        **{"catalogue/mine-one": 'scenario = "mine-case"\n'},
+        requirements=f'[[requirements]]\nid = "MINE"\n{requirement}',
         columns='[mine-case]\nflags = []\nnumbers = ["metres"]\n',
     )
     assert not problems()
@@ -155,16 +158,13 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
             _format_system("mine", ", templates={'tracking': None}"),
             "the system 'vtt' already has the template 'tracking'",
         ),
-        (
-            _format_system("mine", ", catalogue=HERE / 'hda-*.toml'"),
-            "the system 'hda' already has the campaign 'hda-map'",
-        ),
+        (_format_system("mine", ", folder=HERE"), "the system 'hda' already has the campaign 'hda-map'"),
         (_format_system("mine", ", columns=HERE / 'none.toml'"), "these files do not exist: "),
-        (_format_system("mine", ", catalogue=HERE / 'none-*.toml'"), "these files do not exist: "),
+        (_format_system("mine", ", folder=HERE / 'none'"), "these files do not exist: "),
     ],
 )
 def test_invalid_system_does_not_affect_others(install: Install, source: str, reason: str) -> None:
-    install("mine", source, **{"hda-map": ""})
+    install("mine", source, **{"catalogue/hda-map": ""})
     install("valid", _format_system("valid"))
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
@@ -195,13 +195,11 @@ def test_entry_point_of_a_system_of_marsyard_adds_nothing(install: Install, monk
 
 
 def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path) -> None:
-    install(
-        "mine", _format_system("mine", ", requirements=HERE / 'limits.toml'"), limits='[[requirements]]\nid = "MINE"\n'
-    )
+    install("mine", _format_system("mine", ", folder=HERE"), requirements='[[requirements]]\nid = "MINE"\n')
     assert "DIMES-VEL" in requirements.shipped_requirements()
     campaign = tmp_path / "campaign.toml"
     campaign.write_text('name = "c"\nscenario = "descent"\ncases = 1\n[[requirements]]\nid = "MINE"\n')
-    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*limits\.toml: .*metric.*required"):
+    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*requirements\.toml: .*metric.*required"):
         load_campaign(str(campaign))
 
 
