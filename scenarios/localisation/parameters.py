@@ -12,7 +12,6 @@ from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.localisation.flight import ProfileParameters
-from marsyard.scenarios.localisation.imported import check_imported_terrain
 from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
     LANDER_DETECTOR,
@@ -22,7 +21,7 @@ from marsyard.scenarios.localisation.instruments import (
     check_clock,
 )
 from marsyard.scenarios.localisation.map_product import MapParameters
-from marsyard.scenarios.localisation.sites import localisation_site
+from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
 from marsyard.scenarios.localisation.stream import ImageSchedule
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters
