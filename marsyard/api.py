@@ -117,7 +117,7 @@ def run(
     - directory: new folder of the results; `runs/NAME-TIME` if None
     """
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.cli.campaign import default_directory
+    from marsyard.cli.execution import default_directory
     from marsyard.result import open_result
 
     if isinstance(campaign, Campaign):

@@ -347,15 +347,15 @@ def check_threads(environment: Mapping[str, str], cores: int) -> Check:
 def check_systems() -> Iterator[Check]:
     """Check the definitions of the systems under test, built in and plug-ins."""
     try:
-        from marsyard.scenarios.systems import BUILT_IN, registry
+        from marsyard.scenarios.systems import own_paths, registry
 
-        systems = registry()
+        (systems, problems), own_systems = registry(), len(own_paths())
     except ImportError as error:
         yield Check("systems", f"cannot be read: {error}", Verdict.FAIL, REINSTALL)
         return
-    others = ", ".join(system.name for system in systems.systems[len(BUILT_IN) :])
-    yield Check("systems", f"{len(BUILT_IN)} built in; plug-ins: {others or 'none'}")
-    for problem in systems.problems:
+    others = ", ".join(system.name for system in systems[own_systems:])
+    yield Check("systems", f"{own_systems} built in; plug-ins: {others or 'none'}")
+    for problem in problems:
         yield Check("systems", problem, Verdict.WARN, "correct or uninstall the package that defines the system")
 
 

@@ -104,9 +104,10 @@ class Presentation:
 
 @cache
 def presentations() -> tuple[Presentation, ...]:
-    """Import the presentations of all systems in the order of the registry; omit an invalid one with a warning."""
+    """Import the presentations of all systems, those of recorded data first; omit an invalid one with a warning."""
     valid_presentations: list[Presentation] = []
-    for system in systems():
+    # cases of recorded data also contain products of other systems, which must not claim them
+    for system in sorted(systems(), key=lambda system: not system.ingest):
         if not system.report:
             continue
         description = f"the report '{system.report}' of system '{system.name}'"

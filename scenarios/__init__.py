@@ -1,1 +1,1 @@
-"""Scenarios, which combine world, trajectory, instruments and score into cases, and the catalogue of campaign files."""
+"""Scenarios: world, trajectory, instruments and score of cases. Each folder with a module `system` is a system."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, Generic, TypeVar
@@ -35,7 +34,7 @@ class BaseScenario(Generic[ParametersType]):
         return parameters
 
 
-class TerrainScenario(BaseScenario[ParametersType], ABC):
+class TerrainScenario(BaseScenario[ParametersType]):
     """A scenario whose shared inputs are terrains; the most recently used terrains are cached in memory.
 
     `shared_input` is the number of an input that several cases use, one of `Scenario.shared_inputs`.
@@ -53,22 +52,27 @@ class TerrainScenario(BaseScenario[ParametersType], ABC):
     def __init__(self, max_cached_grounds: int = 0) -> None:
         self.load_ground: LoadGround = lru_cache(maxsize=max_cached_grounds)(SiteGround.from_bank)
 
-    def list_stored_terrains(self, bank: int) -> tuple[int, ...]:
-        """Return the numbers of a bank's terrains; empty for a bank of more than `max_stored_terrains` terrains."""
+    def location(self, p: Any) -> Any:
+        """Return the parameters with size of the bank, number of the terrain, and seed of the bank."""
+        return p.location
+
+    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
+        """Return the numbers of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
+        bank = self.location(self.check_parameters(parameters)).bank
         return tuple(range(bank)) if bank <= self.max_stored_terrains else ()
 
-    @abstractmethod
-    def input_terrain(self, p: ParametersType, shared_input: int) -> tuple[TerrainBank, int]:
+    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
+        """Return the shared inputs of a case with these sampled parameters: the number of its terrain in the bank."""
+        return (self.location(self.check_parameters(parameters)).terrain,)
+
+    def input_terrain(self, p: Any, shared_input: int) -> tuple[TerrainBank, int]:
         """Return the bank of a shared input, and the number of the terrain in the bank."""
+        return TerrainBank(p.terrain, self.location(p).bank_seed), shared_input
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Build the terrain of a shared input and store it in the cache on disk."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         bank.store(number)
-
-    @abstractmethod
-    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the shared inputs of a case with these sampled parameters."""
 
     def terrain_identities(self, parameters: BaseModel, case: int) -> tuple[str, ...]:
         """Return the identities of the terrains of a case with these sampled parameters."""

@@ -24,41 +24,11 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from marsyard.algorithms import exchange
-from marsyard.algorithms.answers import STREAM_METHODS, StreamedEstimator
-from marsyard.algorithms.baselines import HomographyEstimator, PhaseCorrelationEstimator
-from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
-from marsyard.algorithms.dimes import options as dimes_options
-from marsyard.algorithms.hda import HdaEstimator, HdaOptions
-from marsyard.algorithms.hda import options as hda_options
-from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
-from marsyard.algorithms.interface import (
-    MastAim,
-    PixelBox,
-    SiteEstimate,
-    SiteEstimator,
-    SiteOutcome,
-    TargetLoss,
-    TargetTracker,
-    TargetUpdate,
-    TrackingState,
-    VelocityEstimate,
-    VelocityEstimator,
-    VelocityOutcome,
-)
-from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
-from marsyard.algorithms.vtt import options as vtt_options
+from marsyard.algorithms.answers import STREAM_METHODS
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.isolation.host import construct, reset
 from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, describe
-from marsyard.scenarios.offline import (
-    SITE_FORMAT,
-    VELOCITY_FORMAT,
-    AnswerFormat,
-    answers_file,
-    create_offline,
-    is_offline,
-    read_answers,
-)
+from marsyard.scenarios.offline import AnswerFormat, answers_file, create_offline, is_offline, read_answers
 from marsyard.scenarios.systems import systems
 
 #: Entry point group of other packages' algorithms.
@@ -106,7 +76,7 @@ class Task(Generic[Algorithm, Options]):
     - offline: format of the answers in a table; None if an answer determines the next inputs
     - streamed: function that wraps an algorithm that receives images one by one; None if streams are not accepted
     - suite: ``module:Class`` of the conformance suite, a `marsyard.scenarios.conformance.checks.Suite`; empty without
-      one, and for the tasks in `TASKS`
+      one
     """
 
     name: str
@@ -229,64 +199,6 @@ def _import_problem(spec: str, path: str, error: Exception) -> str:
     return f"algorithm '{spec}' cannot be loaded from {path}: {error}"
 
 
-VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
-    name="velocity",
-    what="velocity estimator",
-    methods=("estimate",),
-    answers=(VelocityEstimate, VelocityOutcome),
-    shipped={
-        **configurations("dimes", DimesEstimator, dimes_options.IMPROVEMENTS),
-        "phase-correlation": lambda _: PhaseCorrelationEstimator(),
-        "homography": lambda _: HomographyEstimator(),
-    },
-    # a program receives three images at once, or all images one by one
-    executable=lambda command, limits: (
-        StreamedEstimator(exchange.ExecutableVelocityStream(command, limits))
-        if command.stream
-        else exchange.ExecutableVelocityEstimator(command, limits)
-    ),
-    options=DimesOptions,
-    offline=VELOCITY_FORMAT,
-    streamed=StreamedEstimator,
-)
-
-TRACKING: Task[TargetTracker, VttOptions] = Task(
-    name="tracking",
-    what="target tracker",
-    methods=("designate", "aim", "update", "clear", "state"),
-    answers=(MastAim, PixelBox, TargetUpdate, TargetLoss, TrackingState),
-    shipped={
-        **configurations("vtt", VisualTargetTracker, vtt_options.IMPROVEMENTS),
-        # the paper's baseline: without scale and roll
-        "pure-ncc": lambda options: VisualTargetTracker(
-            replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, warp=PURE_NCC.warp)
-        ),
-        "lucas-kanade": lambda options: lucas_kanade_tracker(replace(options, **vtt_options.IMPROVEMENTS)),
-    },
-    executable=exchange.ExecutableTargetTracker,
-    options=VttOptions,
-)
-
-LANDING: Task[SiteEstimator, HdaOptions] = Task(
-    name="landing",
-    what="estimator of landing sites",
-    methods=("estimate",),
-    answers=(SiteEstimate, SiteOutcome),
-    shipped={
-        **configurations("hda", HdaEstimator, hda_options.IMPROVEMENTS),
-        # the baselines replace stages of the improved algorithm
-        "essential-matrix": lambda options: EssentialMatrixEstimator(replace(options, **hda_options.IMPROVEMENTS)),
-        "semi-global": lambda options: SemiGlobalEstimator(replace(options, **hda_options.IMPROVEMENTS)),
-    },
-    executable=exchange.ExecutableSiteEstimator,
-    options=HdaOptions,
-    offline=SITE_FORMAT,
-)
-
-#: Tasks whose conformance suites are in `marsyard.scenarios.conformance`, by name.
-TASKS: Mapping[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
-
-
 @cache
 def shipped_names() -> frozenset[str]:
     """Return the names of the systems' built-in algorithms."""
@@ -307,7 +219,8 @@ def algorithm_sources(spec: str) -> list[tuple[str, Path]]:
     """Return names and paths of the source files of a user's Python algorithm; empty for all other algorithms."""
     path = list_installed()[spec].value if spec in list_installed() else spec
     is_external = is_offline(spec) or spec.startswith(tuple(exchange.PREFIXES))
-    return list(source_files(path)) if ":" in path and not is_external and spec not in shipped_names() else []
+    is_shipped = ":" not in spec and spec in shipped_names()
+    return list(source_files(path)) if ":" in path and not is_external and not is_shipped else []
 
 
 def check_algorithms(task: Task[Any, Any], specs: Sequence[str]) -> None:

@@ -1,7 +1,8 @@
 """Registry of the systems under test and their scenarios: those of Marsyard, and those of installed packages.
 
-A system is, for example, the velocity estimator DIMES with its scenarios, campaigns, requirements and reports. A
-package adds a system by an entry point of the group `marsyard.systems`::
+A system is, for example, the velocity estimator DIMES with its scenarios, campaigns, requirements and reports. Each
+folder of `scenarios` with a module `system` defines one. Another package adds one by an entry point of the group
+`marsyard.systems`::
 
     [project.entry-points."marsyard.systems"]
     altitude = "mypackage.system:SYSTEM"
@@ -15,16 +16,17 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from marsyard.scenarios.imports import import_object
+from marsyard.scenarios.template import CampaignTemplate
 
 if TYPE_CHECKING:  # its imports take longer than `marsyard list`
     from marsyard.scenarios.interface import Scenario
 
-#: Folder of the files that the systems of Marsyard share.
+#: Folder of Marsyard's systems, each in a folder of its own, and of the files that they share.
 SCENARIOS_FOLDER = Path(__file__).resolve().parent
 
 
@@ -42,22 +44,19 @@ class Ingested:
 class System:
     """A system under test; plain data, whose ``module:NAME`` objects are imported when they are needed.
 
-    A system of another package is a module-level object of this class, in an entry point of the group
-    `marsyard.systems` (`marsyard.scenarios.systems`).
-
     - name: short unique name; the dashboard groups campaigns by it
     - title: title in reports
     - summary: one sentence on the tests
     - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
     - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
-    - catalogue: campaign files, as a folder and a pattern (``folder/altitude-*.toml``)
-    - requirements: file of the requirements that campaigns reference by id, as `scenarios/requirements.toml`
+    - folder: its files: campaigns in the folder `catalogue`, and the requirements that campaigns reference by id in
+      `requirements.toml` (docs/reports.md)
     - columns: columns of the rows, each a `marsyard.scenarios.columns.Columns`, by scenario. Without them, requirements
       are checked against the first finished case.
     - compilation_campaigns: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small. One case
       of each calls, and so compiles, all numeric kernels of its scenario (`marsyard compile`).
-    - templates: each a `marsyard.scenarios.template.CampaignTemplate`, by the values of ``marsyard new --system``
+    - templates: of campaign files, by the values of ``marsyard new --system``
     - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder
       for the new cases, and folder to which the new cases are moved. Returns `Ingested`.
     - report: a `marsyard.reports.presentation.Presentation`: report sections, and the figures of a case
@@ -68,133 +67,55 @@ class System:
     summary: str
     scenarios: Mapping[str, str]
     tasks: tuple[str, ...] = ()
-    catalogue: Path | None = None
-    requirements: Path | None = None
+    folder: Path | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     compilation_campaigns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    templates: Mapping[str, str] = field(default_factory=dict)
+    templates: Mapping[str, CampaignTemplate] = field(default_factory=dict)
     ingest: str = ""
     report: str = ""
 
     @property
     def campaigns(self) -> Mapping[str, Path]:
         """Files of the catalogue by campaign."""
-        if self.catalogue is None:
-            return {}
-        return {path.stem: path for path in sorted(self.catalogue.parent.glob(self.catalogue.name))}
+        files = () if self.folder is None else sorted((self.folder / "catalogue").glob("*.toml"))
+        return {path.stem: path for path in files}
+
+    @property
+    def requirements(self) -> Path | None:
+        """File of the requirements; None without one."""
+        path = None if self.folder is None else self.folder / "requirements.toml"
+        return path if path is not None and path.is_file() else None
 
 
 #: Entry point group of other packages' systems.
 GROUP = "marsyard.systems"
 
-#: Files that the systems of Marsyard share.
-_CATALOGUE = SCENARIOS_FOLDER / "catalogue"
-_REQUIREMENTS = SCENARIOS_FOLDER / "requirements.toml"
 
-#: The systems of Marsyard. Recorded images come first, because their cases also contain products of other systems.
-BUILT_IN = (
-    System(
-        name="measured",
-        title="Recorded images",
-        summary="Algorithms on real images, compared with the measured poses.",
-        scenarios={
-            "measured-velocity": "marsyard.scenarios.measured.scenarios:MeasuredVelocityScenario",
-            "measured-landing": "marsyard.scenarios.measured.scenarios:MeasuredLandingScenario",
-            "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
-        },
-        tasks=("marsyard.scenarios.estimators:VELOCITY", "marsyard.scenarios.estimators:LANDING"),
-        columns={
-            "measured-velocity": "marsyard.scenarios.measured.row:VELOCITY_COLUMNS",
-            "measured-landing": "marsyard.scenarios.measured.row:LANDING_COLUMNS",
-            "measured-matching": "marsyard.scenarios.measured.row:MATCHING_COLUMNS",
-        },
-        ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
-        report="marsyard.reports.measured.presentation:MEASURED",
-    ),
-    System(
-        name="dimes",
-        title="Descent Image Motion Estimation System (DIMES)",
-        summary="Horizontal velocity of a lander under its parachute, from three images.",
-        scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
-        tasks=("marsyard.scenarios.estimators:VELOCITY",),
-        catalogue=_CATALOGUE / "dimes-*.toml",
-        requirements=_REQUIREMENTS,
-        columns={"descent": "marsyard.scenarios.descent.row:COLUMNS"},
-        compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
-        templates={"velocity": "marsyard.scenarios.template:VELOCITY"},
-        report="marsyard.reports.dimes.presentation:DIMES",
-    ),
-    System(
-        name="fieldtest",
-        title="Field test of DIMES on a helicopter",
-        summary="Horizontal velocity of a helicopter from triples of images over desert ground.",
-        scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
-        tasks=("marsyard.scenarios.estimators:VELOCITY",),
-        catalogue=_CATALOGUE / "dimes-fieldtest.toml",
-        columns={"fieldtest": "marsyard.scenarios.fieldtest.row:COLUMNS"},
-        report="marsyard.reports.dimes.presentation:FIELD_TEST",
-    ),
-    System(
-        name="vtt",
-        title="Visual target tracking (VTT)",
-        summary="Position of a target that a rover approaches, tracked in the images of its mast cameras.",
-        scenarios={
-            "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
-            "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
-        },
-        tasks=("marsyard.scenarios.estimators:TRACKING",),
-        catalogue=_CATALOGUE / "vtt-*.toml",
-        requirements=_REQUIREMENTS,
-        columns={
-            "rover": "marsyard.scenarios.rover.row:COLUMNS",
-            "rover-drive": "marsyard.scenarios.rover.row:DRIVE_COLUMNS",
-        },
-        compilation_campaigns={
-            "vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")
-        },
-        templates={"tracking": "marsyard.scenarios.template:TRACKING"},
-        report="marsyard.reports.vtt.presentation:VTT",
-    ),
-    System(
-        name="hda",
-        title="Hazard detection and avoidance (HDA)",
-        summary="A safe landing site from two images of a moving camera.",
-        scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
-        tasks=("marsyard.scenarios.estimators:LANDING",),
-        catalogue=_CATALOGUE / "hda-*.toml",
-        requirements=_REQUIREMENTS,
-        columns={"landing": "marsyard.scenarios.landing.row:COLUMNS"},
-        compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
-        templates={"landing": "marsyard.scenarios.template:LANDING"},
-        report="marsyard.reports.hda.presentation:HDA",
-    ),
-)
-
-
-@dataclass(frozen=True)
-class Registry:
-    """The systems in order, and one message for each omitted system."""
-
-    systems: tuple[System, ...]
-    problems: tuple[str, ...]
+def own_paths() -> dict[str, str]:
+    """Return the systems of Marsyard as ``module:SYSTEM``, by the name of their folder."""
+    folders = sorted(file.parent.name for file in SCENARIOS_FOLDER.glob("*/system.py"))
+    return {folder: f"marsyard.scenarios.{folder}.system:SYSTEM" for folder in folders}
 
 
 @cache
-def registry() -> Registry:
-    """Read the systems of this installation, once per process."""
-    loaded_systems = list(BUILT_IN)
+def registry() -> tuple[tuple[System, ...], tuple[str, ...]]:
+    """Read the systems of this installation, once per process; also return one message for each omitted system."""
+    paths = [*own_paths().items()]
+    points = sorted((point.name, point.value) for point in entry_points(group=GROUP))
+    paths += [(name, path) for name, path in points if path not in own_paths().values()]
+    loaded_systems: list[System] = []
     problems: list[str] = []
-    for point in sorted(entry_points(group=GROUP), key=lambda item: (item.name, item.value)):
+    for name, path in paths:
         try:
-            loaded_systems.append(_load(point, loaded_systems))
+            loaded_systems.append(_load(path, loaded_systems))
         except ValueError as error:
-            problems.append(f"system '{point.name}' ({point.value}) is omitted: {error}")
-    return Registry(tuple(loaded_systems), tuple(problems))
+            problems.append(f"system '{name}' ({path}) is omitted: {error}")
+    return tuple(loaded_systems), tuple(problems)
 
 
 def systems() -> tuple[System, ...]:
-    """Return all systems: those of Marsyard first, then those of other packages by name."""
-    return registry().systems
+    """Return all systems: those of Marsyard by folder, then those of other packages by name."""
+    return registry()[0]
 
 
 def catalogue() -> dict[str, Path]:
@@ -203,8 +124,8 @@ def catalogue() -> dict[str, Path]:
 
 
 def problems() -> tuple[str, ...]:
-    """Return one message for each system of another package that is omitted."""
-    return registry().problems
+    """Return one message for each system that is omitted."""
+    return registry()[1]
 
 
 def scenario_paths() -> Mapping[str, str]:
@@ -212,9 +133,9 @@ def scenario_paths() -> Mapping[str, str]:
     return {name: path for system in systems() for name, path in system.scenarios.items()}
 
 
-def template_paths() -> Mapping[str, str]:
-    """Return the templates of `marsyard new` as ``module:NAME`` by value of its option ``--system``."""
-    return {name: path for system in systems() for name, path in system.templates.items()}
+def templates() -> Mapping[str, CampaignTemplate]:
+    """Return the templates of `marsyard new` by value of its option ``--system``."""
+    return {name: template for system in systems() for name, template in system.templates.items()}
 
 
 def find_system(scenario: str) -> System | None:
@@ -222,17 +143,15 @@ def find_system(scenario: str) -> System | None:
     return next((item for item in systems() if scenario in {*item.scenarios, *item.scenarios.values()}), None)
 
 
-def _load(point: EntryPoint, earlier_systems: list[System]) -> System:
-    """Load the system of an entry point. Raises ValueError if it is invalid or conflicts with an earlier system."""
+def _load(path: str, earlier_systems: list[System]) -> System:
+    """Load the system ``module:NAME``. Raises ValueError if it is invalid or conflicts with an earlier system."""
     try:
-        system = import_object(point.value)
+        system = import_object(path)
     except ImportError as error:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
         raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.systems.System")
-    missing = [] if system.requirements is None or system.requirements.is_file() else [str(system.requirements)]
-    if system.catalogue is not None and not system.campaigns:
-        missing.append(str(system.catalogue))
+    missing = [] if system.folder is None or system.folder.exists() else [str(system.folder)]
     if missing:
         raise ValueError(f"these files do not exist: {', '.join(missing)}")
     for earlier in earlier_systems:

@@ -7,14 +7,11 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+if TYPE_CHECKING:  # its import takes longer than `marsyard list`
+    from jinja2 import Environment
 
-from marsyard.scenarios.descent.parameters import binned_size_for
-from marsyard.scenarios.systems import SCENARIOS_FOLDER
-from marsyard.sim.camera import read_camera
-from marsyard.sim.terrain import MAX_TERRAINS
 
 #: Minimum number of terrains of a new campaign's bank, enough for cases appended later and for studies.
 MIN_TERRAINS = 100_000
@@ -69,13 +66,17 @@ class CampaignTemplate:
         reasons = [reason for option, reason in self.unsupported_options.items() if getattr(choices, option)]
         if reasons:
             raise ValueError(reasons[0])
-        template = toml_environment(self.file.parent, SCENARIOS_FOLDER).get_template(self.file.name)
+        from marsyard.sim.terrain import MAX_TERRAINS
+
+        template = toml_environment(self.file.parent, Path(__file__).resolve().parent).get_template(self.file.name)
         bank = min(MAX_TERRAINS, max(MIN_TERRAINS, choices.cases))
         return template.render(asdict(choices), bank=bank, **self.values(choices))
 
 
 def toml_environment(*folders: Path) -> Environment:
     """Return the environment of TOML templates in folders; the filter ``toml`` formats a value as TOML."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     environment = Environment(
         loader=FileSystemLoader(folders),
         undefined=StrictUndefined,
@@ -86,41 +87,3 @@ def toml_environment(*folders: Path) -> Environment:
     )
     environment.filters["toml"] = json.dumps
     return environment
-
-
-_NO_FLIGHT_FILE = "--flight: only descents accept a recorded trajectory, and {} is not a descent"
-_NO_CAMERA_FILE = (
-    "--camera and --detector: tracking uses the stereo cameras of a mast; see camera.preset and camera.custom"
-)
-
-VELOCITY = CampaignTemplate(
-    file=SCENARIOS_FOLDER / "descent" / "new.toml.j2",
-    scale="descent",
-    site="gusev",
-    bound=5.0,
-    bound_text="maximum error of the horizontal velocity, m/s (DIMES requirement: 5)",
-    values=lambda choices: (
-        {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
-    ),
-)
-LANDING = CampaignTemplate(
-    file=SCENARIOS_FOLDER / "landing" / "new.toml.j2",
-    scale="ground",
-    site="heli-hazardous",
-    bound=0.99,
-    bound_text="minimum fraction of safe sites among the selected sites",
-    max_bound=1.0,
-    unsupported_options={"flight": _NO_FLIGHT_FILE.format("landing")},
-)
-TRACKING = CampaignTemplate(
-    file=SCENARIOS_FOLDER / "rover" / "new.toml.j2",
-    scale="ground",
-    site="mars-yard",
-    bound=0.03,
-    bound_text="maximum error of the target's position at the goal, m",
-    unsupported_options={
-        "camera": _NO_CAMERA_FILE,
-        "detector": _NO_CAMERA_FILE,
-        "flight": _NO_FLIGHT_FILE.format("tracking"),
-    },
-)

@@ -1,4 +1,4 @@
-"""Run velocity estimators; compute the result columns of their answers, and the arrays for the figures of a case.
+"""Velocity estimators: their task, runs, the result columns of their answers, and the arrays for figures of a case.
 
 The answer of a velocity estimator is a mean velocity over a span: the interval between two time tags. The truth of an
 answer is the true mean velocity over the same span.
@@ -11,13 +11,17 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Float64, UInt16
 
+from marsyard.algorithms import exchange
 from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span
-from marsyard.algorithms.dimes import DimesDetails, dimes_products
+from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, dimes_products
+from marsyard.algorithms.dimes.baselines import HomographyEstimator, PhaseCorrelationEstimator
+from marsyard.algorithms.dimes.options import IMPROVEMENTS
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator
+from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.estimators import Task, configurations
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
+from marsyard.scenarios.offline import VELOCITY_FORMAT, CaseExporter, RecordedAnswer
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
@@ -27,6 +31,27 @@ Span = tuple[float, float]
 ImageTriple = tuple[int, int, int]
 
 _FIRST_TRIPLE: ImageTriple = (0, 1, 2)
+
+VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
+    name="velocity",
+    what="velocity estimator",
+    methods=("estimate",),
+    answers=(VelocityEstimate, VelocityOutcome),
+    shipped={
+        **configurations("dimes", DimesEstimator, IMPROVEMENTS),
+        "phase-correlation": lambda _: PhaseCorrelationEstimator(),
+        "homography": lambda _: HomographyEstimator(),
+    },
+    # a program receives three images at once, or all images one by one
+    executable=lambda command, limits: (
+        StreamedEstimator(exchange.ExecutableVelocityStream(command, limits))
+        if command.stream
+        else exchange.ExecutableVelocityEstimator(command, limits)
+    ),
+    options=DimesOptions,
+    offline=VELOCITY_FORMAT,
+    streamed=StreamedEstimator,
+)
 
 
 def run_estimator(

@@ -16,7 +16,7 @@ from marsyard.algorithms.arrays import Flags, Points2, Points3, Vector, Vector3
 from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
-from marsyard.sim.camera import CameraModel
+from marsyard.sim.camera import CameraModel, camera_pose
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorImage, LandingMeasurements, PoseMeasurement
 
@@ -69,12 +69,6 @@ def apply_flat_field(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]
     signal = image.counts - np.float32(detector.offset_dn)
     signal = remove_frame_transfer(signal, detector, detector.rows_summed).astype(np.float32, copy=False)
     return np.asarray(np.rint(np.clip(signal / response, 0.0, 65535.0)).astype(np.uint16))
-
-
-def camera_pose(camera: CameraModel) -> RigidTransform:
-    """Transform from the camera frame (columns right, rows down, optical axis forward) to the camera model's frame."""
-    axes = np.column_stack([camera.right, np.cross(camera.a, camera.right), camera.a])
-    return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
 def undistort(camera: CameraModel, pixels: Points2) -> Points2:

@@ -28,7 +28,7 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, CampaignError
 from marsyard.campaigns.execution.batches import Batches
 from marsyard.campaigns.execution.monitoring import POLL_INTERVAL_S, MonitoredWorker
-from marsyard.campaigns.execution.worker_process import BatchResult, Executor, TaskResult, Work
+from marsyard.campaigns.execution.worker_process import BatchResult, TaskResult, Work
 
 Result = TypeVar("Result")
 
@@ -251,15 +251,3 @@ class ExecutorConfig:
         if self.cluster is None:
             return f"{self.jobs} on this machine"
         return f"cluster {self.cluster}" if self.cluster.startswith("local:") else "cluster"
-
-
-def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:
-    """Create an executor as a context; at the end its workers end, or are killed after an exception.
-
-    Raises CampaignError if the cluster cannot be reached or Dask is not installed.
-    """
-    if config.cluster is None:
-        return LocalExecutor(config.jobs)
-    from marsyard.campaigns.execution.cluster import ClusterExecutor
-
-    return ClusterExecutor(config.cluster)

@@ -26,8 +26,9 @@ from marsyard.campaigns.execution.cases import (
     run_cases,
     work_limits,
 )
+from marsyard.campaigns.execution.executors import create_executor
 from marsyard.campaigns.execution.worker_process import Executor, Work
-from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.preparation import compile_kernels, plan_inputs
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard

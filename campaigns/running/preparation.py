@@ -25,8 +25,9 @@ from marsyard.campaigns.execution.cases import (
     run_cases,
     work_limits,
 )
+from marsyard.campaigns.execution.executors import create_executor
 from marsyard.campaigns.execution.worker_process import Executor, Work
-from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.store.products import ALL_PRODUCTS
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import systems

@@ -20,8 +20,9 @@ from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
+from marsyard.campaigns.execution.executors import create_executor
 from marsyard.campaigns.execution.worker_process import Executor
-from marsyard.campaigns.execution.workers import ExecutorConfig, create_executor
+from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver, check_metrics, prepare_inputs
 from marsyard.campaigns.running.preparation import compile_kernels
 from marsyard.campaigns.running.replay import load_stored_campaign

@@ -35,8 +35,9 @@ from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.dynamics.rover import RoverParameters, Stance
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer, rover_objects
+from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
+from marsyard.sim.render.rover import rover_objects
 from marsyard.sim.sensor.compression import compress
 from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.streams import Streams

@@ -67,8 +67,7 @@ def new(arguments: NewOptions) -> None:
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.cli.outcome import evidence_limits
     from marsyard.reports.wording import count
-    from marsyard.scenarios.imports import import_object
-    from marsyard.scenarios.systems import template_paths
+    from marsyard.scenarios.systems import templates
     from marsyard.scenarios.template import Choices
     from marsyard.sim.terrain import sites
 
@@ -78,12 +77,12 @@ def new(arguments: NewOptions) -> None:
         raise CampaignError(f"{path}: the file exists; use --overwrite to replace it, or --out to write another file")
     if not name or any(letter in name for letter in '/\\"\n'):
         raise CampaignError(f"'{name}' is not a valid campaign name: slashes and quotes are not allowed")
-    is_interactive, paths = arguments.system is None and _is_terminal(), template_paths()
-    find_problem = partial(_find_name_problem, list(paths))
-    system = arguments.system or _ask_user("System", next(iter(paths)), is_interactive, find_problem)
-    if system not in paths:
-        raise CampaignError(f"--system: {unknown_name_message('system', system, paths)}")
-    template: CampaignTemplate = import_object(paths[system])
+    is_interactive, available = arguments.system is None and _is_terminal(), templates()
+    find_problem = partial(_find_name_problem, list(available))
+    system = arguments.system or _ask_user("System", next(iter(available)), is_interactive, find_problem)
+    if system not in available:
+        raise CampaignError(f"--system: {unknown_name_message('system', system, available)}")
+    template = available[system]
     ask_camera, ask_flight = (
         is_interactive and option not in template.unsupported_options for option in ("camera", "flight")
     )

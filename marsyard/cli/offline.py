@@ -11,7 +11,7 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
-from marsyard.cli.campaign import default_directory, make_executor, run_and_evaluate, show_progress
+from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
 from marsyard.cli.options import Exit, JsonOption, console, handle_user_errors
 
 TruthOption = Annotated[

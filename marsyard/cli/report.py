@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.campaign import make_executor, stop_on_signals
+from marsyard.cli.execution import make_executor, stop_on_signals
 from marsyard.cli.options import (
     CONFIRMATIONS,
     DirectoryArgument,

@@ -11,7 +11,7 @@ import typer
 from typer import Option
 
 from marsyard.cli import options
-from marsyard.cli.campaign import default_directory, make_executor, show_progress
+from marsyard.cli.execution import default_directory, make_executor, show_progress
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign

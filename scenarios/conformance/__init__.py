@@ -18,17 +18,20 @@ from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
 from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
-from marsyard.scenarios.estimators import LANDING, TASKS, TRACKING, VELOCITY, Task, list_installed
+from marsyard.scenarios.estimators import Task, list_installed
 from marsyard.scenarios.imports import import_object
+from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.offline import is_offline
 from marsyard.scenarios.parts.named import KINDS
+from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.systems import systems
+from marsyard.scenarios.velocity import VELOCITY
 
 
 @cache
 def tasks() -> Mapping[str, Task[Any, Any]]:
-    """Return the tasks with a conformance suite, by name: `TASKS`, then those of the systems that define a suite."""
-    found = dict(TASKS)
+    """Return the tasks with a conformance suite, by name."""
+    found: dict[str, Task[Any, Any]] = {task.name: task for task in (VELOCITY, TRACKING, LANDING)}
     for path in dict.fromkeys(path for system in systems() for path in system.tasks):
         with suppress(ImportError):  # the campaigns of the system report the error
             task = import_object(path)

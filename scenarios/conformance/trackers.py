@@ -19,7 +19,7 @@ from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements
-from marsyard.sim.sensor import stereo_mast
+from marsyard.sim.sensor.mast import stereo_mast
 
 #: Largest count of the 12-bit cameras, and mean count of the wall.
 FULL_SCALE_DN, _MEAN_DN = 4095, 1500.0

@@ -10,21 +10,23 @@ from pydantic import Field, Tag, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes.binning import check_binning
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
-from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.exposure import SHIELD_FALL_M_S
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
+from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters
 from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
-from marsyard.sim.dynamics import SwingParameters
+from marsyard.scenarios.velocity import VELOCITY
+from marsyard.sim.dynamics.swing import SwingParameters
 from marsyard.sim.error_sources import CALIBRATION, CLOUDS, DETECTOR, SHADOW
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field, merge_settings
-from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.render.photometry import CloudLayer, CloudParameters
 from marsyard.sim.sensor import (
     ApproachParameters,
@@ -38,13 +40,11 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.sensor.detector import BURST_DN, BURST_PX
 from marsyard.sim.sensor.imu import IMUS, ImuClass
-from marsyard.sim.terrain import MAX_TERRAINS, Site, TerrainParameters, site, sites
+from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.landforms import Dunes
 
 #: Regular dunes of the dune fault.
 REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regularity=12.0)
-#: Downward speed of the released heat shield relative to the lander, m/s (assumed).
-SHIELD_FALL_M_S = 20.0
 #: Index of the image that single-image faults affect; it belongs to both pairs.
 FAULTY_IMAGE = 1
 
@@ -146,35 +146,6 @@ def add_attitude_faults(
 TRIPLE_SIZE = 3
 
 
-class Location(Parameters):
-    """Terrain and position of the descent."""
-
-    bank: Annotated[int, bounded_field(1, MAX_TERRAINS, "number of terrains in the terrain bank")] = 4
-    bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1
-    terrain: Annotated[int, Field(ge=0, description="number of the terrain in the bank, from 0")] = 0
-    east_m: Annotated[float, Field(description="east coordinate at the first image, on the periodic terrain")] = 0.0
-    north_m: Annotated[float, Field(description="north coordinate at the first image, on the periodic terrain")] = 0.0
-
-    @model_validator(mode="after")
-    def _check_terrain(self) -> Location:
-        if self.terrain >= self.bank:
-            raise ValueError(f"terrain {self.terrain} is not in the bank; allowed: 0 to {self.bank - 1}")
-        return self
-
-
-class SunParameters(Parameters):
-    """Direction to the sun."""
-
-    azimuth_deg: Annotated[float, bounded_field(-360.0, 720.0, "azimuth of the sun, clockwise from north")] = 270.0
-    elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="elevation of the sun above the horizon")] = 40.0
-
-
-#: Optical depth of the atmosphere in a case.
-DustOpacity = Annotated[
-    float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; by default that of the site")
-]
-
-
 class LanderParameters(Parameters):
     """The lander's shadow in its own images, modelled as the shadow of a disc at the camera's position.
 
@@ -231,12 +202,6 @@ class CameraParameters(Parameters):
     distortion_error_px: Annotated[
         float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")
     ] = 0.3
-
-
-class RenderParameters(Parameters):
-    """Rendering of the images."""
-
-    backend: Backend = Field(default_factory=default_backend, description="OpenGL context provider")
 
 
 class InertialParameters(Parameters):
@@ -387,19 +352,3 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     def preset(self) -> Site | None:
         """The site; None for a generic terrain."""
         return None if self.site is None else site(self.site).with_dust(self.dust_opacity)
-
-
-def check_binning(binned_size: tuple[int, int], delivered_size: tuple[int, int]) -> None:
-    """Raise ValueError if DIMES cannot bin a delivered image to this size; both are (columns, rows)."""
-    if delivered_size[0] % binned_size[0] or delivered_size[1] % binned_size[1]:
-        raise ValueError(
-            f"dimes.binned_size {list(binned_size)} does not divide the delivered image of {delivered_size[0]} x "
-            f"{delivered_size[1]} pixels; allowed: sizes that do, such as {list(binned_size_for(*delivered_size))}"
-        )
-
-
-def binned_size_for(columns: int, rows: int) -> tuple[int, int]:
-    """Return a binned size for DIMES: square bins, and the smallest possible width of at least 256 columns."""
-    candidates = range(1, max(columns // 256, 1) + 1)
-    factors = [factor for factor in candidates if columns % factor == 0 and rows % factor == 0]
-    return columns // factors[-1], rows // factors[-1]

@@ -39,13 +39,13 @@ from marsyard.scenarios.descent.score import (
     propagate_to_firing,
 )
 from marsyard.scenarios.descent.timeline import descent_timeline
-from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
 from marsyard.scenarios.timeline import timeline_products
 from marsyard.scenarios.velocity import (
+    VELOCITY,
     Horizontal,
     Span,
     consistency_row,
@@ -59,7 +59,6 @@ from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import TerrainBank
 
 
 class DescentScenario(TerrainScenario[DescentScenarioParameters]):
@@ -75,18 +74,10 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         "scores": SCORE,
     }
 
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
-        return self.list_stored_terrains(self.check_parameters(parameters).location.bank)
-
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the index of the terrain below the descent; empty with the dune fault, whose terrain is in no bank."""
         p = self.check_parameters(parameters)
         return (p.location.terrain,) if add_terrain_fault(p.faults, p.terrain) == p.terrain else ()
-
-    def input_terrain(self, p: DescentScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """Return the terrain bank and the index of a terrain in it."""
-        return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Yield the images of a case, without transmission faults, and the ground truth of their pixels."""

@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 from pydantic import AwareDatetime, Field, model_validator
 
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
 from marsyard.scenarios.terrain_files import site_validator
+from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.dynamics.helicopter import HelicopterParameters
 from marsyard.sim.error_sources import ATTITUDE, ErrorSource
 from marsyard.sim.parameters import NonNegative, Parameters, Positive

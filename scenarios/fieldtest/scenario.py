@@ -18,7 +18,6 @@ from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
-from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.fieldtest.imaging import RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, Triple, simulate_run
@@ -26,7 +25,7 @@ from marsyard.scenarios.fieldtest.timeline import triple_timeline
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredFlight, compute_scores
 from marsyard.scenarios.timeline import timeline_products
-from marsyard.scenarios.velocity import check_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage

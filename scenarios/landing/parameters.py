@@ -12,13 +12,13 @@ from pydantic import Field, field_validator, model_validator
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
-from marsyard.scenarios.descent.parameters import DustOpacity, Location, RenderParameters, SunParameters
-from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import CalibrationParameters
 from marsyard.scenarios.landing.helicopter import HelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
+from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
+from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR, ErrorSource

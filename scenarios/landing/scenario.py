@@ -12,7 +12,6 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import hash_images, image_columns
-from marsyard.scenarios.estimators import LANDING
 from marsyard.scenarios.exposure import Sample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.images import MAX_GROUNDS, RenderedFlight, measure
@@ -29,10 +28,10 @@ from marsyard.scenarios.landing.score import (
     times_row,
 )
 from marsyard.scenarios.landing.timeline import landing_timeline
+from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding, compute_scores
 from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import TerrainBank
 
 
 class LandingScenario(TerrainScenario[LandingScenarioParameters]):
@@ -44,18 +43,6 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
 
     def __init__(self) -> None:
         super().__init__(MAX_GROUNDS)
-
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
-        return self.list_stored_terrains(self.check_parameters(parameters).location.bank)
-
-    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the index of the terrain below the flight."""
-        return (self.check_parameters(parameters).location.terrain,)
-
-    def input_terrain(self, p: LandingScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """Return the terrain bank and the index of a terrain in it."""
-        return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
         """Yield the two delivered images of a case with the ground truth of their pixels."""

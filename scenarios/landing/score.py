@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.hda import STAGES, HdaDetails, MatchStatus, Safety, hda_products
-from marsyard.algorithms.hda.motion import camera_pose
+from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
@@ -19,6 +18,8 @@ from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
 from marsyard.scenarios.landing.images import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
+from marsyard.scenarios.landing_site import motion_errors, stage_row
+from marsyard.sim.camera import camera_pose
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
@@ -32,8 +33,6 @@ MAX_TRACK_ERROR_PX = 1.0
 BORDER_PX = 12.0
 #: Minimum fraction of correct tracks, among the features in both images, of a well-tracked pair.
 MIN_TRACKED_FRACTION = 0.9
-#: Match statuses whose matches are dropped and counted.
-DROP_STATUSES = (MatchStatus.DISSIMILAR, MatchStatus.OUT_OF_BOUNDS, MatchStatus.INCONSISTENT)
 #: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
 #: axis, and change of height as a fraction of the range along the optical axis.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
@@ -219,48 +218,6 @@ def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]
     if details.motion is not None:
         row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
     return row | stage_row(details)
-
-
-def motion_errors(estimated: RigidTransform, true: RigidTransform) -> dict[str, Scalar]:
-    """Compute the errors of an estimated motion from the first to the second camera's frame."""
-    (translation, length), (true_translation, true_length) = (
-        (np.array(motion.translation), float(np.linalg.norm(motion.translation))) for motion in (estimated, true)
-    )
-    has_directions = length and true_length
-    # chord between the unit vectors of both directions
-    chord = float(np.linalg.norm(translation / length - true_translation / true_length)) if has_directions else NAN
-    error = float(np.linalg.norm(translation - true_translation))
-    return {
-        "rotation_error_deg": float(np.degrees((estimated.rotation * true.rotation.inv()).magnitude())),
-        "direction_error_deg": float(np.degrees(2.0 * np.arcsin(min(chord / 2.0, 1.0)))),
-        "length_error_m": length - true_length,
-        "baseline_error_fraction": error / true_length if true_length > 0.0 else NAN,
-    }
-
-
-def stage_row(details: HdaDetails) -> dict[str, Scalar]:
-    """Compute the columns of inliers, matches and map; only for stages that were reached.
-
-    `empty_fraction` is the fraction of the map's cells without an elevation, after small holes were filled;
-    `unknown_fraction` is the fraction of cells that the safe landing map classifies as unknown.
-    """
-    row: dict[str, Scalar] = {}
-    if details.motion is not None:
-        row |= {
-            "inliers": int(details.motion.inliers.sum()),
-            "parallax_px": details.motion.parallax_px,
-            "motion_residual_px": float(np.median(details.motion.residuals_px)),
-        }
-    if details.matches is not None:
-        matches = details.matches
-        row |= {"points": len(matches.points), "matched_fraction": float(matches.accepted.mean())}
-        row |= {f"matches_{status.name.lower()}": int(np.sum(matches.statuses == status)) for status in DROP_STATUSES}
-    if details.ground is not None:
-        rows, columns = details.ground.elevation.elevation_m.shape
-        row |= {"map_rows": rows, "map_columns": columns, "cell_m": details.ground.elevation.cell_m}
-        row["empty_fraction"] = float(np.mean(np.isnan(details.ground.elevation.elevation_m)))
-        row["unknown_fraction"] = float(np.mean(details.ground.hazards.safety == Safety.UNKNOWN))
-    return row
 
 
 def times_row(details: object) -> dict[str, Scalar]:

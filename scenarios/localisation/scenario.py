@@ -16,8 +16,7 @@ from marsyard.algorithms.localisation.interface import InitialState, PositionEst
 from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
-from marsyard.scenarios.descent.exposure import HAZE_PATH_M, HeatShield
-from marsyard.scenarios.exposure import add_haze, camera_optics, render_state
+from marsyard.scenarios.exposure import HAZE_PATH_M, HeatShield, add_haze, camera_optics, render_state
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation import score
 from marsyard.scenarios.localisation.flight import LanderFlight
@@ -38,7 +37,6 @@ from marsyard.sim.sensor import ClockParameters, Detector, Imu
 from marsyard.sim.sensor.instrument import Clock
 from marsyard.sim.sensor.ranging import RadarAltimeter
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import TerrainBank
 
 #: The inertial data begin `LEAD_S` before the start of localisation and end `MARGIN_S` after the last image, s. The
 #: span is longer if the error of a clock moves a time tag out of it.
@@ -58,18 +56,10 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
     max_stored_terrains = 20  # a terrain needs 180 MB on disk
     part_keys: Mapping[str, PartKind] = {}
 
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""
-        return self.list_stored_terrains(self.check_parameters(parameters).location.bank)
-
     def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
         """Return the indices of the terrains below the descent and on the map."""
         p = self.check_parameters(parameters)
         return (p.location.terrain, _map_terrain(p)) if p.faults.wrong_map else (p.location.terrain,)
-
-    def input_terrain(self, p: LocalisationScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
-        """Return the terrain bank and the index of a terrain in it."""
-        return TerrainBank(p.terrain, p.location.bank_seed), shared_input
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one descent and score all algorithms."""

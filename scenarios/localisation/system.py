@@ -1,4 +1,4 @@
-"""Register localisation on a map as a system under test, by an entry point of the group `marsyard.systems`."""
+"""Localisation on a map as a system: position of a lander."""
 
 from __future__ import annotations
 
@@ -14,8 +14,7 @@ SYSTEM = System(
     summary="Position of a lander on a map, from descent images and inertial data.",
     scenarios={"localisation": "marsyard.scenarios.localisation.scenario:LocalisationScenario"},
     tasks=("marsyard.scenarios.localisation.task:LOCALISATION",),
-    catalogue=_FOLDER / "catalogue" / "loc-*.toml",
-    requirements=_FOLDER / "requirements.toml",
+    folder=_FOLDER,
     columns={"localisation": "marsyard.scenarios.localisation.row:COLUMNS"},
     compilation_campaigns={
         "loc-smoke": (

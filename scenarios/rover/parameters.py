@@ -14,30 +14,20 @@ from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
+from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.terrain_files import site_validator
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics import SlipParameters
+from marsyard.sim.dynamics.driving import SlipParameters
 from marsyard.sim.error_sources import CLOUDS, DETECTOR, OPTICS, SHADOW, ErrorSource
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import MastCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import CloudParameters, Sun
 from marsyard.sim.render.backend import Backend, default_backend
-from marsyard.sim.sensor import (
-    MASTS,
-    AutoExposureParameters,
-    CustomCameraChoice,
-    DetectorChoice,
-    DetectorParameters,
-    OdometryParameters,
-    PointingParameters,
-    StereoCalibrationParameters,
-    mount_on_head,
-    preset,
-    stereo_mast,
-)
+from marsyard.sim.sensor import AutoExposureParameters, CustomCameraChoice, DetectorChoice, DetectorParameters, preset
+from marsyard.sim.sensor.mast import MASTS, PointingParameters, StereoCalibrationParameters, mount_on_head, stereo_mast
+from marsyard.sim.sensor.odometry import OdometryParameters
 from marsyard.sim.terrain import MAX_TERRAINS, site
 
 #: Angles in degrees: relative angles, and azimuths.

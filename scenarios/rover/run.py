@@ -27,7 +27,6 @@ from marsyard.algorithms.vtt.placement import Placement
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
 from marsyard.scenarios.algorithm_run import InputCopy, Inputs, answer_time_s
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
@@ -49,9 +48,11 @@ from marsyard.scenarios.rover.stops import (
     designate_from_start,
     triangulate_point,
 )
+from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
 from marsyard.scenarios.views import SiteGround
-from marsyard.sim.dynamics import Drive, Stance
+from marsyard.sim.dynamics.driving import Drive
+from marsyard.sim.dynamics.rover import Stance
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import DriveCommand, MastCalibration, RoverMeasurements, StereoMeasurement
 from marsyard.sim.streams import Streams

@@ -29,12 +29,11 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
 from marsyard.scenarios.conditions import image_columns
-from marsyard.scenarios.estimators import TRACKING
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.scenarios.rover import placement, score
-from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.run import (
     DesignationGuide,
     Run,
@@ -45,6 +44,7 @@ from marsyard.scenarios.rover.run import (
     track_target,
 )
 from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, designate_point, evaluate_visibility
+from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.timeline import run_timeline
 from marsyard.scenarios.rover.world import terrain_parameters
 from marsyard.scenarios.timeline import timeline_products
@@ -246,13 +246,9 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         """Return the parameters of the selected run. Raises TypeError for parameters of another scenario."""
         return super().check_parameters(parameters).select_variant()
 
-    def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
-        """Return the indices of the bank's terrains; empty for a large bank, whose terrains are built by the runs."""
-        return self.list_stored_terrains(self.check_parameters(parameters).world.bank)
-
-    def case_inputs(self, parameters: BaseModel, case: int) -> tuple[int, ...]:
-        """Return the index of the run's terrain."""
-        return (self.check_parameters(parameters).world.terrain,)
+    def location(self, p: RoverScenarioParameters) -> WorldParameters:
+        """Return the parameters of the terrain."""
+        return p.world
 
     def input_terrain(self, p: RoverScenarioParameters, shared_input: int) -> tuple[TerrainBank, int]:
         """Return the terrain bank and the index of a terrain in it."""

@@ -24,7 +24,8 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import Triangles, Vector
 from marsyard.scenarios.rover.world import Rig, RunWorld
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics import Drive, Stance
+from marsyard.sim.dynamics.driving import Drive
+from marsyard.sim.dynamics.rover import Stance
 from marsyard.sim.frames import SITE_FROM_WORLD
 from marsyard.sim.measurements import (
     MastCalibration,

@@ -15,11 +15,12 @@ from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunPara
 from marsyard.scenarios.rover.points import RockOutline
 from marsyard.scenarios.views import SiteGround, Viewpoint, select_rocks, site_scene
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.dynamics import MER, ROCKY_8, Drive, Ground, RockyGround, RoverParameters, Soil, Stance, drive, settle
+from marsyard.sim.dynamics.driving import Drive, Soil, drive
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, MastCalibration
 from marsyard.sim.render import CloudLayer, PixelRays, Scene
-from marsyard.sim.sensor import Mast, MastState, StereoHead
+from marsyard.sim.sensor.mast import Mast, MastState, StereoHead
 from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, TerrainParameters, site

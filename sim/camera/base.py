@@ -27,6 +27,8 @@ from jaxtyping import Bool, Float, Num
 from numpy.typing import NDArray
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.sim.frames import rigid
+
 Vector = NDArray[np.float64]
 #: Type of number arguments: the run-time type checks do not accept an integer for a float.
 Number = float | int
@@ -305,6 +307,12 @@ def mount_looking_down(camera: CameraModel) -> CameraModel:
     right = _normalise(camera.right - (camera.right @ axis) * axis)
     rotation = Rotation.from_matrix(np.stack([right, np.cross(right, axis), -axis]))
     return camera.transform(RigidTransform.from_components(-rotation.apply(camera.c.copy()), rotation))
+
+
+def camera_pose(camera: CameraModel) -> RigidTransform:
+    """Transform from the camera frame (columns right, rows down, optical axis forward) to the camera model's frame."""
+    axes = np.column_stack([camera.right, np.cross(camera.a, camera.right), camera.a])
+    return rigid(Rotation.from_matrix(axes), np.array(camera.c))
 
 
 def dot(vector: Vector, x: Vector, y: Vector, z: Vector) -> Vector:

@@ -30,7 +30,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.dynamics import Drive
+from marsyard.sim.dynamics.driving import Drive
 from marsyard.sim.error_sources import ODOMETRY
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand

@@ -6,10 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marsyard.algorithms.baselines import BaselineDetails, HomographyEstimator, PairPatches, PhaseCorrelationEstimator
-from marsyard.algorithms.baselines.homography import max_length_change
-from marsyard.algorithms.baselines.pairs import DEFAULT_COMMON_OPTIONS, find_common_square, rectify_pair
 from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
+from marsyard.algorithms.dimes.baselines import (
+    DEFAULT_COMMON_OPTIONS,
+    BaselineDetails,
+    HomographyEstimator,
+    PairPatches,
+    PhaseCorrelationEstimator,
+    find_common_square,
+    max_length_change,
+    rectify_pair,
+)
 from marsyard.algorithms.dimes.binning import build_views, inside_frame, square_lattice
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements

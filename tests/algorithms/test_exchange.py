@@ -349,7 +349,7 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
 
 def test_python_example_estimates_velocity(measurements: DescentMeasurements, monkeypatch: pytest.MonkeyPatch) -> None:
     from marsyard.algorithms.dimes import DimesOptions
-    from marsyard.scenarios.estimators import VELOCITY
+    from marsyard.scenarios.velocity import VELOCITY
 
     monkeypatch.chdir(EXAMPLES)
     estimator = VELOCITY.make("velocity_estimator:MedianShift", DimesOptions(), ExecutableLimits())

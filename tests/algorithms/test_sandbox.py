@@ -14,7 +14,7 @@ from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.exchange import ExecutableLimits, process, sandbox
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import VELOCITY
+from marsyard.scenarios.velocity import VELOCITY
 
 #: Searches for the file of its caller, its processes, the network, variables, and writes outside of its folder.
 ATTEMPTS = """

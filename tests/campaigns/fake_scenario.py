@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from marsyard.algorithms.exchange import ExecutableLimits
-from marsyard.scenarios.estimators import VELOCITY
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.cache import CacheWarning
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain.bank import IMPORTED_TERRAIN

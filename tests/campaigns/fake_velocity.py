@@ -7,9 +7,9 @@ from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result, run_algorithm
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import VELOCITY, Task
+from marsyard.scenarios.estimators import Task
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.velocity import velocity_row
+from marsyard.scenarios.velocity import VELOCITY, velocity_row
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 

@@ -36,7 +36,7 @@ from marsyard.reports.wording import (
 )
 from marsyard.scenarios.systems import catalogue
 
-REQUIREMENTS = Path(__file__).parents[2] / "scenarios" / "requirements.toml"
+REQUIREMENTS = sorted((Path(__file__).parents[2] / "scenarios").glob("*/requirements.toml"))
 
 Rows = Callable[..., pd.DataFrame]
 
@@ -152,7 +152,8 @@ def test_rate_without_cases_has_the_interval_0_to_1() -> None:
 def test_requirement_texts_describe_metric_and_population() -> None:
     entries = {
         requirement["id"]: requirement
-        for requirement in tomllib.loads(REQUIREMENTS.read_text(encoding="utf-8"))["requirements"]
+        for path in REQUIREMENTS
+        for requirement in tomllib.loads(path.read_text(encoding="utf-8"))["requirements"]
     }
     texts = {
         name: requirement_text(

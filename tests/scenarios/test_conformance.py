@@ -9,7 +9,9 @@ import pytest
 from marsyard.campaigns.running.replay import run_conformance_checks
 from marsyard.scenarios.conformance import Subject, determine_task, inputs, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
-from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY
+from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.camera import Cahv
 from tests.scenarios.suites import run_suite, write_module
 

@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 
 from marsyard.algorithms.answers import StreamedEstimator
-from marsyard.algorithms.baselines import HomographyEstimator
 from marsyard.algorithms.dimes import DimesOptions
+from marsyard.algorithms.dimes.baselines import HomographyEstimator
 from marsyard.algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
@@ -22,9 +22,11 @@ from marsyard.reports.comparison import select_algorithm
 from marsyard.scenarios import estimators
 from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, Task, check_algorithms, labels
+from marsyard.scenarios.estimators import Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure
-from marsyard.scenarios.velocity import consistency_row
+from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.velocity import VELOCITY, consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
 
@@ -48,7 +50,8 @@ def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.
 def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pytest.MonkeyPatch) -> None:
     group = estimators.GROUP
     entry_points = [
-        EntryPoint(name, "marsyard.algorithms.baselines:HomographyEstimator", group) for name in ("installed", "dimes")
+        EntryPoint(name, "marsyard.algorithms.dimes.baselines:HomographyEstimator", group)
+        for name in ("installed", "dimes")
     ]
     installed_entry_points = {entry_point.name: entry_point for entry_point in entry_points}
     monkeypatch.setattr(estimators, "list_installed", lambda: installed_entry_points)

@@ -12,7 +12,7 @@ from marsyard.scenarios.horizon import HILL_NAME, add_unresolved_rocks, hill_obj
 from marsyard.scenarios.meshes import FIRST_MESH_NUMBER
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene
-from marsyard.sim.render.objects import ROVER_NAME
+from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain import RockField, site
 from marsyard.sim.terrain.sites import Hill
 

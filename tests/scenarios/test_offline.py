@@ -12,8 +12,11 @@ from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, algorithm_sources, labels
+from marsyard.scenarios.estimators import algorithm_sources, labels
+from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.offline import SITE_FORMAT, VELOCITY_FORMAT, read_answers
+from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.velocity import VELOCITY
 
 LIMITS = ExecutableLimits()
 HEADER = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"

@@ -3,6 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -18,10 +19,11 @@ from marsyard.scenarios import columns as column_declarations
 from marsyard.scenarios.columns import ENGINE, label, row_columns
 from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
-    BUILT_IN,
+    SCENARIOS_FOLDER,
     UnknownScenarioError,
     catalogue,
     find_system,
+    own_paths,
     problems,
     registry,
     scenario,
@@ -29,7 +31,7 @@ from marsyard.scenarios.systems import (
     scenario_paths,
     scenario_source,
     systems,
-    template_paths,
+    templates,
 )
 
 CACHED_FUNCTIONS = (
@@ -65,7 +67,9 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         (metadata_folder / "entry_points.txt").write_text(f"[marsyard.systems]\n{entry_points}")
         (tmp_path / f"{package}.py").write_text(HEADER + source)
         for name, text in files.items():
-            (tmp_path / f"{name}.toml").write_text(text)
+            path = tmp_path / f"{name}.toml"
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text)
         modules.append(package)
         _clear_caches()
 
@@ -83,7 +87,7 @@ def _format_system(name: str, arguments: str = "") -> str:
 
 def test_built_in_systems_are_complete() -> None:
     assert not problems()
-    assert [entry.name for entry in systems()][: len(BUILT_IN)] == ["measured", "dimes", "fieldtest", "vtt", "hda"]
+    assert [entry.name for entry in systems()] == ["dimes", "fieldtest", "hda", "localisation", "measured", "vtt"]
     for system in systems():
         assert system.title, system.name
         assert system.summary.endswith("."), system.name
@@ -95,9 +99,8 @@ def test_built_in_systems_are_complete() -> None:
             assert catalogue()[name] == path
         assert set(system.compilation_campaigns) <= set(system.campaigns)
     # Each campaign file in the folders belongs to a system.
-    folders = {path.parent for path in catalogue().values()}
-    assert set(catalogue()) == {path.stem for folder in folders for path in folder.glob("*.toml")}
-    assert list(template_paths()) == ["velocity", "tracking", "landing"]
+    assert set(catalogue()) == {path.stem for path in SCENARIOS_FOLDER.glob("*/catalogue/*.toml")}
+    assert list(templates()) == ["velocity", "landing", "tracking"]
     assert {"dimes", "vtt", "hda", "homography"} <= shipped_names()
 
 
@@ -117,7 +120,7 @@ def test_columns_are_declared_once_with_a_meaning(name: str) -> None:
 
 
 def test_system_of_another_package_is_registered(install: Install) -> None:
-    files = ", catalogue=HERE / 'mine-*.toml', requirements=HERE / 'limits.toml', columns={'mine-case': 'mine:COLUMNS'}"
+    files = ", folder=HERE, columns={'mine-case': 'mine:COLUMNS'}"
     columns_source = "from marsyard.scenarios.columns import Columns, error\n"
     columns_source += "COLUMNS = Columns((error('metres', 'length of a metre'),))\n"
     requirement = 'statement = "S"\nmetric = "metres"\nbound = 1.0\nprobability = 0.9\nconfidence = 0.9\n'
@@ -125,7 +128,8 @@ def test_system_of_another_package_is_registered(install: Install) -> None:
         "mine",
         columns_source
         + _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
-        **{"mine-one": 'scenario = "mine-case"\n', "limits": f'[[requirements]]\nid = "MINE"\n{requirement}'},
+        **{"catalogue/mine-one": 'scenario = "mine-case"\n'},
+        requirements=f'[[requirements]]\nid = "MINE"\n{requirement}',
     )
     assert not problems()
     assert systems()[-1].name == "mine"
@@ -159,28 +163,25 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
         (_format_system("dimes"), "the system 'dimes' already has the name 'dimes'"),
         (_format_system("descent").replace("-case", ""), "the system 'dimes' already has the scenario 'descent'"),
         (
-            _format_system("mine", ", templates={'tracking': 'x:Y'}"),
+            _format_system("mine", ", templates={'tracking': None}"),
             "the system 'vtt' already has the template 'tracking'",
         ),
-        (
-            _format_system("mine", ", catalogue=HERE / 'hda-*.toml'"),
-            "the system 'hda' already has the campaign 'hda-map'",
-        ),
-        (_format_system("mine", ", catalogue=HERE / 'none-*.toml'"), "these files do not exist: "),
+        (_format_system("mine", ", folder=HERE"), "the system 'hda' already has the campaign 'hda-map'"),
+        (_format_system("mine", ", folder=HERE / 'none'"), "these files do not exist: "),
     ],
 )
 def test_invalid_system_does_not_affect_others(install: Install, source: str, reason: str) -> None:
-    install("mine", source, **{"hda-map": ""})
+    install("mine", source, **{"catalogue/hda-map": ""})
     install("valid", _format_system("valid"))
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
-    assert [entry.name for entry in systems()[len(BUILT_IN) :]] == ["localisation", "valid"]
+    assert [entry.name for entry in systems()[len(own_paths()) :]] == ["valid"]
     result = CliRunner().invoke(app, ["list"])
     assert (result.exit_code, result.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in result.stdout
     checks = list(check_systems())
-    assert checks[0].finding.endswith("plug-ins: localisation, valid")
+    assert checks[0].finding.endswith("plug-ins: valid")
     assert [entry.finding for entry in checks if entry.verdict is Verdict.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is omitted"):
         scenario("unknown-scenario")
@@ -192,14 +193,20 @@ def test_first_of_two_entry_points_is_used(install: Install) -> None:
     assert problems() == ("system 'b' (mine:SYSTEM) is omitted: the system 'mine' already has the name 'mine'",)
 
 
+def test_entry_point_of_a_system_of_marsyard_adds_nothing(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+    install("mine", _format_system("mine"))
+    points = [EntryPoint(folder, path, "marsyard.systems") for folder, path in own_paths().items()]
+    monkeypatch.setattr("marsyard.scenarios.systems.entry_points", lambda group: points)
+    assert len(systems()) == len(own_paths())
+    assert not problems()
+
+
 def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path) -> None:
-    install(
-        "mine", _format_system("mine", ", requirements=HERE / 'limits.toml'"), limits='[[requirements]]\nid = "MINE"\n'
-    )
+    install("mine", _format_system("mine", ", folder=HERE"), requirements='[[requirements]]\nid = "MINE"\n')
     assert "DIMES-VEL" in requirements.shipped_requirements()
     campaign = tmp_path / "campaign.toml"
     campaign.write_text('name = "c"\nscenario = "descent"\ncases = 1\n[[requirements]]\nid = "MINE"\n')
-    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*limits\.toml: .*metric.*required"):
+    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*requirements\.toml: .*metric.*required"):
         load_campaign(str(campaign))
 
 

@@ -1,9 +1,15 @@
-"""Test of the import contracts: algorithms may import only the listed modules of the simulation."""
+"""Tests of the import contracts: they list each module of the simulation and of the scenarios; no circular imports."""
 
 from __future__ import annotations
 
 import tomllib
+from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import Any
+
+import grimp
+
+from marsyard.scenarios.systems import own_paths
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Modules of the simulation that algorithms may import (docs/architecture.md).
@@ -17,8 +23,29 @@ PARAMETER_TYPES = {"marsyard.sim.parameters"}
 def test_algorithms_may_import_only_the_allowed_modules_of_sim() -> None:
     paths = [path for path in (ROOT / "sim").iterdir() if path.suffix in ("", ".py") and not path.name.startswith("_")]
     modules = {f"marsyard.sim.{path.stem}" for path in paths}
-    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     forbidden_modules = next(
-        set(contract["forbidden_modules"]) for contract in contracts if contract["type"] == "forbidden"
+        set(contract["forbidden_modules"]) for contract in _read_contracts() if contract["type"] == "forbidden"
     )
     assert forbidden_modules == modules - ALLOWED_MODULES - CAMERA_DEPENDENCIES - PARAMETER_TYPES
+
+
+def test_contract_separates_systems_from_common_modules() -> None:
+    contract = next(item for item in _read_contracts() if item.get("containers") == ["marsyard.scenarios"])
+    systems, shared = ({name.strip() for name in layer.replace(":", "|").split("|")} for layer in contract["layers"])
+    assert systems <= set(own_paths())
+    modules = {path.stem for path in (ROOT / "scenarios").iterdir() if path.suffix in ("", ".py")}
+    # conformance suites use the inputs and limits of several systems
+    assert shared == {name for name in modules if not name.startswith("_")} - set(own_paths()) - {"conformance"}
+
+
+def test_no_circular_imports() -> None:
+    graph = grimp.build_graph("marsyard", exclude_type_checking_imports=True, cache_dir=None)
+    # raises CycleError, which names the modules
+    TopologicalSorter({name: graph.find_modules_directly_imported_by(name) for name in graph.modules}).prepare()
+
+
+def _read_contracts() -> list[dict[str, Any]]:
+    contracts: list[dict[str, Any]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"][
+        "contracts"
+    ]
+    return contracts

@@ -133,7 +133,7 @@ def test_all_processes_end_with_the_campaign(
 def test_second_interruption_ends_the_program() -> None:
     program = """
 import signal, sys, time
-from marsyard.cli.campaign import stop_on_signals
+from marsyard.cli.execution import stop_on_signals
 with stop_on_signals():
     try:
         print("ready", flush=True)

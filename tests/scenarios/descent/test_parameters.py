@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from marsyard.algorithms.dimes.binning import binned_size_for
 from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
-from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters, binned_size_for
+from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
 from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 

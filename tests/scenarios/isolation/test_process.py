@@ -21,10 +21,11 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.algorithm_run import run_on_measurements
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target
-from marsyard.scenarios.estimators import TRACKING, VELOCITY
 from marsyard.scenarios.isolation.plain import decode, encode
 from marsyard.scenarios.isolation.remote import is_remote
 from marsyard.scenarios.objects import name_object
+from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
 from tests.campaigns.fake_velocity import FakeVelocityParameters, FakeVelocityScenario

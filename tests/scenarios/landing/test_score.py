@@ -19,7 +19,8 @@ from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.images import GroundTruth, SampledMap, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
-from marsyard.scenarios.landing.score import landing_row, map_row, site_populations, site_row, stage_row
+from marsyard.scenarios.landing.score import landing_row, map_row, site_populations, site_row
+from marsyard.scenarios.landing_site import stage_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset

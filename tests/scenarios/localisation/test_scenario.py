@@ -1,6 +1,6 @@
 """Tests of complete localisation cases on a small terrain: repeatability, accuracy, faults, and invalid parameters.
 
-The rows of all cases are checked against `columns.toml` (tests/scenarios/conftest.py).
+The rows of all cases are checked against the declared columns (tests/scenarios/conftest.py).
 """
 
 from functools import cache

@@ -11,7 +11,9 @@ from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.measured.ingest import ingest
-from marsyard.scenarios.measured.scenarios import MatchingScenario, MeasuredLandingScenario, MeasuredVelocityScenario
+from marsyard.scenarios.measured.landing import MeasuredLandingScenario
+from marsyard.scenarios.measured.scenarios import MatchingScenario
+from marsyard.scenarios.measured.velocity import MeasuredVelocityScenario
 from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder

@@ -8,7 +8,7 @@ import pytest
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
 from marsyard.scenarios.rover.run import Run, run_case
-from marsyard.sim.dynamics import ROCKY_8, settle
+from marsyard.sim.dynamics.rover import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST
 from marsyard.sim.streams import Streams

@@ -13,7 +13,8 @@ from marsyard.scenarios.rover.run import Run, map_terrain, prepare_run, run_case
 from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid
-from marsyard.sim.sensor import preset, stereo_mast
+from marsyard.sim.sensor import preset
+from marsyard.sim.sensor.mast import stereo_mast
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
 

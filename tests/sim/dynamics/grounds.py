@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.sim.dynamics import SlipParameters
+from marsyard.sim.dynamics.driving import SlipParameters
 
 #: Wheels that follow their commands exactly.
 NO_SLIP = SlipParameters(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from marsyard.sim.dynamics import MER, SlipParameters, Soil, drive, settle
+from marsyard.sim.dynamics.driving import SlipParameters, Soil, drive
+from marsyard.sim.dynamics.rover import MER, settle
 from marsyard.sim.measurements import DriveCommand
 from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east
 

@@ -6,8 +6,16 @@ import trimesh
 from jaxtyping import Float64
 from pydantic import ValidationError
 
-from marsyard.sim.dynamics import MER, ROCKY_8, Ground, RockyGround, RoverParameters, settle
-from marsyard.sim.dynamics.rover import WHEELS, compute_wheel_centres
+from marsyard.sim.dynamics.rover import (
+    MER,
+    ROCKY_8,
+    WHEELS,
+    Ground,
+    RockyGround,
+    RoverParameters,
+    compute_wheel_centres,
+    settle,
+)
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
 

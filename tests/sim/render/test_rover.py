@@ -6,20 +6,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.camera import Cahv
-from marsyard.sim.dynamics import MER, ROCKY_8, RoverParameters, settle
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, settle
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import (
-    Photometry,
-    PixelRays,
-    Renderer,
-    Scene,
-    Sun,
-    may_cast_shadow,
-    rover_objects,
-    rover_sphere,
-)
-from marsyard.sim.render.objects import ROVER_NAME
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_cast_shadow
+from marsyard.sim.render.rover import ROVER_NAME, rover_objects, rover_sphere
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.sim.dynamics import MER, Drive, Ground, SlipParameters, Soil, drive, settle
+from marsyard.sim.dynamics.driving import Drive, SlipParameters, Soil, drive
+from marsyard.sim.dynamics.rover import MER, Ground, settle
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.sensor.odometry import EXACT, Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east

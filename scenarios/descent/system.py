@@ -1,0 +1,41 @@
+"""DIMES as a system: velocity of a lander under its parachute."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from marsyard.scenarios.systems import System
+from marsyard.scenarios.template import CampaignTemplate, Choices
+
+_FOLDER = Path(__file__).resolve().parent
+
+
+def _camera_values(choices: Choices) -> dict[str, tuple[int, int]]:
+    """Return the size to which DIMES bins the images of a user's camera."""
+    from marsyard.algorithms.dimes.binning import binned_size_for
+    from marsyard.sim.camera import read_camera
+
+    return {"binned_size": binned_size_for(*read_camera(choices.camera).size)} if choices.camera else {}
+
+
+SYSTEM = System(
+    name="dimes",
+    title="Descent Image Motion Estimation System (DIMES)",
+    summary="Horizontal velocity of a lander under its parachute, from three images.",
+    scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
+    tasks=("marsyard.scenarios.velocity:VELOCITY",),
+    folder=_FOLDER,
+    columns={"descent": "marsyard.scenarios.descent.row:COLUMNS"},
+    compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
+    templates={
+        "velocity": CampaignTemplate(
+            file=_FOLDER / "new.toml.j2",
+            scale="descent",
+            site="gusev",
+            bound=5.0,
+            bound_text="maximum error of the horizontal velocity, m/s (DIMES requirement: 5)",
+            values=_camera_values,
+        )
+    },
+    report="marsyard.reports.dimes.presentation:DIMES",
+)

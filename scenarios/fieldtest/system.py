@@ -1,0 +1,18 @@
+"""The field test of DIMES as a system."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from marsyard.scenarios.systems import System
+
+SYSTEM = System(
+    name="fieldtest",
+    title="Field test of DIMES on a helicopter",
+    summary="Horizontal velocity of a helicopter from triples of images over desert ground.",
+    scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
+    tasks=("marsyard.scenarios.velocity:VELOCITY",),
+    folder=Path(__file__).resolve().parent,
+    columns={"fieldtest": "marsyard.scenarios.fieldtest.row:COLUMNS"},
+    report="marsyard.reports.dimes.presentation:FIELD_TEST",
+)

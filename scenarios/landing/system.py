@@ -1,0 +1,35 @@
+"""Hazard detection and avoidance as a system: a helicopter selects its landing site."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from marsyard.scenarios.systems import System
+from marsyard.scenarios.template import CampaignTemplate
+
+_FOLDER = Path(__file__).resolve().parent
+
+SYSTEM = System(
+    name="hda",
+    title="Hazard detection and avoidance (HDA)",
+    summary="A safe landing site from two images of a moving camera.",
+    scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
+    tasks=("marsyard.scenarios.landing_site:LANDING",),
+    folder=_FOLDER,
+    columns={"landing": "marsyard.scenarios.landing.row:COLUMNS"},
+    compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
+    templates={
+        "landing": CampaignTemplate(
+            file=_FOLDER / "new.toml.j2",
+            scale="ground",
+            site="heli-hazardous",
+            bound=0.99,
+            bound_text="minimum fraction of safe sites among the selected sites",
+            max_bound=1.0,
+            unsupported_options={
+                "flight": "--flight: only descents accept a recorded trajectory, and landing is not a descent"
+            },
+        )
+    },
+    report="marsyard.reports.hda.presentation:HDA",
+)

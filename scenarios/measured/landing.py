@@ -1,0 +1,129 @@
+"""Estimation of landing sites from recorded images of the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel, Field
+from scipy.spatial.transform import RigidTransform
+
+from marsyard.algorithms.answers import check_site
+from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
+from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
+from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result
+from marsyard.scenarios.base import algorithm_result
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.landing_site import LANDING, motion_errors, stage_row
+from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
+from marsyard.scenarios.measured.scenarios import (
+    MeasuredParameters,
+    MeasuredScenario,
+    case_row,
+    distance,
+    run_algorithms,
+)
+from marsyard.scenarios.parts.named import SCORE, PartKind
+from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, compute_scores
+from marsyard.sim.camera import camera_pose
+from marsyard.sim.measurements import LandingMeasurements
+from marsyard.sim.streams import Streams
+
+
+class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
+    """Parameters of landing site estimation from two images of the ground."""
+
+    task_name = "landing"
+    task = LANDING
+    scored = ScoredSite
+
+    algorithm: Annotated[str, Field(description="the estimator of landing sites under test")] = "hda"
+    hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions()
+
+
+class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
+    """Estimation of a landing site from two recorded images of the ground and their measured poses."""
+
+    name = "measured-landing"
+    parameters_type = MeasuredLandingParameters
+    task = LANDING
+    algorithm_table = ()
+    part_keys: Mapping[str, PartKind] = {"scores": SCORE}
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Run one flight."""
+        p = self.check_parameters(parameters)
+        images = store.load_images(p.cases, p.case)
+        measurements = store.landing_measurements(p.case, images)
+        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.images])
+        true_poses = None
+        if p.case.truth.poses is not None:
+            first, second = (store.body_pose(*pose) for pose in p.case.truth.poses)
+            true_poses = first, second
+        conditions: dict[str, Scalar] = {
+            **case_row(p, images),
+            "slant_range_m": measurements.slant_range_m,
+            "truth_known": true_poses is not None,
+            **agreement_row(pairs),
+        }
+        runs = run_algorithms(p, p.hda, measurements, check_site, streams.case)
+
+        def evaluate(algorithm: str) -> CaseResult:
+            run = runs[algorithm]
+            details = None if run.answer is None else run.answer.details
+            row = _site_answer_row(run.answer, measurements, true_poses)
+            if algorithm != p.algorithm:
+                row["difference_m"] = distance(_get_site(run.answer), _get_site(runs[p.algorithm].answer))
+            row |= run.row
+            if run.answer is not None:
+                case = ScoredSite(measurements=measurements, answer=run.answer, true_poses=true_poses)
+                row |= compute_scores(p.scores, case, {*row, *conditions})
+            products = hda_products(details) if isinstance(details, HdaDetails) else {}
+            is_converged = run.answer is not None and run.answer.outcome.converged
+            return algorithm_result(run, is_converged, row, {**products, **agreement_products(images, pairs)})
+
+        return case_result(p.algorithms, evaluate, conditions)
+
+
+def _get_site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:
+    """Return the site; None if the algorithm reports no safe site."""
+    return None if estimate is None or estimate.outcome is not SiteOutcome.SAFE_SITE else estimate.site_world
+
+
+def _site_answer_row(
+    estimate: SiteEstimate | None,
+    measurements: LandingMeasurements,
+    true_poses: tuple[RigidTransform, RigidTransform] | None,
+) -> dict[str, Scalar]:
+    """Return the columns of an answer: site, and motion compared with the measured and the true poses.
+
+    The safety of the site is not scored: it needs the true ground, which a folder of images does not contain.
+    """
+    site = _get_site(estimate)
+    position = np.full(3, np.nan) if site is None else site
+    # without an answer both outcome columns are false, as for NO_STRUCTURE
+    outcome = SiteOutcome.NO_STRUCTURE if estimate is None else estimate.outcome
+    row: dict[str, Scalar] = {
+        "converged": outcome.converged,
+        "site_reported": outcome is SiteOutcome.SAFE_SITE,
+        **{f"site_{name}_m": float(value) for name, value in zip(("east", "north", "up"), position, strict=True)},
+    }
+    details = None if estimate is None else estimate.details
+    if not isinstance(details, HdaDetails):
+        return row
+    row |= stage_row(details)
+    if details.motion is None:
+        return row
+
+    def compare_motion(poses: Sequence[RigidTransform]) -> dict[str, Scalar]:
+        """Compare the estimated motion from the first to the second camera's frame with poses of the body."""
+        cameras = [body * camera_pose(image.camera) for body, image in zip(poses, measurements.images, strict=True)]
+        return motion_errors(motion.second_from_first, cameras[1].inv() * cameras[0])
+
+    motion = details.motion
+    differences = compare_motion([pose.world_from_body for pose in measurements.poses])
+    row |= {name.replace("_error_", "_pose_difference_"): value for name, value in differences.items()}
+    return row if true_poses is None else {**row, **compare_motion(true_poses)}

@@ -1,0 +1,24 @@
+"""Recorded images as a system: other systems' algorithms on real images, compared with measured poses."""
+
+from __future__ import annotations
+
+from marsyard.scenarios.systems import System
+
+SYSTEM = System(
+    name="measured",
+    title="Recorded images",
+    summary="Algorithms on real images, compared with the measured poses.",
+    scenarios={
+        "measured-velocity": "marsyard.scenarios.measured.velocity:MeasuredVelocityScenario",
+        "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
+        "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
+    },
+    tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_site:LANDING"),
+    columns={
+        "measured-velocity": "marsyard.scenarios.measured.row:VELOCITY_COLUMNS",
+        "measured-landing": "marsyard.scenarios.measured.row:LANDING_COLUMNS",
+        "measured-matching": "marsyard.scenarios.measured.row:MATCHING_COLUMNS",
+    },
+    ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
+    report="marsyard.reports.measured.presentation:MEASURED",
+)

@@ -1,0 +1,143 @@
+"""Velocity estimation from recorded images of a descent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, Field, model_validator
+from scipy.spatial.transform import RigidTransform
+
+from marsyard.algorithms.dimes import DimesDetails, DimesOptions
+from marsyard.algorithms.dimes.binning import check_binning
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result
+from marsyard.scenarios.base import algorithm_result
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
+from marsyard.scenarios.measured.scenarios import (
+    MeasuredParameters,
+    MeasuredScenario,
+    case_row,
+    distance,
+    run_algorithms,
+)
+from marsyard.scenarios.parts.named import SCORE, PartKind
+from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity, compute_scores
+from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DescentMeasurements
+from marsyard.sim.streams import Streams
+
+NAN = float("nan")
+
+
+class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
+    """Parameters of velocity estimation from three images of a descent."""
+
+    task_name = "velocity"
+    task = VELOCITY
+    scored = ScoredVelocity
+
+    algorithm: str = Field(default="dimes", description="the velocity estimator under test")
+    dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
+
+    @model_validator(mode="after")
+    def _check_binning(self) -> MeasuredVelocityParameters:
+        if any(name.startswith("dimes") for name in self.algorithms):
+            for image in self.case.images:
+                check_binning(self.dimes.binned_size, image.size)
+        return self
+
+
+class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
+    """Velocity estimation from three recorded images of a descent and their measurements."""
+
+    name = "measured-velocity"
+    parameters_type = MeasuredVelocityParameters
+    task = VELOCITY
+    algorithm_table = ()
+    part_keys: Mapping[str, PartKind] = {"scores": SCORE}
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Run one descent."""
+        p = self.check_parameters(parameters)
+        images = store.load_images(p.cases, p.case)
+        measurements = store.descent_measurements(p.case, images)
+        matches = match_images(images)
+        axes = [
+            image.camera.transform(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
+            for image, attitude in zip(images, measurements.attitudes, strict=True)
+        ]
+        conditions: dict[str, Scalar] = {
+            **case_row(p, images),
+            **{f"altitude_{number}_m": item.altitude_m for number, item in enumerate(measurements.altitudes, start=1)},
+            "off_nadir_max_deg": max(float(np.degrees(np.arccos(np.clip(-axis[2], -1.0, 1.0)))) for axis in axes),
+            "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
+            "truth_known": p.case.truth.velocity_m_s is not None,
+        }
+        runs = run_algorithms(
+            p, p.dimes, measurements, lambda answer: check_last_interval(answer, measurements), streams.case
+        )
+        true_velocity = p.case.truth.velocity_m_s
+        truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
+
+        def evaluate(algorithm: str) -> CaseResult:
+            run = runs[algorithm]
+            velocity = _get_velocity(run.answer)
+            pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
+            details = None if run.answer is None else run.answer.details
+            velocity_pair = details.selected if isinstance(details, DimesDetails) else None
+            estimate_m_s = np.full(2, np.nan) if velocity is None else velocity
+            row: dict[str, Scalar] = {
+                "velocity_estimated_x_m_s": float(estimate_m_s[0]),
+                "velocity_estimated_y_m_s": float(estimate_m_s[1]),
+                # estimated minus inertial velocity, which has an unknown constant error
+                "inertial_difference_m_s": distance(velocity, measurements.interval_velocities_m_s[1, :2]),
+                # estimated minus inertial velocity change between the intervals, in which this error cancels
+                "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
+            }
+            if true_velocity is not None:
+                row |= {**velocity_row("velocity", velocity, truth), **consistency_row(run.answer, truth)}
+            if algorithm != p.algorithm:
+                row["difference_m_s"] = distance(velocity, _get_velocity(runs[p.algorithm].answer))
+            row |= {**agreement_row(pairs), **run.row}
+            if run.answer is not None:
+                case = ScoredVelocity(
+                    measurements=measurements,
+                    answer=run.answer,
+                    true_velocity_m_s=None if true_velocity is None else truth,
+                )
+                row |= compute_scores(p.scores, case, {*row, *conditions})
+            products = velocity_products([image.counts for image in images], run.answer, truth)
+            return algorithm_result(run, velocity is not None, row, {**products, **agreement_products(images, pairs)})
+
+        return case_result(p.algorithms, evaluate, conditions)
+
+
+def _get_velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:
+    return None if estimate is None else estimate.velocity_m_s
+
+
+def _descent_poses(
+    case: store.StoredCase, measurements: DescentMeasurements, velocity_m_s: Float64[np.ndarray, "2"] | None
+) -> list[RigidTransform]:
+    """Return the body's poses from measured positions or, without these, from the inertial unit's velocities.
+
+    The inertial velocities have an unknown constant error, which the estimate removes. The horizontal velocity of the
+    second interval is the estimate; the velocity of the first interval is the estimate minus the inertial velocity
+    change. The agreement of images and poses then depends on the estimate as well.
+    """
+    velocities = measurements.interval_velocities_m_s.copy()
+    if velocity_m_s is not None:
+        velocities[:, :2] += velocity_m_s - velocities[1, :2]
+    times = np.array([image.time_s for image in measurements.images])
+    positions = np.concatenate([np.zeros((1, 3)), np.cumsum(velocities * np.diff(times)[:, None], axis=0)])
+    positions_m = [image.position_m for image in case.images]
+    if None not in positions_m:
+        positions = np.array(positions_m, dtype=np.float64)
+    rotations = [attitude.world_from_body for attitude in measurements.attitudes]
+    return [rigid(rotation, position) for rotation, position in zip(rotations, positions, strict=True)]
