@@ -26,5 +26,5 @@ def test_compiled_systems_are_skipped(tmp_path: Path, monkeypatch: pytest.Monkey
     result = CliRunner().invoke(app, ["compile"])
     assert (result.exit_code, result.output) == (
         0,
-        "".join(f"{name}: already compiled\n" for name in ("descent", "rover", "landing", "localisation")),
+        "".join(f"{name}: already compiled\n" for name in ("descent", "landing", "localisation", "rover")),
     )
