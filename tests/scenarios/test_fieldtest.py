@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard import scenarios
 from marsyard.algorithms.interface import VelocityOutcome
+from marsyard.scenarios import fieldtest
 from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.fieldtest import run as run_module
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory
@@ -38,7 +38,7 @@ from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
 
-CATALOGUE = Path(scenarios.__file__).parent / "catalogue" / "dimes-fieldtest.toml"
+CATALOGUE = Path(fieldtest.__file__).parent / "catalogue" / "dimes-fieldtest.toml"
 IMU = {"rate_hz": 25.0, "gyro_bias_deg_h_k": 0.0}
 #: Number of image triples in Fig. 11 of the paper: sum of the column TOTAL.
 N_PAPER_TRIPLES = 1913
