@@ -1,16 +1,12 @@
-"""Run the algorithms of a case separately: a failure or changed inputs of one algorithm do not affect the others.
-
-The first algorithm of a campaign is under test: its columns have no prefix. The columns of the compared algorithms have
-their label as a prefix (`homography.velocity_error_m_s`), with separate `outcome`, `answered` and `error`.
-"""
+"""Run the algorithms of a case separately: a failure or changed inputs of one algorithm do not affect the others."""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -19,8 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
-from marsyard.scenarios.estimators import Task, check_algorithms, labels
-from marsyard.scenarios.interface import CaseResult, Failure, Scalar
+from marsyard.scenarios.estimators import Task, check_algorithms
+from marsyard.scenarios.interface import Failure, Scalar
 from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.sim.parameters import Parameters
 
@@ -28,8 +24,8 @@ Algorithm = TypeVar("Algorithm")
 Answer = TypeVar("Answer")
 Inputs = TypeVar("Inputs")
 
-#: Names of two columns: label of the algorithm under test, and standard error of an external program.
-ALGORITHM, STDERR = "algorithm", "stderr"
+#: Column of the standard error of an external program.
+STDERR = "stderr"
 
 
 @dataclass(frozen=True)
@@ -45,10 +41,11 @@ class AlgorithmRun(Generic[Answer]):
     failure: Failure | None
     row: Mapping[str, Scalar]
 
-    def outcome(self, outcome_of_answer: Callable[[Answer], str]) -> str:
-        """Return the name of the answer's outcome, or of the fault if there is no answer."""
+    @property
+    def outcome_name(self) -> str:
+        """Name of the answer's outcome, or of the fault if there is no answer."""
         if self.answer is not None:
-            return outcome_of_answer(self.answer)
+            return str(self.answer.outcome.name)  # type: ignore[attr-defined]
         return self.failure.outcome if self.failure is not None else Fault.CRASHED.name
 
 
@@ -176,31 +173,6 @@ def answer_time_s(answer: object, processor_s: float) -> float:
     return details.time_s if isinstance(details, ProgramDetails) else processor_s
 
 
-def case_result(
-    algorithms: Sequence[str], evaluate: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
-) -> CaseResult:
-    """Score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
-    names = labels(algorithms)
-    first, *compared_results = [evaluate(spec) for spec in algorithms]
-    row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
-    for name, result in zip(names[1:], compared_results, strict=True):
-        columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered}
-        columns |= _empty_columns(first.row) if result.failure is not None else {}
-        columns |= result.row
-        columns["error"] = "" if result.failure is None else result.failure.error
-        row |= {f"{name}.{column}": value for column, value in columns.items()}
-    return replace(first, row=row)
-
-
-def _empty_columns(row: Mapping[str, Scalar]) -> dict[str, Scalar]:
-    """Return the columns of a failed algorithm: without them a report would show those of the algorithm under test."""
-    return {
-        column: False if isinstance(value, bool | np.bool_) else float("nan")
-        for column, value in row.items()
-        if not isinstance(value, str)
-    }
-
-
 class AlgorithmSelection(Parameters):
     """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
 
@@ -218,6 +190,15 @@ class AlgorithmSelection(Parameters):
     def algorithms(self) -> tuple[str, ...]:
         """All algorithms; the first is the one under test."""
         return (self.algorithm, *self.compared)
+
+    @property
+    def options(self) -> Any:
+        """Options of the published algorithm, for all algorithms of Marsyard."""
+        return next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
+
+    def make(self, algorithm: str, case: int) -> Any:
+        """Create an algorithm for a case. Raises ValueError, and the exceptions of a user's constructor."""
+        return self.task.make(algorithm, self.options, self.executable, case)
 
     @field_validator("algorithm")
     @classmethod
@@ -240,8 +221,7 @@ class AlgorithmSelection(Parameters):
     @model_validator(mode="after")
     def _check_options(self) -> AlgorithmSelection:
         """Create the algorithms of Marsyard once, which checks their options."""
-        options = next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
         for name in self.algorithms:
             if name in self.task.shipped:
-                self.task.shipped[name](options)
+                self.task.shipped[name](self.options)
         return self

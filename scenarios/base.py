@@ -8,8 +8,6 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel
 
-from marsyard.scenarios.algorithm_run import AlgorithmRun
-from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
@@ -84,11 +82,3 @@ class TerrainScenario(BaseScenario[ParametersType]):
         """Return the size in bytes of a terrain that is not yet in the cache on disk; 0 if it is."""
         bank, number = self.input_terrain(self.check_parameters(parameters), shared_input)
         return bank.missing_bytes(number)
-
-
-def algorithm_result(
-    run: AlgorithmRun[Any], answered: bool, row: Mapping[str, Scalar], products: Mapping[str, Any]
-) -> CaseResult:
-    """Combine an algorithm's answer or failure with its columns and products."""
-    outcome = run.outcome(lambda answer: str(answer.outcome.name))
-    return CaseResult(outcome, answered, row, products, run.failure)

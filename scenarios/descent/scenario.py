@@ -11,8 +11,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from marsyard.algorithms.dimes import DimesDetails
-from marsyard.scenarios.algorithm_run import case_result
-from marsyard.scenarios.base import TerrainScenario, algorithm_result
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.algorithm_run import AlgorithmRun
+from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.conditions import (
     add_detector_faults,
     contrast_columns,
@@ -39,11 +40,11 @@ from marsyard.scenarios.descent.score import (
     propagate_to_firing,
 )
 from marsyard.scenarios.descent.timeline import descent_timeline
+from marsyard.scenarios.evaluation import Score, evaluate_case
 from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
-from marsyard.scenarios.parts.scores import ScoredDescent, compute_scores
-from marsyard.scenarios.timeline import timeline_products
+from marsyard.scenarios.parts.scores import ScoredDescent
 from marsyard.scenarios.velocity import (
     VELOCITY,
     Horizontal,
@@ -112,7 +113,11 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
             **descent.flight.row,
             **image_columns(p.render.backend, hash_images(descent.images)),
         }
-        return case_result(p.algorithms, lambda algorithm: _score_algorithm(descent, algorithm, shared), shared)
+
+        def run(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
+            return run_estimator(partial(p.make, algorithm, streams.case), descent.measurements, p.triple_indices)
+
+        return evaluate_case(p, shared, run, lambda name, runs: _score_answer(descent, runs[name].answer))
 
 
 def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams) -> Detector:
@@ -172,12 +177,9 @@ class Descent:
         return true_velocity(self.flight.motion, self.states, self.measurements.tags_s, span_s)
 
 
-def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scalar]) -> CaseResult:
-    """Run an algorithm on a descent and compute its columns and products."""
+def _score_answer(descent: Descent, estimate: VelocityEstimate | None) -> Score:
+    """Score the answer of an algorithm, None for a failure."""
     p, state_at_firing, measurements = descent.p, descent.at_firing, descent.measurements
-    create_estimator = partial(VELOCITY.make, algorithm, p.dimes, p.executable, descent.streams.case)
-    algorithm_run = run_estimator(create_estimator, measurements, p.triple_indices)
-    estimate = algorithm_run.answer
     velocity = None if estimate is None else estimate.velocity_m_s
     truth = descent.truth((estimate and estimate.span_s) or measurements.last_interval_s)
     propagated = propagate_to_firing(estimate, descent.instruments, state_at_firing.time_s, gravity_m_s2(p))
@@ -191,10 +193,10 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
         "touchdown_speed_uncorrected_m_s": float(np.hypot(*landing.without_answer)),
         "in_time_assumed": landing.is_in_time,
         **stream_row(estimate, descent.truth),
-        **algorithm_run.row,
     }
+    scored = None
     if estimate is not None:
-        case = ScoredDescent(
+        scored = ScoredDescent(
             measurements=measurements,
             answer=estimate,
             true_velocity_m_s=truth,
@@ -203,14 +205,9 @@ def _score_algorithm(descent: Descent, algorithm: str, shared: Mapping[str, Scal
             at_firing=state_at_firing,
             touchdown_m_s=landing.with_answer,
         )
-        row |= compute_scores(p.scores, case, {*row, *shared})
     # figures show the three input images of DIMES, or all images of other algorithms
     is_dimes = estimate is not None and isinstance(estimate.details, DimesDetails)
     indices = p.triple_indices if is_dimes and p.triple_indices is not None else range(len(descent.images))
     images = [descent.images[index] for index in indices]
-    products = {
-        **velocity_products(images, estimate, truth),
-        **stream_products(estimate, descent.truth),
-        **timeline_products(lambda: descent_timeline(descent, estimate), is_tested=algorithm == p.algorithm),
-    }
-    return algorithm_result(algorithm_run, velocity is not None, row, products)
+    products = {**velocity_products(images, estimate, truth), **stream_products(estimate, descent.truth)}
+    return Score(velocity is not None, row, products, scored, lambda: descent_timeline(descent, estimate))

@@ -7,24 +7,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
-from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
-from marsyard.scenarios.base import TerrainScenario, algorithm_result
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
+from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.fieldtest.imaging import RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import Category, Run, Triple, simulate_run
 from marsyard.scenarios.fieldtest.timeline import triple_timeline
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.parts.scores import ScoredFlight, compute_scores
-from marsyard.scenarios.timeline import timeline_products
+from marsyard.scenarios.parts.scores import ScoredFlight
 from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -104,29 +104,22 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             **image_columns(p.backend, hash_images(images)),
         }
 
-        def evaluate(algorithm: str) -> CaseResult:
-            algorithm_run = run_on_measurements(
-                lambda: VELOCITY.make(algorithm, DimesOptions(), p.executable, streams.case),
-                lambda answer: check_last_interval(answer, measurements),
-                measurements,
-            )
-            estimate = algorithm_run.answer
+        def evaluate(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
+            check = partial(check_last_interval, measurements=measurements)
+            return run_on_measurements(partial(p.make, algorithm, streams.case), check, measurements)
+
+        def score(algorithm: str, runs: Runs[VelocityEstimate]) -> Score:
+            estimate = runs[algorithm].answer
             velocity = None if estimate is None else estimate.velocity_m_s
-            row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth), **algorithm_run.row}
+            row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth)}
+            scored = None
             if estimate is not None:
                 truths: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
-                flight = ScoredFlight(measurements=measurements, answer=estimate, **truths)
-                row |= compute_scores(p.scores, flight, {*row, *conditions})
-            products = {
-                **velocity_products(images, estimate, truth),
-                **timeline_products(
-                    lambda: triple_timeline(run, ground, case.states, images, estimate),
-                    is_tested=algorithm == p.algorithm,
-                ),
-            }
-            return algorithm_result(algorithm_run, velocity is not None, row, products)
+                scored = ScoredFlight(measurements=measurements, answer=estimate, **truths)
+            timeline = partial(triple_timeline, run, ground, case.states, images, estimate)
+            return Score(velocity is not None, row, velocity_products(images, estimate, truth), scored, timeline)
 
-        return case_result(p.algorithms, evaluate, conditions)
+        return evaluate_case(p, conditions, evaluate, score)
 
 
 def _find_triple(p: FieldTestParameters, case: int) -> tuple[int, int]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 from pydantic import BaseModel
 
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
-from marsyard.scenarios.base import TerrainScenario, algorithm_result
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.conditions import hash_images, image_columns
+from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.exposure import Sample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.images import MAX_GROUNDS, RenderedFlight, measure
@@ -29,8 +31,7 @@ from marsyard.scenarios.landing.score import (
 )
 from marsyard.scenarios.landing.timeline import landing_timeline
 from marsyard.scenarios.landing_site import LANDING
-from marsyard.scenarios.parts.scores import ScoredLanding, compute_scores
-from marsyard.scenarios.timeline import timeline_products
+from marsyard.scenarios.parts.scores import ScoredLanding
 from marsyard.sim.streams import Streams
 
 
@@ -69,12 +70,12 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         provenance = image_columns(p.render.backend, hash_images(case.pair.counts))
         shared = {**conditions(case, measurements), **provenance}
 
-        def evaluate(algorithm: str) -> CaseResult:
-            algorithm_run = run_on_measurements(
-                lambda: LANDING.make(algorithm, p.hda, p.executable, streams.case), check_site, measurements
-            )
+        def run(algorithm: str) -> AlgorithmRun[SiteEstimate]:
+            return run_on_measurements(partial(p.make, algorithm, streams.case), check_site, measurements)
+
+        def score(algorithm: str, runs: Runs[SiteEstimate]) -> Score:
             # without an answer the helicopter lands at the a-priori site; NO_STRUCTURE stands for any failure
-            answer = algorithm_run.answer
+            answer = runs[algorithm].answer
             estimate = answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
             touchdown = simulate_touchdown(p, estimate, flight, truth, streams)
             row = {
@@ -84,24 +85,18 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 **motion_row(estimate.details, flight, case.pair),
                 **map_row(p, estimate, flight, truth),
                 **times_row(estimate.details),
-                **algorithm_run.row,
             }
+            scored = None
             if answer is not None:
-                scored_case = ScoredLanding(
+                scored = ScoredLanding(
                     measurements=measurements,
                     answer=answer,
                     true_poses=(flight.states[0].world_from_body, flight.states[1].world_from_body),
                     states=flight.states,
                     ground=truth,
                 )
-                row |= compute_scores(p.scores, scored_case, {*row, *shared})
             is_converged = answer is not None and estimate.outcome.converged
-            case_products = {
-                **products(case, estimate),
-                **timeline_products(
-                    lambda: landing_timeline(case, estimate, touchdown), is_tested=algorithm == p.algorithm
-                ),
-            }
-            return algorithm_result(algorithm_run, is_converged, row, case_products)
+            timeline = partial(landing_timeline, case, estimate, touchdown)
+            return Score(is_converged, row, products(case, estimate), scored, timeline)
 
-        return case_result(p.algorithms, evaluate, shared)
+        return evaluate_case(p, shared, run, score)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -13,9 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import InitialState, PositionEstimator, PositionOutcome
-from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
-from marsyard.scenarios.base import TerrainScenario, algorithm_result
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
+from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.exposure import HAZE_PATH_M, HeatShield, add_haze, camera_optics, render_state
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation import score
@@ -29,7 +31,6 @@ from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.scenarios.parts.named import PartKind
-from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.render.renderer import return_freed_memory
@@ -71,28 +72,26 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             **image_columns(p.render.backend, hash_images(image.counts for image in descent.images)),
         }
 
-        def evaluate(algorithm: str) -> CaseResult:
-            measurements = descent.measurements
-            tags = measurements.increments.times_s
+        def run(algorithm: str) -> AlgorithmRun[StreamAnswers]:
+            tags = descent.measurements.increments.times_s
             span_s = (float(tags[0]), float(tags[-1]))
-            algorithm_run = run_on_measurements(
-                lambda: LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case),
+            return run_on_measurements(
+                partial(p.make, algorithm, streams.case),
                 lambda answers: _check_answers(answers, span_s),
-                measurements,
+                descent.measurements,
                 _run_estimator,
             )
-            answers = algorithm_run.answer
-            row = {**algorithm_run.row, **({} if answers is None else score.answer_row(descent, answers))}
-            products = {
-                **({} if answers is None else score.products(descent, answers)),
-                **timeline_products(
-                    lambda: localisation_timeline(descent, answers), is_tested=algorithm == p.algorithm
-                ),
-            }
-            is_answered = answers is not None and answers.outcome is PositionOutcome.VALID
-            return algorithm_result(algorithm_run, is_answered, row, products)
 
-        return case_result(p.algorithms, evaluate, shared)
+        def score_answers(algorithm: str, runs: Runs[StreamAnswers]) -> Score:
+            answers = runs[algorithm].answer
+            timeline = partial(localisation_timeline, descent, answers)
+            if answers is None:
+                return Score(False, {}, timeline=timeline)
+            is_answered = answers.outcome is PositionOutcome.VALID
+            row, products = score.answer_row(descent, answers), score.products(descent, answers)
+            return Score(is_answered, row, products, timeline=timeline)
+
+        return evaluate_case(p, shared, run, score_answers)
 
 
 def _run_estimator(algorithm: object, inputs: LocalisationMeasurements) -> object:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -13,21 +14,15 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result
-from marsyard.scenarios.base import algorithm_result
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
+from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing_site import LANDING, motion_errors, stage_row
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
-from marsyard.scenarios.measured.scenarios import (
-    MeasuredParameters,
-    MeasuredScenario,
-    case_row,
-    distance,
-    run_algorithms,
-)
+from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.parts.named import SCORE, PartKind
-from marsyard.scenarios.parts.scores import CustomScores, ScoredSite, compute_scores
+from marsyard.scenarios.parts.scores import CustomScores, ScoredSite
 from marsyard.sim.camera import camera_pose
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams
@@ -69,23 +64,24 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             "truth_known": true_poses is not None,
             **agreement_row(pairs),
         }
-        runs = run_algorithms(p, p.hda, measurements, check_site, streams.case)
 
-        def evaluate(algorithm: str) -> CaseResult:
-            run = runs[algorithm]
-            details = None if run.answer is None else run.answer.details
-            row = _site_answer_row(run.answer, measurements, true_poses)
+        def run(algorithm: str) -> AlgorithmRun[SiteEstimate]:
+            return run_on_measurements(partial(p.make, algorithm, streams.case), check_site, measurements)
+
+        def score(algorithm: str, runs: Runs[SiteEstimate]) -> Score:
+            answer = runs[algorithm].answer
+            details = None if answer is None else answer.details
+            row = _site_answer_row(answer, measurements, true_poses)
             if algorithm != p.algorithm:
-                row["difference_m"] = distance(_get_site(run.answer), _get_site(runs[p.algorithm].answer))
-            row |= run.row
-            if run.answer is not None:
-                case = ScoredSite(measurements=measurements, answer=run.answer, true_poses=true_poses)
-                row |= compute_scores(p.scores, case, {*row, *conditions})
+                row["difference_m"] = distance(_get_site(answer), _get_site(runs[p.algorithm].answer))
+            scored = None
+            if answer is not None:
+                scored = ScoredSite(measurements=measurements, answer=answer, true_poses=true_poses)
             products = hda_products(details) if isinstance(details, HdaDetails) else {}
-            is_converged = run.answer is not None and run.answer.outcome.converged
-            return algorithm_result(run, is_converged, row, {**products, **agreement_products(images, pairs)})
+            is_converged = answer is not None and answer.outcome.converged
+            return Score(is_converged, row, {**products, **agreement_products(images, pairs)}, scored)
 
-        return case_result(p.algorithms, evaluate, conditions)
+        return evaluate_case(p, conditions, run, score)
 
 
 def _get_site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:

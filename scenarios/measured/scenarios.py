@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Annotated, Any, ClassVar, TypeVar
+from collections.abc import Sequence
+from typing import Annotated, ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, Field, model_validator
 
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
 from marsyard.scenarios.base import BaseScenario
 from marsyard.scenarios.conditions import hash_images
 from marsyard.scenarios.interface import CaseResult, Scalar
@@ -91,16 +89,6 @@ class MatchingScenario(MeasuredScenario[MatchingParameters]):
             row={**case_row(p, images), **agreement_row(pairs)},
             products=agreement_products(images, pairs),
         )
-
-
-def run_algorithms(
-    p: AlgorithmSelection, options: Any, measurements: Any, check: Callable[[object], Answer], case: int
-) -> Mapping[str, AlgorithmRun[Answer]]:
-    """Run all algorithms on the measurements."""
-    return {
-        spec: run_on_measurements(partial(p.task.make, spec, options, p.executable, case), check, measurements)
-        for spec in p.algorithms
-    }
 
 
 def case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:

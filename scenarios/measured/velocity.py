@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -13,20 +14,14 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.dimes.binning import check_binning
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result
-from marsyard.scenarios.base import algorithm_result
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
+from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
-from marsyard.scenarios.measured.scenarios import (
-    MeasuredParameters,
-    MeasuredScenario,
-    case_row,
-    distance,
-    run_algorithms,
-)
+from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.parts.named import SCORE, PartKind
-from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity, compute_scores
+from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
 from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements
@@ -79,17 +74,18 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(measurements.sun_direction[2], -1.0, 1.0)))),
             "truth_known": p.case.truth.velocity_m_s is not None,
         }
-        runs = run_algorithms(
-            p, p.dimes, measurements, lambda answer: check_last_interval(answer, measurements), streams.case
-        )
         true_velocity = p.case.truth.velocity_m_s
         truth = np.array(true_velocity or (np.nan, np.nan), dtype=np.float64)
 
-        def evaluate(algorithm: str) -> CaseResult:
-            run = runs[algorithm]
-            velocity = _get_velocity(run.answer)
+        def run(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
+            check = partial(check_last_interval, measurements=measurements)
+            return run_on_measurements(partial(p.make, algorithm, streams.case), check, measurements)
+
+        def score(algorithm: str, runs: Runs[VelocityEstimate]) -> Score:
+            answer = runs[algorithm].answer
+            velocity = _get_velocity(answer)
             pairs = compare_with_poses(images, matches, _descent_poses(p.case, measurements, velocity))
-            details = None if run.answer is None else run.answer.details
+            details = None if answer is None else answer.details
             velocity_pair = details.selected if isinstance(details, DimesDetails) else None
             estimate_m_s = np.full(2, np.nan) if velocity is None else velocity
             row: dict[str, Scalar] = {
@@ -99,23 +95,20 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
                 "inertial_difference_m_s": distance(velocity, measurements.interval_velocities_m_s[1, :2]),
                 # estimated minus inertial velocity change between the intervals, in which this error cancels
                 "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
+                **agreement_row(pairs),
             }
             if true_velocity is not None:
-                row |= {**velocity_row("velocity", velocity, truth), **consistency_row(run.answer, truth)}
+                row |= {**velocity_row("velocity", velocity, truth), **consistency_row(answer, truth)}
             if algorithm != p.algorithm:
                 row["difference_m_s"] = distance(velocity, _get_velocity(runs[p.algorithm].answer))
-            row |= {**agreement_row(pairs), **run.row}
-            if run.answer is not None:
-                case = ScoredVelocity(
-                    measurements=measurements,
-                    answer=run.answer,
-                    true_velocity_m_s=None if true_velocity is None else truth,
-                )
-                row |= compute_scores(p.scores, case, {*row, *conditions})
-            products = velocity_products([image.counts for image in images], run.answer, truth)
-            return algorithm_result(run, velocity is not None, row, {**products, **agreement_products(images, pairs)})
+            scored = None
+            if answer is not None:
+                known_truth = None if true_velocity is None else truth
+                scored = ScoredVelocity(measurements=measurements, answer=answer, true_velocity_m_s=known_truth)
+            products = velocity_products([image.counts for image in images], answer, truth)
+            return Score(velocity is not None, row, {**products, **agreement_products(images, pairs)}, scored)
 
-        return case_result(p.algorithms, evaluate, conditions)
+        return evaluate_case(p, conditions, run, score)
 
 
 def _get_velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:

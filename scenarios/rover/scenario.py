@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from typing import Annotated, Literal, cast
 
@@ -26,12 +26,12 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
 from marsyard.scenarios.conditions import image_columns
+from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
-from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.scenarios.rover import placement, score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.run import (
@@ -47,7 +47,6 @@ from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, designa
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.timeline import run_timeline
 from marsyard.scenarios.rover.world import terrain_parameters
-from marsyard.scenarios.timeline import timeline_products
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
@@ -261,14 +260,26 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
         first = prepare_run(p, streams, self.load_ground)
         shared = {**score.fixed_conditions(p, first), **placement.placement_truth(first)}
 
-        def evaluate(algorithm: str) -> CaseResult:
+        def run(algorithm: str) -> AlgorithmRun[ScoredTrack]:
             is_tested = algorithm == p.algorithm
             candidate = p.model_copy(update={"algorithm": algorithm})
             run_start_s = start_s if is_tested else time.process_time()
-            run = first if is_tested else prepare_run(candidate, streams, self.load_ground)
-            return _evaluate(p, lambda: place_target(track_target(candidate, run)), shared, is_tested, run_start_s)
+            prepared = first if is_tested else prepare_run(candidate, streams, self.load_ground)
+            tracked = run_tracker(p, lambda: place_target(track_target(candidate, prepared)))
+            if tracked.answer is not None:
+                tracked.answer.row["run_time_s"] = time.process_time() - run_start_s
+            return tracked
 
-        return case_result(p.algorithms, evaluate, shared)
+        def score_run(algorithm: str, runs: Runs[ScoredTrack]) -> Score:
+            result = score_track(p, runs[algorithm].answer, is_tested=algorithm == p.algorithm)
+            track = runs[algorithm].answer
+            if track is None:
+                return result
+            row = {**result.row, **placement.placement_row(track.run)}
+            row |= score.visibility_columns(p, track.run) if algorithm == p.algorithm else {}
+            return replace(result, row=row)
+
+        return evaluate_case(p, shared, run, score_run)
 
 
 class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
@@ -320,10 +331,12 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
             and (p.max_obliquity_deg is None or visibility.obliquity_max_deg <= p.max_obliquity_deg),
         }
 
-        def evaluate(name: str) -> CaseResult:
-            return _evaluate(case, lambda: track_views(p, drive, name), shared, name == algorithm)
-
-        return case_result(p.drive.algorithms, evaluate, shared)
+        return evaluate_case(
+            p.drive,
+            shared,
+            lambda name: run_tracker(case, lambda: track_views(p, drive, name)),
+            lambda name, runs: score_track(case, runs[name].answer, is_tested=name == algorithm),
+        )
 
 
 def place_target(run: Run) -> Run:
@@ -335,34 +348,38 @@ def place_target(run: Run) -> Run:
     return run
 
 
-def _evaluate(
-    p: RoverScenarioParameters,
-    track: Callable[[], Run],
-    shared: Mapping[str, Scalar],
-    is_tested: bool,
-    start_s: float | None = None,
-) -> CaseResult:
-    """Score a run; conditions and products are stored only for the algorithm under test (`is_tested`).
+@dataclass(frozen=True)
+class ScoredTrack:
+    """A run of a tracker and the columns of its score."""
 
-    `start_s` is the processor time at the start of a run that takes its own images.
-    """
+    run: Run
+    row: dict[str, Scalar]
 
-    def track_and_score() -> tuple[Run, dict[str, Scalar]]:
+    @property
+    def outcome(self) -> RunOutcome:
+        """Outcome of the run."""
+        return self.run.outcome
+
+
+def run_tracker(p: RoverScenarioParameters, track: Callable[[], Run]) -> AlgorithmRun[ScoredTrack]:
+    """Run a tracker, whose answers move the mast or the rover; an exception is a failure of the tracker."""
+
+    def track_and_score() -> ScoredTrack:
         run = track()
-        return run, {**score.score_run(p, run), **score.tracking_row(run)}
+        return ScoredTrack(run, {**score.score_run(p, run), **score.tracking_row(run)})
 
-    algorithm_run = run_algorithm(track_and_score, lambda answer: cast(tuple[Run, dict[str, Scalar]], answer))
-    if algorithm_run.answer is None:
-        return CaseResult(algorithm_run.outcome(str), False, algorithm_run.row, failure=algorithm_run.failure)
-    run, row = algorithm_run.answer
-    if start_s is not None:
-        row["run_time_s"] = time.process_time() - start_s
-        row |= placement.placement_row(run)
-        row |= score.visibility_columns(p, run) if is_tested else {}
-    if is_tested:
-        digest = hashlib.sha256(b"".join(stop.images.digest for stop in run.stops)).hexdigest()
-        row |= {**score.update_columns(run, p.score.stored_updates), **score.run_conditions(p, run)}
-        row |= image_columns(p.backend, digest)
-    row |= compute_scores(p.scores, score.create_scored_run(run), {*row, *shared})
-    products = {**score.products(p, run), **timeline_products(lambda: run_timeline(p, run))} if is_tested else {}
-    return CaseResult(run.outcome.name, run.outcome is RunOutcome.COMPLETED, row, products)
+    return run_algorithm(track_and_score, lambda answer: cast(ScoredTrack, answer))
+
+
+def score_track(p: RoverScenarioParameters, track: ScoredTrack | None, *, is_tested: bool) -> Score:
+    """Score a run, None for a failure; conditions and products are stored only for the algorithm under test."""
+    if track is None:
+        return Score(False, {})
+    run, row = track.run, dict(track.row)
+    is_completed, scored = run.outcome is RunOutcome.COMPLETED, score.create_scored_run(run)
+    if not is_tested:
+        return Score(is_completed, row, scored=scored)
+    digest = hashlib.sha256(b"".join(stop.images.digest for stop in run.stops)).hexdigest()
+    row |= {**score.update_columns(run, p.score.stored_updates), **score.run_conditions(p, run)}
+    row |= image_columns(p.backend, digest)
+    return Score(is_completed, row, score.products(p, run), scored, lambda: run_timeline(p, run))

@@ -5,9 +5,10 @@ from typing import ClassVar
 
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import AlgorithmSelection, case_result, run_algorithm
+from marsyard.scenarios.algorithm_run import AlgorithmSelection, run_algorithm
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.estimators import Task
+from marsyard.scenarios.evaluation import case_result
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.velocity import VELOCITY, velocity_row
 from marsyard.sim.streams import Streams
@@ -39,7 +40,7 @@ class FakeVelocityScenario(ScenarioWithoutInputs):
             )
             velocity = None if run_result.answer is None else run_result.answer.velocity_m_s
             return CaseResult(
-                outcome=run_result.outcome(lambda answer: answer.outcome.name),
+                outcome=run_result.outcome_name,
                 answered=velocity is not None,
                 row={**velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]), **run_result.row},
                 failure=run_result.failure,

@@ -20,9 +20,10 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.reports.comparison import select_algorithm
 from marsyard.scenarios import estimators
-from marsyard.scenarios.algorithm_run import case_result, run_algorithm
+from marsyard.scenarios.algorithm_run import run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.estimators import Task, check_algorithms, labels
+from marsyard.scenarios.evaluation import case_result
 from marsyard.scenarios.interface import CaseResult, Failure
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING
@@ -118,7 +119,10 @@ def test_failing_algorithm_does_not_affect_others() -> None:
 
         result = run_algorithm(compute_answer, lambda answer: answer)
         return CaseResult(
-            result.outcome(lambda _: "VALID"), result.answer is not None, {"error_m": 0.5}, failure=result.failure
+            "VALID" if result.failure is None else result.failure.outcome,
+            result.answer is not None,
+            {"error_m": 0.5},
+            failure=result.failure,
         )
 
     case = case_result(["2", "0"], run_with, {"altitude_m": 7.0})

@@ -1,0 +1,103 @@
+"""Evaluation of a case: run each algorithm, score its answer, and combine the rows.
+
+The first algorithm of a campaign is under test: its columns have no prefix. The columns of the compared algorithms have
+their label as a prefix (`homography.velocity_error_m_s`), with separate `outcome`, `answered` and `error`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection
+from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.parts.scores import ScoredCase, compute_scores
+from marsyard.scenarios.timeline import Timeline, timeline_products
+
+Answer = TypeVar("Answer")
+
+#: Column of the label of the algorithm under test.
+ALGORITHM = "algorithm"
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score of an algorithm's answer.
+
+    - answered: whether the answer is valid (the population `valid` of requirements)
+    - row: columns of the answer and of its errors
+    - products: arrays for the case's figures
+    - scored: input of custom scores; None without an answer
+    - timeline: creates the timeline of the case with this answer
+    - outcome: outcome of the answer; empty for the name of its attribute `outcome`, or of the failure
+    """
+
+    answered: bool
+    row: Mapping[str, Scalar]
+    products: Mapping[str, Any] = field(default_factory=dict)
+    scored: ScoredCase | None = None
+    timeline: Callable[[], Timeline] | None = None
+    outcome: str = ""
+
+
+#: Runs of the algorithms by name, the one under test first.
+Runs = Mapping[str, AlgorithmRun[Answer]]
+
+
+def evaluate_case(
+    p: AlgorithmSelection,
+    conditions: Mapping[str, Scalar],
+    run: Callable[[str], AlgorithmRun[Answer]],
+    score: Callable[[str, Runs[Answer]], Score],
+) -> CaseResult:
+    """Evaluate all algorithms of a case.
+
+    - p: selected algorithms, with the custom scores
+    - conditions: columns that do not depend on an algorithm
+    - run: runs an algorithm, given by name
+    - score: scores the answer or failure of an algorithm, given by its name and the runs so far
+    """
+    runs: dict[str, AlgorithmRun[Answer]] = {}
+
+    def evaluate(algorithm: str) -> CaseResult:
+        runs[algorithm] = algorithm_run = run(algorithm)
+        scored = score(algorithm, runs)
+        row: dict[str, Scalar] = {**scored.row, **algorithm_run.row}
+        if scored.scored is not None:
+            row |= compute_scores(getattr(p, "scores", ()), scored.scored, {*row, *conditions})
+        products = dict(scored.products)
+        if scored.timeline is not None:
+            products |= timeline_products(scored.timeline, is_tested=algorithm == p.algorithm)
+        outcome = scored.outcome or algorithm_run.outcome_name
+        return CaseResult(outcome, scored.answered, row, products, algorithm_run.failure)
+
+    return case_result(p.algorithms, evaluate, conditions)
+
+
+def case_result(
+    algorithms: Sequence[str], evaluate: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
+) -> CaseResult:
+    """Score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
+    names = labels(algorithms)
+    first, *compared_results = [evaluate(algorithm) for algorithm in algorithms]
+    row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
+    for name, result in zip(names[1:], compared_results, strict=True):
+        columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered}
+        columns |= _empty_columns(first.row) if result.failure is not None else {}
+        columns |= result.row
+        columns["error"] = "" if result.failure is None else result.failure.error
+        row |= {f"{name}.{column}": value for column, value in columns.items()}
+    return replace(first, row=row)
+
+
+def _empty_columns(row: Mapping[str, Scalar]) -> dict[str, Scalar]:
+    """Return the columns of a failed algorithm: without them a report would show those of the algorithm under test."""
+    return {
+        column: False if isinstance(value, bool | np.bool_) else float("nan")
+        for column, value in row.items()
+        if not isinstance(value, str)
+    }
