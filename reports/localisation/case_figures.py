@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
-from marsyard.reports.presentation import check_shape, read_arrays, to_matrix
-from marsyard.reports.section import INK, MUTED, REQUIREMENT, SERIES, MarkedImage, draw_marked_images, in_page_style
+from marsyard.reports.images import Mark, Panel, draw_panels
+from marsyard.reports.presentation import Products, check_shape, read_arrays, to_matrix
+from marsyard.reports.section import INK, MUTED, REQUIREMENT, SERIES, in_page_style
 
 _AXES = ("east", "north", "up")
 #: Enlargement of the landmarks' residuals.
 _RESIDUAL_SCALE = 20.0
 
 
-def is_localisation_case(products: Mapping[str, Any]) -> bool:
+def is_localisation_case(products: Products) -> bool:
     """Return whether products contain the track of a localisation case and its map, with the outcomes of the track."""
     shapes = {"track": (None, 7), "inliers": (None,), "true_xy_m": (None, 2), "estimated_xy_m": (None, 2)}
     arrays = read_arrays(products, shapes)
@@ -30,7 +28,7 @@ def is_localisation_case(products: Mapping[str, Any]) -> bool:
     return len(arrays[0]) == len(arrays[1]) == len(names) and set(names) <= set(PositionOutcome.__members__)
 
 
-def read_track(products: Mapping[str, Any]) -> Float[np.ndarray, "n 7"]:
+def read_track(products: Products) -> Float[np.ndarray, "n 7"]:
     """Read the track: time, errors east, north, up, and their standard deviations; NaN for a refusal."""
     track = check_shape(products.get("track"), None, 7)
     if track is None:
@@ -39,7 +37,7 @@ def read_track(products: Mapping[str, Any]) -> Float[np.ndarray, "n 7"]:
 
 
 @in_page_style
-def draw_errors(products: Mapping[str, Any]) -> Figure:
+def draw_errors(products: Products) -> Figure:
     """Draw the position error of each component over time, with bands of three standard deviations."""
     track = read_track(products)
     valid = track[np.isfinite(track[:, 0])]
@@ -54,7 +52,7 @@ def draw_errors(products: Mapping[str, Any]) -> Figure:
 
 
 @in_page_style
-def draw_map(products: Mapping[str, Any]) -> Figure:
+def draw_map(products: Products) -> Figure:
     """Draw the map with true and estimated positions."""
     figure = Figure(figsize=(6.0, 6.0), layout="constrained")
     axes = figure.add_subplot()
@@ -72,7 +70,7 @@ def draw_map(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
+def draw_landmarks(products: Products) -> Figure | None:
     """Draw the last image with its landmarks and their residuals; None without landmarks."""
     pixels, residuals = (check_shape(products.get(f"landmarks_{name}"), None, 2) for name in ("px", "residual_px"))
     flags, image = check_shape(products.get("landmarks_used"), None), to_matrix(products.get("image_2"))
@@ -81,9 +79,9 @@ def draw_landmarks(products: Mapping[str, Any]) -> Figure | None:
     if not len(pixels) == len(residuals) == len(flags):
         return None
     used = flags > 0.5
-    marks: list[tuple[Float[np.ndarray, "... 2"], Mapping[str, Any]]] = []
+    marks = []
     for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):
         style = {"marker": marker, "linestyle": "none", "markersize": 4.0, "fillstyle": "none"}
         segments = np.stack([pixels[mask], pixels[mask] + _RESIDUAL_SCALE * residuals[mask]])
-        marks += [(pixels[mask], style | {"color": colour}), (segments, {"color": colour, "linewidth": 0.8})]
-    return draw_marked_images([MarkedImage("", image, marks)], (6.0, 6.0))
+        marks += [Mark(pixels[mask], style | {"color": colour}), Mark(segments, {"color": colour, "linewidth": 0.8})]
+    return draw_panels([[Panel(image, marks=marks)]], (6.0, 6.0))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,9 +23,18 @@ from marsyard.reports.blocks import (
 )
 from marsyard.reports.common_sections import evaluate_consistency
 from marsyard.reports.localisation import case_figures as figures
-from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, save_figures, to_float
+from marsyard.reports.presentation import (
+    CaseFigure,
+    CaseKind,
+    CaseView,
+    Cause,
+    Presentation,
+    Products,
+    TableRow,
+    to_float,
+)
 from marsyard.reports.rates import CaseFraction, finite_values, fraction_of
-from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.wording import number, numbers
 
 _LEGEND = "The blue line is the true position; the bands are three standard deviations that the algorithm reports."
@@ -34,16 +42,16 @@ _LEGEND = "The blue line is the true position; the bands are three standard devi
 _MAX_POSITION_ERROR_M = 40.0
 
 
-def view(products: Mapping[str, Any], key: str) -> CaseView:
+def view(products: Products, _complete: bool = False) -> CaseView:
     """Create the view of a localisation case: error over time, map, landmarks, and a table of the estimates."""
-    svg_figures = [
-        svg_figure(figures.draw_errors(products), f"{key}errors", "Position error over time.", wide=True),
-        svg_figure(figures.draw_map(products), f"{key}map", "True and estimated positions on the map."),
+    drawn = [
+        CaseFigure("errors", figures.draw_errors(products), "Position error over time."),
+        CaseFigure("map", figures.draw_map(products), "True and estimated positions on the map.", wide=False),
     ]
     landmarks = figures.draw_landmarks(products)
     if landmarks is not None:
         caption = "Landmarks in the last image: used (green), rejected (red); residuals enlarged twenty times."
-        svg_figures.append(svg_figure(landmarks, f"{key}landmarks", caption))
+        drawn.append(CaseFigure("landmarks", landmarks, caption, wide=False))
     rows = []
     track, outcomes, inliers = figures.read_track(products), products["outcomes"], products["inliers"]
     for index, (values, outcome) in enumerate(zip(track, outcomes, strict=True)):
@@ -54,16 +62,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
         errors = [number(float(value)) if is_valid else "" for value in (*values[1:4], np.hypot(*values[4:6]))]
         rows.append(TableRow([name, text, used, *errors], is_valid))
     head = ["Estimate", "Outcome", "Landmarks used", "Error east (m)", "north (m)", "up (m)", "Reported sd (m)"]
-    return CaseView([], svg_figures, head, rows)
-
-
-def write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write the figures of a case into a folder."""
-    named_figures = {"errors": figures.draw_errors(products), "map": figures.draw_map(products)}
-    landmarks = figures.draw_landmarks(products)
-    if landmarks is not None:
-        named_figures["landmarks"] = landmarks
-    return save_figures(directory, named_figures)
+    return CaseView(drawn, head=head, rows=rows)
 
 
 _FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
@@ -200,7 +199,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 
 LOCALISATION = Presentation(
-    cases=(CaseKind(figures.is_localisation_case, view, write_figures, _LEGEND),),
+    cases=(CaseKind(figures.is_localisation_case, view, _LEGEND),),
     first=(position_section,),
     sections=(conditions_section,),
     outcomes=(PositionOutcome,),

@@ -148,7 +148,7 @@ def test_incomplete_products_are_no_localisation_case(products: dict[str, Any], 
 
 
 def test_table_has_a_row_per_estimate(products: dict[str, Any]) -> None:
-    case_view = view(products, "case3")
+    case_view = view(products)
     assert len(case_view.figures) == 3
     assert [row.values[0] for row in case_view.rows] == [*(f"image {k}" for k in range(1, IMAGES + 1)), "end"]
     assert [row.succeeded for row in case_view.rows] == [False] * REFUSED + [True] * (IMAGES + 1 - REFUSED)
@@ -163,7 +163,7 @@ def test_table_has_a_row_per_estimate(products: dict[str, Any]) -> None:
 
 
 def test_view_of_a_refused_descent_has_one_row() -> None:
-    case_view = view(refused_products(), "case4")
+    case_view = view(refused_products())
     assert [row.succeeded for row in case_view.rows] == [False]
     assert len(case_view.figures) == 2
 
