@@ -231,9 +231,6 @@ def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVer
         return OverallVerdict(status, crashed, sentence, _NO_VERDICT)
     if study.get("kind") == "budget":
         return OverallVerdict(None, crashed, "The study computes an error budget. See the section.", _NO_VERDICT)
-    if not table(result.get("decision")):
-        text = "An earlier version evaluated the study, and assumed a continuous margin. Start the study again."
-        return OverallVerdict(Status.INSUFFICIENT, crashed, text)
     statement = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
     return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
 

@@ -130,8 +130,6 @@ def read_joint_evidence(evidence: Evidence) -> JointEvidence:
     """Read what the record of confirmations contains about the claim of a run."""
     if not evidence.is_confirmation:
         return JointEvidence()
-    if not evidence.claim:
-        return JointEvidence(True, f"{UNKNOWN}: an earlier version recorded this confirmation.")
     path = Path(evidence.record)
     try:
         record = read_record(path)

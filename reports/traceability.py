@@ -47,7 +47,7 @@ class Algorithm:
 
 
 def read_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from a campaign's record, the algorithm under test first; old records contain only names."""
+    """Read the algorithms from a campaign's record, the algorithm under test first."""
     stored_list = record.get("algorithms")
     entries = [table(entry) for entry in stored_list] if isinstance(stored_list, list) else []
     algorithms = [
@@ -62,25 +62,12 @@ def read_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
         for entry in entries
         if entry.get("spec")
     ]
-    if not algorithms:
-        algorithms = _algorithms_from_parameters(table(table(record.get("configuration")).get("parameters")))
     return sorted(algorithms, key=lambda algorithm: not algorithm.tested)
 
 
 def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
     """Format names and versions of the algorithms under test."""
     return ", ".join(algorithm.title for algorithm in algorithms if algorithm.tested)
-
-
-def _algorithms_from_parameters(parameters: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from the first table of parameters, at any depth, that has the key `algorithm`."""
-    tested_name = parameters.get("algorithm")
-    if isinstance(tested_name, str) and tested_name:
-        compared_names = parameters.get("compared")
-        names = compared_names if isinstance(compared_names, list) else []
-        return [Algorithm(tested_name), *(Algorithm(str(name), tested=False) for name in names)]
-    nested_lists = (_algorithms_from_parameters(value) for value in parameters.values() if isinstance(value, Mapping))
-    return next((algorithms for algorithms in nested_lists if algorithms), [])
 
 
 #: Verdicts of requirements that are neither met nor failed at their confidence; JUnit tests with them are skipped.

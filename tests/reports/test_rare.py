@@ -70,8 +70,3 @@ def test_shared_terrains_are_stated() -> None:
 @pytest.mark.parametrize("study", [{}, {"kind": "search", "result": {"violations": 1}}])
 def test_other_studies_have_no_sentences(study: dict[str, Any]) -> None:
     assert result_sentences(read_result({"study": study})) == []
-
-
-def test_result_without_a_counting_bound_is_not_read() -> None:
-    study = {"kind": "rare", "requirement": "VEL", "max_probability": 1e-2, "result": {"verdict": "PASS"}}
-    assert read_result({"study": study}) == {}
