@@ -27,8 +27,8 @@ from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences, read_budget
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
-from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.evaluation import Evaluation, evaluate_run
+from marsyard.reports.overall import OverallVerdict, multiplicity_text
 from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
 from marsyard.reports.rare import rare_section, read_result, result_sentences
 from marsyard.reports.record import SCHEMA, CampaignReport, StudySummary

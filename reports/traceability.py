@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as Xml
 
-from marsyard.reports.evaluation import OverallVerdict
+from marsyard.reports.overall import OverallVerdict
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count

@@ -135,7 +135,7 @@ BUILT_IN = (
         catalogue=_CATALOGUE / "dimes-fieldtest.toml",
         columns=_COLUMNS,
         error_sources=_ERROR_SOURCES,
-        report="marsyard.reports.dimes.presentation:FIELD_TEST",
+        report="marsyard.reports.fieldtest.presentation:FIELD_TEST",
     ),
     System(
         name="vtt",

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.reports.dimes import case_figures as figures
-from marsyard.reports.dimes.sections import field_test_section, ignition_section, landing_section, sensitivity_section
+from marsyard.reports.dimes.sections import ignition_section, landing_section, sensitivity_section
 from marsyard.reports.images import Panel, fill_panels
 from marsyard.reports.presentation import (
     CaseFigure,
@@ -247,4 +247,3 @@ DIMES = Presentation(
     outcomes=(VelocityOutcome,),
     explain=explain,
 )
-FIELD_TEST = Presentation(first=(field_test_section,), explain=explain)

@@ -25,8 +25,14 @@ from marsyard.reports.papers import paper_section, read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
 from marsyard.reports.stored import table
-from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, losses_note, selectable_targets
-from marsyard.reports.vtt.table_1 import table_1_section
+from marsyard.reports.vtt.goal import (
+    is_closed_loop,
+    is_tracking,
+    losses_grid,
+    losses_note,
+    selectable_targets,
+    table_1_section,
+)
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")

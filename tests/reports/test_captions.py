@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.blocks import correlation_text, estimate_effects
-from marsyard.reports.evaluation import combine_verdicts
 from marsyard.reports.hda.sections import MAP_CONDITIONS, MAP_ERRORS, distance_grid
+from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.sections import driver_figures
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import NOTHING, number

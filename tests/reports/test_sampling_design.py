@@ -16,7 +16,7 @@ from rich.console import Console
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
+from marsyard.reports.overall import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status

@@ -13,7 +13,7 @@ import pandas as pd
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts
+from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_evidence, verification_csv
 
 Rows = Callable[..., pd.DataFrame]

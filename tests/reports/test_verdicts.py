@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
+from marsyard.reports.overall import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts
+from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower
 from marsyard.reports.verdicts import Status

@@ -28,8 +28,7 @@ from marsyard.reports.dashboard.entries import (
     requirement_rows,
     sparkline,
 )
-from marsyard.reports.dashboard.excerpts import read_excerpts
-from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.dashboard.site import read_excerpts, write_site
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sections import script_hash
 from marsyard.reports.verdicts import Status, Verdict

@@ -16,11 +16,14 @@ from marsyard.algorithms.localisation.interface import PositionOutcome
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dimes.case_figures import is_dimes_case
 from marsyard.reports.hda.products import is_hda_case
-from marsyard.reports.localisation.case_figures import draw_errors, draw_landmarks, draw_map, is_localisation_case
 from marsyard.reports.localisation.presentation import (
     LOCALISATION,
     conditions_section,
     create_consistency_block,
+    draw_errors,
+    draw_landmarks,
+    draw_map,
+    is_localisation_case,
     position_section,
     view,
 )

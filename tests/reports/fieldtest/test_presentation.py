@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.dimes.sections import FIG_11, field_cells, field_test_section
+from marsyard.reports.fieldtest.presentation import FIG_11, field_cells, field_test_section
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import read_run
 
