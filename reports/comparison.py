@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.campaign import leaves
 from marsyard.reports import rates
+from marsyard.reports.decision import requirement_masks
 from marsyard.reports.rates import CONFIDENCE, success_mask
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
@@ -245,19 +246,12 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
     error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])
     for requirement in run.requirements:
         name, metric = str(requirement.get("id", "?")), str(requirement.get("metric", ""))
-        bound = requirement.get("bound")
-        is_bounded = isinstance(bound, int | float)
-        if metric not in frame or not (is_bounded or rates.is_flag(frame, metric)):
+        masks = requirement_masks(frame, requirement)
+        if masks is None:
             continue
-        try:
-            population = rates.population_mask(frame, str(requirement.get("population", "all")))
-        except ValueError:
-            continue
-        values = (bound, requirement.get("scale", 1))
-        limit, scale = (float(value) if isinstance(value, int | float) else math.nan for value in values)
-        success = success_mask(frame, metric, limit, scale)
-        add_metric(name, np.where(population, success.astype(np.float64), np.nan))
-        if is_bounded:
+        member, success = masks
+        add_metric(name, np.where(member, success.astype(np.float64), np.nan))
+        if metric in frame and isinstance(requirement.get("bound"), int | float):
             error_columns[metric] = None
     for column in filter(None, error_columns):
         magnitude = np.abs(numbers(frame, column))

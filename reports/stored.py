@@ -201,6 +201,12 @@ def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.sort_values("case", kind="stable").reset_index(drop=True)
 
 
+def read_study(record: Mapping[str, Any], kind: str) -> Mapping[str, Any]:
+    """Return the settings of a study of a kind with its `result`; empty for another run, or without a result."""
+    study = table(record.get("study"))
+    return study if study.get("kind") == kind and table(study.get("result")) else {}
+
+
 def table(value: object) -> Mapping[str, Any]:
     """Return the value if it is a table; otherwise return an empty table."""
     return value if isinstance(value, Mapping) else {}

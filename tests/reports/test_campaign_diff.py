@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from marsyard.reports.comparison import MetricComparison, campaign_diff_grid, compare_campaigns, list_metrics
 from marsyard.reports.statistics.changes import difference_p_value
 from marsyard.reports.stored import read_run
-
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
+from tests.reports.synthetic_run import MakeRun, make_rows
 
 
 def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
@@ -22,7 +18,7 @@ def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricCompariso
     return is_paired, {comparison.name: comparison for comparison in comparisons}
 
 
-def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_run: MakeRun) -> None:
     frame = make_rows(200, terrains=40)
     worse_frame = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
     is_paired, comparisons = _compare(make_run(frame), make_run(worse_frame, name="other"))
@@ -40,14 +36,14 @@ def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_rows: Rows, ma
     assert comparisons["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
 
 
-def test_terrains_of_different_banks_are_not_paired(make_rows: Rows, make_run: MakeRun) -> None:
+def test_terrains_of_different_banks_are_not_paired(make_run: MakeRun) -> None:
     banks = [{"parameters": {"location": {"bank_seed": seed}}} for seed in (1, 2)]
     runs = [make_run(make_rows(100), name=f"run-{seed}", configuration=bank) for seed, bank in enumerate(banks)]
     assert not _compare(*runs)[0]
     assert _compare(runs[0], runs[0])[0]
 
 
-def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_with_different_draws_are_compared_as_two_samples(make_run: MakeRun) -> None:
     first = make_run(make_rows(300))
     is_paired, comparisons = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
     assert not is_paired
@@ -62,7 +58,7 @@ def test_campaigns_with_different_draws_are_compared_as_two_samples(make_rows: R
     assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
 
 
-def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: MakeRun) -> None:
+def test_terrains_of_different_sites_are_not_paired(make_run: MakeRun) -> None:
     # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
     def write_site_run(name: str, seed: int) -> Path:
         terrain_error = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
@@ -73,11 +69,11 @@ def test_terrains_of_different_sites_are_not_paired(make_rows: Rows, make_run: M
 
     gusev, meridiani = read_run(write_site_run("gusev", 1)), read_run(write_site_run("meridiani", 6))
     assert min(entry.p_value for entry in compare_campaigns(gusev, meridiani)[1]) > 0.05
-    metrics = [{metric.name: metric.sample for metric in list_metrics(run)[1]} for run in (gusev, meridiani)]
-    assert difference_p_value(*(samples["velocity error (m/s)"] for samples in metrics)) < 1e-3
+    first, second = ({item.name: item.sample for item in list_metrics(run)[1]} for run in (gusev, meridiani))
+    assert difference_p_value(first["velocity error (m/s)"], second["velocity error (m/s)"]) < 1e-3
 
 
-def test_campaigns_without_common_metric_are_compared_by_completion(make_rows: Rows, make_run: MakeRun) -> None:
+def test_campaigns_without_common_metric_are_compared_by_completion(make_run: MakeRun) -> None:
     first = make_run(make_rows(20)[["case", "outcome"]], [])
     _, comparisons = _compare(first, make_run(make_rows(20), name="other", seed=8))
     assert set(comparisons) == {"came to an end"}

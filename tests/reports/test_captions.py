@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from xml.etree import ElementTree as Xml
 
 import numpy as np
@@ -16,13 +15,13 @@ from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.sections import driver_figures
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import NOTHING, number
+from tests.reports.synthetic_run import make_rows
 
-Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
 DRIVERS = ("off_nadir_max_deg", "sun_elevation_deg")
 
 
-def test_rank_correlations_have_intervals_and_need_enough_cases(make_rows: Rows) -> None:
+def test_rank_correlations_have_intervals_and_need_enough_cases() -> None:
     few_captions = [figure.caption for figure in driver_figures(make_rows(12, answer_rate=1.0), METRIC, 5.0, DRIVERS)]
     assert few_captions
     assert not [caption for caption in few_captions if "correlation" in caption]
@@ -53,7 +52,7 @@ def test_rounding_errors_are_printed_as_zero() -> None:
     assert number(2e-7) == "2.00e−07"
 
 
-def test_message_on_one_crashed_case_is_singular(make_rows: Rows) -> None:
+def test_message_on_one_crashed_case_is_singular() -> None:
     frame = make_rows(8, n_crashed=1)
     suite = Xml.fromstring(junit_xml("one", [], combine_verdicts([], frame)))  # noqa: S314
     assert [failure.get("message") for failure in suite.iter("failure")] == ["1 case crashed"]

@@ -6,7 +6,6 @@ An error axis ends at most at 3 times the bound (15 m/s for 5 m/s), unless more 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
@@ -23,8 +22,8 @@ from marsyard.reports.figures import (
     outcome_bars,
 )
 from marsyard.reports.section import svg_markup
+from tests.reports.synthetic_run import make_rows
 
-Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
 
 
@@ -41,7 +40,7 @@ def _draw_all_figures(frame: pd.DataFrame, bound: float | None) -> list[Figure |
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("cases", "bound"), [(1, 5.0), (24, None), (24, 0.0), (1500, 5.0)])
-def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | None) -> None:
+def test_figures_are_well_formed(cases: int, bound: float | None) -> None:
     for index, figure in enumerate(_draw_all_figures(make_rows(cases, answer_rate=1.0), bound)):
         assert figure is not None
         root = ET.fromstring(svg_markup(figure, f"f{index}", 'errors & "more" <of them>'))  # noqa: S314
@@ -49,7 +48,7 @@ def test_figures_are_well_formed(make_rows: Rows, cases: int, bound: float | Non
         assert root.get("viewBox")
 
 
-def test_missing_data_give_no_figure(make_rows: Rows) -> None:
+def test_missing_data_give_no_figure() -> None:
     frame = make_rows(5, answer_rate=0.0)
     assert error_scatter(frame, METRIC, 5.0) is None
     assert error_histogram(frame, METRIC, 5.0) is None
@@ -61,7 +60,7 @@ def test_missing_data_give_no_figure(make_rows: Rows) -> None:
     assert error_histogram(without_outcomes, METRIC, 5.0) is not None
 
 
-def test_figures_have_distinct_identifiers(make_rows: Rows) -> None:
+def test_figures_have_distinct_identifiers() -> None:
     figure = error_histogram(make_rows(24), METRIC, 5.0)
     assert figure is not None
     names = [
@@ -72,13 +71,13 @@ def test_figures_have_distinct_identifiers(make_rows: Rows) -> None:
     assert not names[0] & names[1]
 
 
-def test_figures_are_reproducible(make_rows: Rows) -> None:
+def test_figures_are_reproducible() -> None:
     frame = make_rows(24)
     first, second = (svg_markup(error_scatter(frame, METRIC, 5.0) or Figure(), "s", "") for _ in range(2))
     assert first == second
 
 
-def test_scatter_shows_the_bound_as_a_circle(make_rows: Rows) -> None:
+def test_scatter_shows_the_bound_as_a_circle() -> None:
     figure = error_scatter(make_rows(24), METRIC, 5.0)
     assert figure is not None
     circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
@@ -86,7 +85,7 @@ def test_scatter_shows_the_bound_as_a_circle(make_rows: Rows) -> None:
     assert figure.axes[0].get_aspect() == 1.0
 
 
-def test_texts_in_figures_are_escaped(make_rows: Rows) -> None:
+def test_texts_in_figures_are_escaped() -> None:
     frame = make_rows(6).assign(outcome="<script>alert(1)</script> $\\frac$ \N{ROCKET}")
     figure = outcome_bars(frame)
     assert figure is not None
@@ -103,7 +102,7 @@ def _scale_errors(frame: pd.DataFrame, rows: slice) -> pd.DataFrame:
     return frame
 
 
-def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
+def test_histogram_has_an_overflow_bar() -> None:
     frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(0, 60, 12))
     figure = error_histogram(frame, METRIC, 5.0)
     assert figure is not None
@@ -117,7 +116,7 @@ def test_histogram_has_an_overflow_bar(make_rows: Rows) -> None:
     assert any("> 15" in text.get_text() for text in figure.axes[0].texts)
 
 
-def test_error_axis_is_extended_to_the_95_percent_quantile(make_rows: Rows) -> None:
+def test_error_axis_is_extended_to_the_95_percent_quantile() -> None:
     frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(None))
     for draw in (error_histogram, error_distribution):
         figure = draw(frame, METRIC, 5.0)
@@ -136,7 +135,7 @@ def _count_hollow_marks(figure: Figure) -> int:
     return sum(np.size(line.get_xdata()) for line in lines)
 
 
-def test_points_beyond_the_axes_are_marked_and_counted(make_rows: Rows) -> None:
+def test_points_beyond_the_axes_are_marked_and_counted() -> None:
     frame = _scale_errors(make_rows(60, answer_rate=1.0), slice(0, 60, 12))
     figure = error_scatter(frame, METRIC, 5.0)
     assert figure is not None

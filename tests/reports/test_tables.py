@@ -5,9 +5,7 @@ from __future__ import annotations
 import io
 import math
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,10 +33,9 @@ from marsyard.reports.wording import (
     requirement_text,
 )
 from marsyard.scenarios.systems import catalogue
+from tests.reports.synthetic_run import VELOCITY, make_rows
 
 REQUIREMENTS = Path(__file__).parents[2] / "scenarios" / "requirements.toml"
-
-Rows = Callable[..., pd.DataFrame]
 
 
 def _print_table(table: Table, width: int) -> str:
@@ -49,8 +46,8 @@ def _print_table(table: Table, width: int) -> str:
 
 
 @pytest.mark.parametrize("width", [80, 140])
-def test_verdict_table_is_complete_at_any_width(make_rows: Rows, velocity: dict[str, Any], width: int) -> None:
-    verdicts = evaluate_requirements(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
+def test_verdict_table_is_complete_at_any_width(width: int) -> None:
+    verdicts = evaluate_requirements(make_rows(24), [VELOCITY, {**VELOCITY, "id": "DIMES-AVAIL", "population": "all"}])
     text = _print_table(verdict_table(verdicts), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for message in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
@@ -63,13 +60,13 @@ def test_verdict_table_reports_missing_requirements() -> None:
     assert "no requirement" in _print_table(verdict_table([]), 80)
 
 
-def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdicts = evaluate_requirements(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
+def test_texts_are_not_interpreted_as_markup() -> None:
+    verdicts = evaluate_requirements(make_rows(5), [{**VELOCITY, "id": "[red]R[/red]", "metric": "[/]"}])
     text = _print_table(verdict_table(verdicts), 140)
     assert "[red]R[/red]" in text
 
 
-def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
+def test_outcomes_are_ordered_and_counted() -> None:
     frame = make_rows(200, n_crashed=2)
     counts = outcome_counts(frame)
     assert counts[0][0] == "VALID"
@@ -78,7 +75,7 @@ def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
     assert outcome_counts(frame.drop(columns="outcome")) == []
 
 
-def test_statistics_table_has_errors_and_components(make_rows: Rows) -> None:
+def test_statistics_table_has_errors_and_components() -> None:
     grid = statistics_grid(make_rows(24), "velocity_error_m_s")
     assert list(grid.head) == ["", "velocity error (m/s)", "east velocity error (m/s)", "north velocity error (m/s)"]
     assert [row[0] for row in grid.rows if "interval" not in row[0] and "bounds" not in row[0]][:3] == [
@@ -94,29 +91,29 @@ def test_labels_are_derived_from_column_names() -> None:
     assert magnitude_label("velocity_error_m_s") == "|velocity error| (m/s)"
 
 
-def test_axis_columns_are_the_components_of_an_error(make_rows: Rows) -> None:
+def test_axis_columns_are_the_components_of_an_error() -> None:
     columns = list(make_rows(1).columns)
     assert axis_columns("velocity_error_m_s", columns) == ["velocity_error_x_m_s", "velocity_error_y_m_s"]
     assert axis_columns("score", columns) == []
 
 
-def test_driver_columns_exclude_errors_and_bookkeeping_columns(make_rows: Rows) -> None:
+def test_driver_columns_exclude_errors_and_bookkeeping_columns() -> None:
     drivers = driver_columns(make_rows(50), "velocity_error_m_s", max_columns=20)
     assert drivers[:3] == ["off_nadir_max_deg", "attitude_rate_max_deg_s", "altitude_1_m"]
     assert not {"case", "wall_time_s", "velocity_error_x_m_s", "terrain", "answered"} & set(drivers)
 
 
-def test_category_column_has_few_distinct_values(make_rows: Rows) -> None:
+def test_category_column_has_few_distinct_values() -> None:
     frame = make_rows(100)
     assert category_column(frame) == "terrain"
     assert category_column(frame.assign(site=["Gusev", "Meridiani"] * 50)) == "site"
     assert category_column(make_rows(100, terrains=50)) is None
 
 
-def test_primary_metric_is_an_existing_column(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_primary_metric_is_an_existing_column() -> None:
     frame = make_rows(3)
-    assert primary_metric(frame, [{**velocity, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
-    assert primary_metric(frame, [{**velocity, "metric": "no_such_column"}]) == "velocity_error_m_s"
+    assert primary_metric(frame, [{**VELOCITY, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
+    assert primary_metric(frame, [{**VELOCITY, "metric": "no_such_column"}]) == "velocity_error_m_s"
     assert primary_metric(frame[["case", "outcome"]], []) is None
 
 
