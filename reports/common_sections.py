@@ -82,8 +82,7 @@ def answers_section(subject: Subject) -> Section | None:
         },
     )
     note = note_text("common.answers")
-    data = {name: asdict(fraction) for name, fraction in fractions.items()}
-    return Section("answers", "Answers", "Availability and wrong answers", [Block(grid=grid, note=note)], data)
+    return Section("answers", "Answers", "Availability and wrong answers", [Block(grid=grid, note=note)], fractions)
 
 
 def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
@@ -150,9 +149,10 @@ def scatter_section(subject: Subject) -> Section | None:
         ["Fraction of errors", f"Radius ({unit})", f"Lower and upper bound ({format_fraction(CONFIDENCE)} each)"], rows
     )
     note = note_text("common.scatter")
-    data = {"ellipse": asdict(ellipse), "circles": [asdict(circle) for circle in circles]}
     block = Block(text=text, grid=grid, note=note)
-    return Section("scatter", "Scatter", "Error ellipse and circular errors", [block], data)
+    return Section(
+        "scatter", "Scatter", "Error ellipse and circular errors", [block], {"ellipse": ellipse, "circles": circles}
+    )
 
 
 #: Maximum number of ranked conditions, and of cases that are used for the ranking.
@@ -239,11 +239,11 @@ def convergence_section(subject: Subject) -> Section | None:
         )
         for index, (name, rate, points) in enumerate(curves)
     ]
-    data = {name: [asdict(point) for point in points] for name, _, points in curves}
+    data = {name: points for name, _, points in curves}
     for key, (name, axis, points) in error_curves(frame, subject.metric).items():
         bound = subject.bound if key == "quantile" else None
         svg_figures.append(svg_figure(curve_figure(points, axis, bound), f"converge-{key}", f"{name} and its bounds."))
-        data[f"{subject.metric}: {name}"] = [asdict(point) for point in points]
+        data[f"{subject.metric}: {name}"] = points
     if not svg_figures:
         return None
     note = note_text("common.convergence")

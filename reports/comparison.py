@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -174,11 +174,7 @@ def comparison_section(subject: Subject) -> Section | None:
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {tested_name}", grid=grids[1], note=note))
-    data = {
-        "algorithms": [asdict(result) for result in results],
-        "against": tested_name,
-        "differences": [asdict(difference) for difference in differences],
-    }
+    data = {"algorithms": results, "against": tested_name, "differences": differences}
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
 
 

@@ -169,7 +169,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a section: heading, text, figures, table, note, and its numbers in `report.json`; all are optional."""
+    """A block of a section: heading, text, figures, table, note, and its numbers in `report.json`; all are optional.
+
+    The numbers may contain dataclasses, which become tables of `report.json`.
+    """
 
     heading: str = ""
     text: str = ""

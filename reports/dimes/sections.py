@@ -6,7 +6,7 @@ The paper is Johnson et al., "Field Testing of the MER DIMES".
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -65,12 +65,11 @@ def ignition_section(subject: Subject) -> Section | None:
     summaries = error_summaries(frame, _FIRING)
     rows, too_few_cases = omit_empty_rows(statistics_rows([summary for _, summary in summaries]))
     grid = Grid(["", *(name for name, _ in summaries)], rows)
-    data = {name: asdict(summary) for name, summary in summaries}
     return create_section(
         "firing",
         "Ignition",
         "Velocity error at thruster ignition",
-        Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}", data=data),
+        Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}", data=dict(summaries)),
         quantile_block(
             frame,
             [Quantity("firing_after_s")],
@@ -161,9 +160,10 @@ def sensitivity_section(subject: Subject) -> Section | None:
         for effect in effects
     ]
     head = ["", "5 % to 95 % quantile", "Rank correlation", "Standardised coefficient", f"Effect ({unit})"]
-    data = {"drivers": [asdict(effect) for effect in effects]}
     blocks = [Block(figures=[effect_svg]), Block(grid=Grid(head, rows), note=note)]
-    return Section("sensitivity", "Sensitivity", "Sensitivity of the error to the conditions", blocks, data)
+    return Section(
+        "sensitivity", "Sensitivity", "Sensitivity of the error to the conditions", blocks, {"drivers": effects}
+    )
 
 
 def estimate_effects(subject: Subject, metric: str) -> list[ConditionEffect]:

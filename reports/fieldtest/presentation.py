@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -88,8 +87,9 @@ def field_test_section(subject: Subject) -> Section | None:
         if bound is not None and subject.metric is not None:
             note = note_text("dimes.errors", bound=f"{bound:g}", unit=split_unit(subject.metric)[1])
         blocks.append(Block(heading="Errors by category", figures=svg_figures, note=note))
-    data = {"cells": [cell | {"valid": asdict(cell["valid"])} for cell in cells]}
-    return Section("field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, data)
+    return Section(
+        "field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, {"cells": cells}
+    )
 
 
 def field_cells(subject: Subject) -> list[dict[str, Any]]:

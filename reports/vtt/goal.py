@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +141,7 @@ def _create_camera_blocks(runs: Rows) -> list[Block]:
         for name, rate in _RATES.items()
     ]
     run_grid = Grid(["Camera", "Result", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
-    data = [row | {rate: vars(row[rate]) for rate in _RATES.values()} for row in cameras]
-    blocks = [Block("Runs at selectable targets", grid=run_grid, note=_RATES_NOTE, data={"cameras": data})]
+    blocks = [Block("Runs at selectable targets", grid=run_grid, note=_RATES_NOTE, data={"cameras": cameras})]
     if any(row["completed"].hits for row in cameras):
         grid, note = _errors_grid(cameras), _describe_errors(cameras)
         blocks.append(Block(heading="Errors of the completed runs at the goal", grid=grid, note=note))
@@ -295,11 +293,7 @@ def table_1_section(subject: Subject) -> Section | None:
         Block(heading="Computed", grid=grid, note=_COMPUTED_NOTE),
         Block(heading="Measured in this campaign", grid=_measured_grid(accuracy), note=_MEASURED_NOTE),
     ]
-    data = {
-        "computed": {name: asdict(row) for name, row in computed_rows.items()},
-        "printed": {name: asdict(row) for name, row in PRINTED.items()},
-        "measured": accuracy,
-    }
+    data = {"computed": computed_rows, "printed": PRINTED, "measured": accuracy}
     return Section(
         "table-1", "Position accuracy", "Accuracy of a target's position (Table I of the paper)", blocks, data
     )

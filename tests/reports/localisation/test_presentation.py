@@ -176,9 +176,9 @@ def test_position_section_has_rates_and_quantiles() -> None:
     section = position_section(_make_subject(frame))
     assert section is not None
     rates = section.data["rates"]
-    assert rates["Position reported within 10 s"]["hits"] == frame["fixed_in_time"].sum()
-    assert rates["Coarse position within 200 m"]["hits"] == frame["fixed_in_time"].sum()
-    assert rates["A reported position is wrong by more than 40 m"]["hits"] == 0
+    assert rates["Position reported within 10 s"].hits == frame["fixed_in_time"].sum()
+    assert rates["Coarse position within 200 m"].hits == frame["fixed_in_time"].sum()
+    assert rates["A reported position is wrong by more than 40 m"].hits == 0
     headings = [block.heading for block in section.blocks]
     assert headings == ["Positions", "Position error", "Distributions", "Consistency of the covariance"]
     nees = section.data["nees"]
@@ -192,13 +192,13 @@ def test_condition_section_is_created() -> None:
     assert section is not None
     bins = section.data["by_condition"]
     assert sum(entry["n"] for entry in bins) == 200
-    assert [entry["fixed_in_time"]["hits"] for entry in bins] == [entry["answered"]["hits"] for entry in bins]
+    assert [entry["fixed_in_time"].hits for entry in bins] == [entry["answered"].hits for entry in bins]
 
 
 def test_algorithm_without_coarse_stage_has_no_coarse_rate() -> None:
     section = position_section(_make_subject(localisation_frame(200).assign(coarse_error_m=np.nan)))
     assert section is not None
-    assert section.data["rates"]["Coarse position within 200 m"]["n"] == 0
+    assert section.data["rates"]["Coarse position within 200 m"].n == 0
 
 
 def test_consistent_covariances_are_inside_the_interval() -> None:
