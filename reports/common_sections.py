@@ -328,26 +328,23 @@ def curve_figure(points: Sequence[Point], name: str, required: float | None) -> 
     return figure
 
 
-#: Column of the normalised estimation error squared (NEES), and its degrees of freedom.
-NEES, NEES_DIMENSION = "velocity_nees", 2
+#: Columns of normalised estimation errors squared (NEES), and their degrees of freedom.
+NEES, NEES_DIMENSION = ("velocity_nees", "position_nees"), 2
 #: Probability of the band of the mean NEES, and of the error ellipse.
 BAND_PROBABILITY = 0.95
 
 
-def evaluate_consistency(
-    nees: Float[np.ndarray, " n"], dimension: int = NEES_DIMENSION, probability: float = BAND_PROBABILITY
-) -> dict[str, Any]:
+def evaluate_consistency(nees: Float[np.ndarray, " n"]) -> dict[str, Any]:
     """Evaluate from the NEES of estimates whether their errors agree with their covariances.
 
     Keys: mean NEES with its band for correct covariances, fraction of errors `inside` their ellipse with its 90 %
-    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic". Band and
-    ellipse have the given probability.
+    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
     """
     n, mean = nees.size, float(nees.mean())
-    tail = 0.5 * (1.0 - probability)
+    tail = 0.5 * (1.0 - BAND_PROBABILITY)
     # for correct covariances, the sum of n NEES has a chi-square distribution with n * dimension degrees of freedom
-    lower, upper = (float(stats.chi2.ppf(level, dimension * n)) / n for level in (tail, 1.0 - tail))
-    inside = int((nees <= stats.chi2.ppf(probability, dimension)).sum())
+    lower, upper = (float(stats.chi2.ppf(level, NEES_DIMENSION * n)) / n for level in (tail, 1.0 - tail))
+    inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, NEES_DIMENSION)).sum())
     low, high = proportion_interval(inside, n, CONFIDENCE)
     word = "optimistic" if mean > upper else "pessimistic" if mean < lower else "consistent"
     band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
@@ -358,9 +355,8 @@ def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Evaluate the consistency of all algorithms with covariances in the rows, by name."""
     tested_name = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
     frames = {tested_name: frame, **{name: select_algorithm(frame, name) for name in list_compared_algorithms(frame)}}
-    by_name = {name: numbers(rows, NEES) for name, rows in frames.items() if NEES in rows}
-    finite = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
-    return {name: evaluate_consistency(nees) for name, nees in finite.items() if nees.size}
+    values = {name: [rates.finite_values(rows, column) for column in NEES] for name, rows in frames.items()}
+    return {name: evaluate_consistency(nees) for name, columns in values.items() for nees in columns if nees.size}
 
 
 def consistency_section(subject: Subject) -> Section | None:

@@ -180,7 +180,7 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     `valid` and `completed` exclude unfinished cases. Without this check, crashes instead of wrong answers could lead to
     PASS.
     """
-    if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
+    if not verdict.status.is_met or verdict.status is with_unfinished.status:
         return verdict
     n_unfinished = with_unfinished.n - verdict.n
     reason = (
@@ -188,7 +188,7 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
         f"population of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore "
         "withheld."
     )
-    return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
+    return verdict.withhold(reason)
 
 
 def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:

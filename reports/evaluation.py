@@ -110,19 +110,8 @@ def _describe_unfinished(run: StoredRun) -> str:
 
 def _withhold_unfinished(verdict: Verdict, reason: str) -> Verdict:
     """Replace the verdict and the bounds of an unfinished campaign: its number of cases depends on earlier looks."""
-    return replace(
-        verdict,
-        status=Status.INSUFFICIENT,
-        reason=reason,
-        further_cases=None,
-        advice="",
-        all_cases=None,
-        clustered=None,
-        lower=math.nan,
-        upper=math.nan,
-        plain_lower=math.nan,
-        plain_upper=math.nan,
-    )
+    unknown: dict[str, Any] = dict.fromkeys(("lower", "upper", "plain_lower", "plain_upper"), math.nan)
+    return replace(verdict.withhold(reason), advice="", all_cases=None, clustered=None, **unknown)
 
 
 def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
@@ -172,12 +161,10 @@ def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
     """
     if not evidence.excludes_pass:
         return verdict
-    if verdict.status not in (Status.PASS, Status.MET_BY_RATE):
+    if not verdict.status.is_met:
         return replace(verdict, further_cases=None)
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
-    return replace(
-        verdict, status=Status.INSUFFICIENT, withheld_status=verdict.status, reason=reason, further_cases=None
-    )
+    return replace(verdict.withhold(reason), withheld_status=verdict.status)
 
 
 def record_look(evaluation: Evaluation) -> None:

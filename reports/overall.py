@@ -17,8 +17,6 @@ from marsyard.reports.wording import count, format_fraction
 
 #: Headline of an exploration that meets all requirements: it is no confirmation.
 EXPLORATORY_PASS = "PASS (exploration)"  # noqa: S105  (a verdict, not a password)
-#: Statuses that need a decision of a person: PASS with a qualification.
-_QUALIFIED = (Status.UNREGISTERED, Status.OTHER_CLAIMS)
 #: Exit status of PASS with a qualification.
 QUALIFIED_EXIT_CODE = 4
 
@@ -62,8 +60,7 @@ def combine_verdicts(
     crash_text = f" {count(crashed, 'case')} crashed." if crashed else ""
     if not statuses:
         return OverallVerdict(None, crashed, "The campaign has no requirement." + crash_text)
-    order = (Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE, *_QUALIFIED)
-    worst = next((status for status in order if status in statuses), Status.PASS)
+    worst = next(status for status in Status if status in statuses)
     if not sampling.independent:
         rate_statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
         met_text = f"{rate_statuses.count(Status.MET_BY_RATE)} of {count(len(rate_statuses), 'requirement')}"
@@ -108,7 +105,7 @@ def compute_exit_code(verdicts: Sequence[Verdict], crashed: bool) -> int:
     has_rate_verdict = any(verdict.status is Status.MET_BY_RATE and not verdict.accept_rate for verdict in verdicts)
     if has_rate_verdict or any(verdict.status is Status.INSUFFICIENT for verdict in verdicts):
         return 3
-    return QUALIFIED_EXIT_CODE if any(verdict.status in _QUALIFIED for verdict in verdicts) else 0
+    return QUALIFIED_EXIT_CODE if any(verdict.status.is_qualified for verdict in verdicts) else 0
 
 
 #: Confidence of the lower bound of the fraction of the cases that belong to a population; high, so that the stated

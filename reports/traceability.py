@@ -70,8 +70,6 @@ def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
     return ", ".join(algorithm.title for algorithm in algorithms if algorithm.tested)
 
 
-#: Verdicts of requirements that are neither met nor failed at their confidence; JUnit tests with them are skipped.
-_UNDECIDED = (Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS)
 #: Characters that XML 1.0 does not allow.
 _INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -150,7 +148,7 @@ def junit_xml(
         name=_clean_xml(campaign),
         tests=str(len(verdicts) + 1),
         failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
-        skipped=str(sum(status in _UNDECIDED for status in statuses)),
+        skipped=str(sum(status not in (Status.PASS, Status.FAIL) for status in statuses)),
     )
     cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
     if cells:
@@ -169,7 +167,7 @@ def junit_xml(
         )
         if verdict.status is Status.FAIL:
             Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
-        elif verdict.status in _UNDECIDED:
+        elif verdict.status is not Status.PASS:
             Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
         Xml.SubElement(test_case, "system-out").text = _clean_xml(f"{tested_text}{verdict.statement} {message}")
     completion = Xml.SubElement(suite, "testcase", classname=_clean_xml(campaign), name="all cases end")

@@ -26,7 +26,6 @@ from marsyard.reports.blocks import (
     rate_block,
     scatter_block,
 )
-from marsyard.reports.common_sections import evaluate_consistency
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import (
     CaseFigure,
@@ -41,14 +40,12 @@ from marsyard.reports.presentation import (
     to_float,
     to_matrix,
 )
-from marsyard.reports.rates import CaseFraction, finite_values, fraction_of
+from marsyard.reports.rates import CaseFraction, fraction_of
 from marsyard.reports.section import (
     INK,
     MUTED,
     REQUIREMENT,
     SERIES,
-    Block,
-    Grid,
     Section,
     Subject,
     create_section,
@@ -196,36 +193,6 @@ _ERRORS = (
 )
 
 
-#: Degrees of freedom: the components of the horizontal position.
-_DEGREES_OF_FREEDOM = 2
-#: Probability of the interval of the mean, and of the error ellipse.
-_PROBABILITY = 0.9
-
-
-def create_consistency_block(frame: pd.DataFrame) -> Block | None:
-    """Compare the normalised squared errors (NEES) with the chi-square distribution with two degrees of freedom."""
-    nees = finite_values(frame, "position_nees")
-    if nees.size == 0:
-        return None
-    result = evaluate_consistency(nees, _DEGREES_OF_FREEDOM, _PROBABILITY)
-    rows = [
-        ["Descents with a final position", f"{nees.size:,}"],
-        ["Mean of the normalised squared error", number(result["mean"])],
-        [
-            f"{100 * _PROBABILITY:.0f} % interval of this mean for a correct covariance",
-            f"{result['lower']:.2f} to {result['upper']:.2f}",
-        ],
-        [f"Errors within the {100 * _PROBABILITY:.0f} % ellipse", f"{100.0 * result['inside']:.1f} %"],
-    ]
-    note = (
-        "The normalised squared error is e' P^-1 e with the horizontal error e and its reported covariance P. Its mean "
-        "is 2 for a correct covariance; larger values mean that the errors are larger than reported. The interval "
-        "assumes independent descents."
-    )
-    data = {"nees": {name: result[name] for name in ("n", "mean", "lower", "upper", "inside")}}
-    return Block(heading="Consistency of the covariance", grid=Grid(["", ""], rows), note=note, data=data)
-
-
 def position_section(subject: Subject) -> Section | None:
     """Create the section on the position on the map; None for cases of another system."""
     frame = subject.frame
@@ -248,7 +215,6 @@ def position_section(subject: Subject) -> Section | None:
         rate_block(rates_by_name, "Descents", "Positions"),
         distribution,
         quantile_block(frame, _QUANTITIES, {"5 %": 0.05, "Median": 0.5, "95 %": 0.95, "99 %": 0.99}, "Distributions"),
-        create_consistency_block(frame),
     )
 
 

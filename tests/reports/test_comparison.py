@@ -65,7 +65,10 @@ def test_correct_covariances_are_consistent_at_95_percent() -> None:
     assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "pessimistic"
 
 
-def test_consistency_covers_all_algorithms_with_covariances() -> None:
-    frame = make_paired_rows([1, 2], [3, 4]).assign(**{"other.velocity_nees": [2.0, 2.0]})
+@pytest.mark.parametrize("column", ["velocity_nees", "position_nees"])
+def test_consistency_covers_all_algorithms_with_covariances(column: str) -> None:
+    frame = make_paired_rows([1, 2, 3], [3, 4, 5]).assign(**{f"other.{column}": [2.0, 2.0, np.nan]})
     ((name, values),) = evaluate_consistencies(frame).items()
     assert (name, values["n"], values["mean"], values["word"]) == ("other", 2, 2.0, "consistent")
+    # the sum of two values with two degrees of freedom each
+    assert values["lower"] == pytest.approx(stats.chi2.ppf(0.025, 4) / 2)
