@@ -107,11 +107,12 @@ class History:
             )
             self._connection.executemany("INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
-    def finish(self, night: int, state: str, changes: Sequence[tuple[str, str, float, bool]] = ()) -> None:
-        """End a night with its changes: campaign, metric, corrected p-value, whether it is a regression."""
+    def finish(self, night: int, state: str, changes: Sequence[Change] = ()) -> None:
+        """End a night with its changes."""
         with self._transaction():
             self._connection.executemany(
-                "INSERT INTO changes VALUES (?, ?, ?, ?, ?)", [(night, *change) for change in changes]
+                "INSERT INTO changes VALUES (?, ?, ?, ?, ?)",
+                [(night, item.campaign, item.metric, item.p_value, item.is_regression) for item in changes],
             )
             self._connection.execute(
                 "UPDATE nights SET state = ?, finished_utc = ? WHERE night = ?", (state, utc_now(), night)

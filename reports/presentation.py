@@ -213,24 +213,31 @@ def to_matrix(value: object) -> Float[np.ndarray, "_ _"] | None:
     return values if values is not None and values.ndim == 2 and values.size else None
 
 
+#: Shape of a product: lengths, names of lengths that are equal in products read together, and None for any length.
+Shape = tuple[int | str | None, ...]
+
+
 def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] | None:
     """Convert a product to an array of a shape, where None is any length; None if it has another shape."""
-    values = numeric_product(value)
-    if values is None or values.ndim != len(shape):
-        return None
-    is_valid = all(
-        required_length in (None, length) for required_length, length in zip(shape, values.shape, strict=True)
-    )
-    return values if is_valid else None
+    arrays = read_arrays({"value": value}, {"value": shape})
+    return None if arrays is None else arrays[0]
 
 
 def read_arrays(
-    products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
+    products: Products, shapes: Mapping[str, Shape], *, finite: bool = False
 ) -> list[Float[np.ndarray, "..."]] | None:
     """Read products by name and shape; None if a product is missing, invalid, or not finite if `finite` is set."""
-    arrays = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
-    valid_arrays = [array for array in arrays if array is not None and (not finite or np.isfinite(array).all())]
-    return valid_arrays if len(valid_arrays) == len(shapes) else None
+    arrays, lengths = [], dict[str, int]()
+    for name, shape in shapes.items():
+        values = numeric_product(products.get(name))
+        if values is None or values.ndim != len(shape) or (finite and not np.isfinite(values).all()):
+            return None
+        for required, length in zip(shape, values.shape, strict=True):
+            expected = lengths.setdefault(required, length) if isinstance(required, str) else required
+            if expected not in (None, length):
+                return None
+        arrays.append(values)
+    return arrays
 
 
 #: Number of selected cases of each group (largest errors, no answer, random); a case has half a megabyte of images.

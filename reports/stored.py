@@ -67,12 +67,7 @@ class StoredRun:
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
         """The requirements of the campaign."""
-        stored_requirements = self.recorded("requirements")
-        return (
-            [item for item in stored_requirements if isinstance(item, Mapping)]
-            if isinstance(stored_requirements, list | tuple)
-            else []
-        )
+        return _read_requirements(self.record)
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -165,12 +160,7 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         frame = _sort_rows(pd.read_parquet(path))
         return frame, frame
     first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
-    requirement_list = record.get("requirements")
-    requirements = (
-        [requirement for requirement in requirement_list if isinstance(requirement, Mapping)]
-        if isinstance(requirement_list, list)
-        else []
-    )
+    requirements = _read_requirements(record)
     # columns of all cases that verdicts, outcomes and figures use
     columns = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
     for requirement in requirements:
@@ -183,6 +173,13 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         columns.update([metric, *axis_columns(metric, stored_names), *drivers])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if name in columns])
     return _sort_rows(first_rows), _sort_rows(all_cases)
+
+
+def _read_requirements(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the requirements of a record or of its configuration; empty if they are invalid."""
+    stored = record.get("requirements")
+    stored = table(record.get("configuration")).get("requirements") if stored is None else stored
+    return [item for item in stored if isinstance(item, Mapping)] if isinstance(stored, list | tuple) else []
 
 
 def _read_conditions(record: Mapping[str, Any]) -> tuple[str, ...]:

@@ -151,10 +151,9 @@ _MAX_PER_ROW = 10
 
 def _read_stream(products: Products) -> Float[np.ndarray, "n 6"] | None:
     """Read a row for each image: start and end of the time span, estimate, truth (east, north); NaN if missing."""
-    parts = read_arrays(products, dict.fromkeys(("after_spans_s", "after_velocities_m_s", "after_true_m_s"), (None, 2)))
-    if parts is None or len({len(part) for part in parts}) > 1 or not len(parts[0]):
-        return None
-    return np.concatenate(parts, axis=1)
+    names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
+    parts = read_arrays(products, dict.fromkeys(names, ("n", 2)))
+    return np.concatenate(parts, axis=1) if parts is not None and len(parts[0]) else None
 
 
 def is_stream_case(products: Products) -> bool:

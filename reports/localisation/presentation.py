@@ -61,14 +61,14 @@ _RESIDUAL_SCALE = 20.0
 
 def is_localisation_case(products: Products) -> bool:
     """Return whether products contain the track of a localisation case and its map, with the outcomes of the track."""
-    shapes = {"track": (None, 7), "inliers": (None,), "true_xy_m": (None, 2), "estimated_xy_m": (None, 2)}
+    shapes = {"track": ("n", 7), "inliers": ("n",), "true_xy_m": (None, 2), "estimated_xy_m": (None, 2)}
     arrays = read_arrays(products, shapes)
     extent = read_arrays(products, {"map_extent_m": (4,)}, finite=True)
     if arrays is None or extent is None or to_matrix(products.get("map")) is None:
         return False
     outcomes = products.get("outcomes")
     names = [str(name) for name in outcomes] if isinstance(outcomes, list | tuple | np.ndarray) else []
-    return len(arrays[0]) == len(arrays[1]) == len(names) and set(names) <= set(PositionOutcome.__members__)
+    return len(arrays[0]) == len(names) and set(names) <= set(PositionOutcome.__members__)
 
 
 def read_track(products: Products) -> Float[np.ndarray, "n 7"]:
@@ -115,12 +115,11 @@ def draw_map(products: Products) -> Figure:
 
 def draw_landmarks(products: Products) -> Figure | None:
     """Draw the last image with its landmarks and their residuals; None without landmarks."""
-    pixels, residuals = (check_shape(products.get(f"landmarks_{name}"), None, 2) for name in ("px", "residual_px"))
-    flags, image = check_shape(products.get("landmarks_used"), None), to_matrix(products.get("image_2"))
-    if pixels is None or residuals is None or flags is None or image is None:
+    shapes = {"landmarks_px": ("n", 2), "landmarks_residual_px": ("n", 2), "landmarks_used": ("n",)}
+    arrays, image = read_arrays(products, shapes), to_matrix(products.get("image_2"))
+    if arrays is None or image is None:
         return None
-    if not len(pixels) == len(residuals) == len(flags):
-        return None
+    pixels, residuals, flags = arrays
     used = flags > 0.5
     marks = []
     for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):

@@ -125,11 +125,7 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
         night = _add_run(history, 5, error_factor=3.0)
         regressions = find_changes(list_comparisons(history, night))
         assert "error (m)" in {entry.metric for entry in regressions}
-        history.finish(
-            night,
-            FINISHED,
-            [(entry.campaign, entry.metric, entry.p_value, entry.is_regression) for entry in regressions],
-        )
+        history.finish(night, FINISHED, regressions)
         # after a reported change, later runs are compared with that run only
         next_night = _add_run(history, 6, error_factor=3.0)
         n_compared = {entry.metric.name: len(entry.before) for entry in list_comparisons(history, next_night)}
