@@ -172,7 +172,7 @@ def test_run_without_a_recorded_command_is_reported(folder: Path, tmp_path: Path
     run = tmp_path / "run"
     run.mkdir()
     (run / "cases.parquet").write_bytes((folder / "run" / "cases.parquet").read_bytes())
-    (run / "campaign.json").write_text(json.dumps(_read_record(folder) | {"command": None}))
+    (run / "campaign.json").write_text(json.dumps({**_read_record(folder), "command": None}))
     result = CliRunner().invoke(app, ["report", str(run)])
     assert result.exit_code in (1, 3), result.output
     page = (run / "report.html").read_text()
