@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.campaigns.errors import CampaignError, StoreError
@@ -32,6 +33,7 @@ class Entry:
 
     - slug: name of the campaign's folder in the site: letters, digits and hyphens, with a hash of the campaign's path
     - folder: folder of the report: the campaign's folder, or that of its pages
+    - sites, algorithms: names from the rows, else from the parameters
     - report: the content of `report.json`
     """
 
@@ -40,6 +42,8 @@ class Entry:
     folder: Path
     name: str
     system: str
+    sites: tuple[str, ...]
+    algorithms: tuple[str, ...]
     report: CampaignReport
 
     @property
@@ -50,7 +54,7 @@ class Entry:
     @property
     def tested_names(self) -> str:
         """Names and versions of the algorithm under test; names from the rows if the record contains none."""
-        return format_tested_algorithms(self.report.algorithm_details) or ", ".join(self.report.algorithms)
+        return format_tested_algorithms(self.report.algorithm_details) or ", ".join(self.algorithms)
 
     @property
     def started(self) -> str:
@@ -118,6 +122,7 @@ def _read_entry(path: Path, pages: Path) -> Entry:
         report = read_report((folder / REPORT_JSON).read_bytes())
     if report is None:
         raise StoreError(f"{folder / REPORT_JSON} has another layout than this version of Marsyard writes")
+    parameters = table(table(record.get("configuration")).get("parameters"))
     system = find_system(str(table(record.get("configuration")).get("scenario")))
     return Entry(
         slug=slug,
@@ -125,6 +130,8 @@ def _read_entry(path: Path, pages: Path) -> Entry:
         folder=folder,
         name=name,
         system="other" if system is None else system.name,
+        sites=report.sites or _find_names(parameters, "site"),
+        algorithms=report.algorithms or _find_names(parameters, "algorithm"),
         report=report,
     )
 
@@ -146,6 +153,22 @@ def make_slug(path: Path, name: str) -> str:
     """Create a unique folder name without path separators from a campaign's path and name."""
     safe_name = re.sub(r"[^A-Za-z0-9-]+", "-", name)[:60].strip("-") or "campaign"
     return f"{safe_name}-{hashlib.sha256(str(path.resolve()).encode('utf-8', 'replace')).hexdigest()[:10]}"
+
+
+def _find_names(parameters: Mapping[str, Any], key: str) -> tuple[str, ...]:
+    name = _find_text(parameters, key)
+    return (name,) if name else ()
+
+
+def _find_text(parameters: Mapping[str, Any], key: str) -> str:
+    """Find the first text under a key at any depth of nested tables; empty if there is none."""
+    for name, value in parameters.items():
+        if name == key and isinstance(value, str):
+            return value
+        nested_value = _find_text(value, key) if isinstance(value, Mapping) else ""
+        if nested_value:
+            return nested_value
+    return ""
 
 
 #: Maximum number of other campaigns next to a requirement's verdict.

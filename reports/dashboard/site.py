@@ -55,8 +55,8 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
     script = read_script()
     filter_values = {
         "System": {entry.system for entry in entries},
-        "Site": {site for entry in entries for site in entry.report.sites},
-        "Algorithm": {algorithm for entry in entries for algorithm in entry.report.algorithms},
+        "Site": {site for entry in entries for site in entry.sites},
+        "Algorithm": {algorithm for entry in entries for algorithm in entry.algorithms},
         "Commit": {entry.commit for entry in entries},
         "Evidence": {entry.report.evidence.title for entry in entries},
     }

@@ -74,7 +74,7 @@ def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path
     entries, problems = read_entries(paths, tmp_path / "pages")
     assert problems == []
     assert [entry.name for entry in entries] == ["dimes-c", "dimes-b", "dimes-a"]
-    assert (entries[0].report.sites, entries[0].report.algorithms) == (("east", "west"), ("mine",))
+    assert (entries[0].sites, entries[0].algorithms) == (("east", "west"), ("mine",))
     row = next(row for row in requirement_rows(entries, {}) if row.requirement == "DIMES-VEL")
     assert [cell.entry.name for cell in row.cells] == ["dimes-b", "dimes-a", "dimes-c"]
 
@@ -151,10 +151,12 @@ def test_security_policy_contains_the_hash_of_the_script(make_run: MakeRun, tmp_
 
 
 def test_texts_are_escaped_and_files_stay_in_the_site(make_run: MakeRun, tmp_path: Path) -> None:
-    frame = make_rows(12, n_crashed=1)[[*MIN_COLUMNS, "error"]].assign(error=HOSTILE, site=HOSTILE, algorithm=HOSTILE)
+    frame = make_rows(12, n_crashed=1)[[*MIN_COLUMNS, "error"]].assign(error=HOSTILE)
+    parameters = {"site": HOSTILE, "algorithm": HOSTILE}
     directory = make_run(frame, [{**VELOCITY, "id": HOSTILE, "statement": HOSTILE}], name="hostile", git_commit=HOSTILE)
     record = (directory / "campaign.json").read_text()
     hostile_record = {**json.loads(record), "name": HOSTILE, "state": HOSTILE, "started_utc": HOSTILE}
+    hostile_record["configuration"]["parameters"] = parameters
     (directory / "campaign.json").write_text(json.dumps(hostile_record))
     text = _write_index(tmp_path)
     assert "alert('x')</script>" not in text
