@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -99,8 +99,7 @@ def rate_block(
             fraction = f"{rate.hits:,} of {rate.total:,}: {percent(rate.fraction)}"
             rows.append([name, fraction, rates.range_text(rate.lower, rate.upper)])
     grid = Grid(["", cases, f"{format_fraction(CONFIDENCE)} interval"], rows)
-    values = {data: {name: asdict(rate) for name, rate in rates_by_name.items()}}
-    return Block(heading=heading, grid=grid if rows else None, note=note if rows else "", data=values)
+    return Block(heading=heading, grid=grid if rows else None, note=note if rows else "", data={data: rates_by_name})
 
 
 def condition_blocks(
@@ -132,7 +131,7 @@ def condition_blocks(
     for value, n, bin_rates in bins:
         rows.append([f"{value:.4g}", f"{n:,}", *map(_describe_rate, bin_rates)])
         named_rates = zip(declared_rates, bin_rates, strict=True)
-        records.append({by.column: value, "n": n} | {rate.key: asdict(result) for rate, result in named_rates})
+        records.append({by.column: value, "n": n} | {rate.key: result for rate, result in named_rates})
     grid = Grid([by.title, cases, *(rate.name for rate in declared_rates)], rows)
     figure = svg_figure(rate_figure(lines, (by.title, ylabel), limit), key, caption or by.title)
     values_of_block = {data: records} | ({} if limit is None else {"limit": limit[1]})
@@ -210,9 +209,8 @@ class OutcomesBySize:
             for outcome, (name, style) in self.styles.items()
         }
         figure = stacked_bars([" ".join(pair).strip() for pair in texts], percentages, f"% of {self.cases.lower()}")
-        data = [{**record, f"{last}_fraction": asdict(record[f"{last}_fraction"])} for record in records]
         figures = [svg_figure(figure, key, caption)]
-        return [Block(figures=figures, data={"rows": data}), Block(grid=Grid(head, rows), note=note)]
+        return [Block(figures=figures, data={"rows": records}), Block(grid=Grid(head, rows), note=note)]
 
 
 def distribution_block(

@@ -7,7 +7,6 @@ is validated by its predictions for terrains that were not used for the fit, and
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -20,6 +19,7 @@ from matplotlib.figure import Figure
 from marsyard.reports import rates
 from marsyard.reports.common_sections import rank_drivers
 from marsyard.reports.conditions import CONDITIONS
+from marsyard.reports.decision import requirement_masks
 from marsyard.reports.section import (
     INK,
     REQUIREMENT,
@@ -182,17 +182,11 @@ def _fit_requirement(
     frame: pd.DataFrame, requirement: Mapping[str, Any], columns: Sequence[str]
 ) -> tuple[list[BoundaryFit], list[tuple[BoundaryFit, Figure]]]:
     """Fit the violations of a requirement over each pair of conditions; also draw the good fits."""
-    metric, bound = str(requirement.get("metric")), requirement.get("bound")
-    try:
-        in_population = rates.population_mask(frame, str(requirement.get("population") or "all"))
-    except ValueError:
+    masks = requirement_masks(frame, requirement)
+    if masks is None:
         return [], []
-    rows = frame[in_population].reset_index(drop=True)
-    limit = math.nan if bound is None else float(bound)
-    try:
-        is_violation = ~rates.success_mask(rows, metric, limit, float(requirement.get("scale") or 1.0))
-    except (KeyError, ValueError):
-        return [], []
+    member, success = masks
+    rows, is_violation = frame[member].reset_index(drop=True), ~success[member]
     if min(int(is_violation.sum()), int((~is_violation).sum())) < MIN_CASES_PER_CLASS:
         return [], []
     drivers = rank_drivers(rows, columns, is_violation.astype(np.float64))

@@ -34,21 +34,21 @@ class Looks:
 def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks: Looks) -> Verdict:
     """Add the bounds of the success rate of a population (`member`) of independent cases, at least one."""
     n, failures = int(member.sum()), int((member & ~success).sum())
-    if looks.in_first_look is None:
-        confidence = confidence_at(verdict.confidence, looks.risk_fraction)
-        bounded = _add_binomial_bounds(verdict, n, failures, (confidence, confidence))
-        if looks.risk_fraction < 1.0:
-            further = proportions.further_cases_needed(n, failures, verdict.probability, confidence)
-            return replace(bounded, further_cases=further)
-        first_n = n
+    first_n = n if looks.in_first_look is None else int((member & looks.in_first_look).sum())
+    risk = 1.0 - verdict.confidence
+    pass_test, fail_test = (
+        SequentialTest(rate, risk, first_n) for rate in (1.0 - verdict.probability, verdict.probability)
+    )
+    if looks.in_first_look is not None:
+        confidences = 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
     else:
-        first_n = int((member & looks.in_first_look).sum())
-    pass_test, fail_test = _sequential_tests(verdict, first_n)
-    further = pass_test.cases_needed(n, failures) - n
-    if looks.in_first_look is None:
-        return replace(bounded, further_cases=further)
-    confidences = 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
-    return replace(_add_binomial_bounds(verdict, n, failures, confidences), further_cases=further)
+        confidences = (confidence_at(verdict.confidence, looks.risk_fraction),) * 2
+    further: int | None = None
+    if looks.in_first_look is None and looks.risk_fraction < 1.0:
+        further = proportions.further_cases_needed(n, failures, verdict.probability, confidences[0])
+    else:
+        further = pass_test.cases_needed(n, failures) - n
+    return _add_binomial_bounds(verdict, n, (n - failures, n - failures), confidences, further)
 
 
 def add_clustered_bounds(verdict: Verdict, cases: ClusteredCases, looks: Looks) -> Verdict:
@@ -87,17 +87,9 @@ def _add_bounds_at_later_look(verdict: Verdict, cases: ClusteredCases, in_first_
         for rate in (1.0 - verdict.probability, verdict.probability)
     )
     confidences = 1.0 - pass_test.significance_level(terrains), 1.0 - fail_test.significance_level(terrains)
-    successful = min(evidence.successful_terrains, terrains)
-    return replace(
-        verdict,
-        lower=proportions.proportion_lower(terrains - failed, terrains, confidences[0]),
-        upper=proportions.proportion_upper(successful, terrains, confidences[1]),
-        bounds_confidence=confidences[0],
-        upper_confidence=confidences[1],
-        consumer_risk=proportions.consumer_risk(terrains - failed, terrains, verdict.probability),
-        further_cases=pass_test.cases_needed(terrains, failed) - terrains,
-        clustered=evidence,
-    )
+    successes = terrains - failed, min(evidence.successful_terrains, terrains)
+    further = pass_test.cases_needed(terrains, failed) - terrains
+    return replace(_add_binomial_bounds(verdict, terrains, successes, confidences, further), clustered=evidence)
 
 
 def _clustered_test(cases: ClusteredCases, in_first_look: Mask, rate: float, risk: float) -> SequentialTest:
@@ -109,21 +101,20 @@ def _clustered_test(cases: ClusteredCases, in_first_look: Mask, rate: float, ris
     return SequentialTest(rate, risk, first_n, first_risk if cases.member.all() or first_risk == 0.0 else risk)
 
 
-def _sequential_tests(verdict: Verdict, first_n: int) -> tuple[SequentialTest, SequentialTest]:
-    """Create the tests for PASS and for FAIL at looks after the first, for independent cases."""
-    risk = 1.0 - verdict.confidence
-    return (
-        SequentialTest(1.0 - verdict.probability, risk, first_n), SequentialTest(verdict.probability, risk, first_n)
-    )  # fmt: skip
+def _add_binomial_bounds(
+    verdict: Verdict, n: int, successes: tuple[int, int], confidences: tuple[float, float], further: int | None
+) -> Verdict:
+    """Add the bounds of n independent cases.
 
-
-def _add_binomial_bounds(verdict: Verdict, n: int, failures: int, confidences: tuple[float, float]) -> Verdict:
-    """Add the bounds of n independent cases at the confidences of the lower and of the upper bound."""
+    - successes, confidences: those of the lower and of the upper bound
+    - further: additional cases for PASS
+    """
     return replace(
         verdict,
-        lower=proportions.proportion_lower(n - failures, n, confidences[0]),
-        upper=proportions.proportion_upper(n - failures, n, confidences[1]),
+        lower=proportions.proportion_lower(successes[0], n, confidences[0]),
+        upper=proportions.proportion_upper(successes[1], n, confidences[1]),
         bounds_confidence=confidences[0],
         upper_confidence=confidences[1],
-        consumer_risk=proportions.consumer_risk(n - failures, n, verdict.probability),
+        consumer_risk=proportions.consumer_risk(successes[0], n, verdict.probability),
+        further_cases=further,
     )

@@ -20,7 +20,7 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.stored import table
+from marsyard.reports.stored import read_study, table
 from marsyard.reports.wording import count, format_fraction, label, number
 from marsyard.scenarios.columns import split_unit
 
@@ -37,19 +37,13 @@ def signed_percent(fraction: float) -> str:
     return f"{100.0 * fraction:z.1f} %".replace("-", "−")
 
 
-def read_budget(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of an error budget with its `result`; empty for another run or an unfinished study."""
-    study = table(record.get("study"))
-    return study if study.get("kind") == "budget" and table(study.get("result")) else {}
-
-
 def budget_sentences(study: Mapping[str, Any]) -> list[str]:
     """Describe total, largest contributions and additivity of an error budget; empty without a result."""
     if not study:
         return []
-    result = table(study.get("result"))
+    result = study["result"]
     sentences: list[str] = []
-    budget = table(result.get("budget"))
+    budget = table(result["budget"])
     if budget:
         total = budget["total"]
         largest = ", ".join(
@@ -96,12 +90,12 @@ def _closure_sentence(budget: Mapping[str, Any], confidence: float) -> str:
 
 def budget_section(subject: Subject) -> Section | None:
     """Create the section of an error budget; None for another run."""
-    study = read_budget(subject.run.record)
+    study = read_study(subject.run.record, "budget")
     if not study:
         return None
-    result = table(study.get("result"))
+    result = study["result"]
     blocks: list[Block] = []
-    budget = table(result.get("budget"))
+    budget = table(result["budget"])
     if budget:
         blocks.append(_budget_block(result, budget, float(study["confidence"])))
     if result["indices"]:

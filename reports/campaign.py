@@ -24,19 +24,19 @@ from marsyard.campaigns.store.key import sign
 from marsyard.campaigns.store.lock import replace_file
 from marsyard.reports import common_sections, explorer, sections
 from marsyard.reports.boundary import boundary_section
-from marsyard.reports.budget import budget_section, budget_sentences, read_budget
+from marsyard.reports.budget import budget_section, budget_sentences
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
-from marsyard.reports.evaluation import Evaluation, OverallVerdict, evaluate_run
-from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.evaluation import Evaluation, evaluate_run
+from marsyard.reports.overall import OverallVerdict, multiplicity_text
 from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
-from marsyard.reports.rare import rare_section, read_result, result_sentences
+from marsyard.reports.rare import rare_section, rare_sentences
 from marsyard.reports.record import SCHEMA, CampaignReport, StudySummary
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.search import read_search, search_section, search_sentences
+from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
-from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, table
+from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_study, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
@@ -229,9 +229,9 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
 def study_sentences(record: Mapping[str, Any]) -> list[str]:
     """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
     return [
-        *result_sentences(read_result(record)),
-        *search_sentences(read_search(record)),
-        *budget_sentences(read_budget(record)),
+        *rare_sentences(read_study(record, "rare")),
+        *search_sentences(read_study(record, "search")),
+        *budget_sentences(read_study(record, "budget")),
     ]
 
 

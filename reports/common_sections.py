@@ -82,8 +82,7 @@ def answers_section(subject: Subject) -> Section | None:
         },
     )
     note = note_text("common.answers")
-    data = {name: asdict(fraction) for name, fraction in fractions.items()}
-    return Section("answers", "Answers", "Availability and wrong answers", [Block(grid=grid, note=note)], data)
+    return Section("answers", "Answers", "Availability and wrong answers", [Block(grid=grid, note=note)], fractions)
 
 
 def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
@@ -150,9 +149,10 @@ def scatter_section(subject: Subject) -> Section | None:
         ["Fraction of errors", f"Radius ({unit})", f"Lower and upper bound ({format_fraction(CONFIDENCE)} each)"], rows
     )
     note = note_text("common.scatter")
-    data = {"ellipse": asdict(ellipse), "circles": [asdict(circle) for circle in circles]}
     block = Block(text=text, grid=grid, note=note)
-    return Section("scatter", "Scatter", "Error ellipse and circular errors", [block], data)
+    return Section(
+        "scatter", "Scatter", "Error ellipse and circular errors", [block], {"ellipse": ellipse, "circles": circles}
+    )
 
 
 #: Maximum number of ranked conditions, and of cases that are used for the ranking.
@@ -239,11 +239,11 @@ def convergence_section(subject: Subject) -> Section | None:
         )
         for index, (name, rate, points) in enumerate(curves)
     ]
-    data = {name: [asdict(point) for point in points] for name, _, points in curves}
+    data = {name: points for name, _, points in curves}
     for key, (name, axis, points) in error_curves(frame, subject.metric).items():
         bound = subject.bound if key == "quantile" else None
         svg_figures.append(svg_figure(curve_figure(points, axis, bound), f"converge-{key}", f"{name} and its bounds."))
-        data[f"{subject.metric}: {name}"] = [asdict(point) for point in points]
+        data[f"{subject.metric}: {name}"] = points
     if not svg_figures:
         return None
     note = note_text("common.convergence")
@@ -328,26 +328,23 @@ def curve_figure(points: Sequence[Point], name: str, required: float | None) -> 
     return figure
 
 
-#: Column of the normalised estimation error squared (NEES), and its degrees of freedom.
-NEES, NEES_DIMENSION = "velocity_nees", 2
+#: Columns of normalised estimation errors squared (NEES), and their degrees of freedom.
+NEES, NEES_DIMENSION = ("velocity_nees", "position_nees"), 2
 #: Probability of the band of the mean NEES, and of the error ellipse.
 BAND_PROBABILITY = 0.95
 
 
-def evaluate_consistency(
-    nees: Float[np.ndarray, " n"], dimension: int = NEES_DIMENSION, probability: float = BAND_PROBABILITY
-) -> dict[str, Any]:
+def evaluate_consistency(nees: Float[np.ndarray, " n"]) -> dict[str, Any]:
     """Evaluate from the NEES of estimates whether their errors agree with their covariances.
 
     Keys: mean NEES with its band for correct covariances, fraction of errors `inside` their ellipse with its 90 %
-    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic". Band and
-    ellipse have the given probability.
+    interval, and `word`: "consistent", "optimistic" (errors larger than the covariances) or "pessimistic".
     """
     n, mean = nees.size, float(nees.mean())
-    tail = 0.5 * (1.0 - probability)
+    tail = 0.5 * (1.0 - BAND_PROBABILITY)
     # for correct covariances, the sum of n NEES has a chi-square distribution with n * dimension degrees of freedom
-    lower, upper = (float(stats.chi2.ppf(level, dimension * n)) / n for level in (tail, 1.0 - tail))
-    inside = int((nees <= stats.chi2.ppf(probability, dimension)).sum())
+    lower, upper = (float(stats.chi2.ppf(level, NEES_DIMENSION * n)) / n for level in (tail, 1.0 - tail))
+    inside = int((nees <= stats.chi2.ppf(BAND_PROBABILITY, NEES_DIMENSION)).sum())
     low, high = proportion_interval(inside, n, CONFIDENCE)
     word = "optimistic" if mean > upper else "pessimistic" if mean < lower else "consistent"
     band = {"n": n, "mean": mean, "lower": lower, "upper": upper}
@@ -358,9 +355,8 @@ def evaluate_consistencies(frame: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """Evaluate the consistency of all algorithms with covariances in the rows, by name."""
     tested_name = str(frame["algorithm"].iloc[0]) if "algorithm" in frame and len(frame) else "tested"
     frames = {tested_name: frame, **{name: select_algorithm(frame, name) for name in list_compared_algorithms(frame)}}
-    by_name = {name: numbers(rows, NEES) for name, rows in frames.items() if NEES in rows}
-    finite = {name: nees[np.isfinite(nees)] for name, nees in by_name.items()}
-    return {name: evaluate_consistency(nees) for name, nees in finite.items() if nees.size}
+    values = {name: [rates.finite_values(rows, column) for column in NEES] for name, rows in frames.items()}
+    return {name: evaluate_consistency(nees) for name, columns in values.items() for nees in columns if nees.size}
 
 
 def consistency_section(subject: Subject) -> Section | None:

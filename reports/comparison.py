@@ -11,20 +11,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.campaign import leaves
 from marsyard.reports import rates
+from marsyard.reports.decision import requirement_masks
 from marsyard.reports.rates import CONFIDENCE, success_mask
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
 from marsyard.reports.statistics.changes import (
+    Metric,
     Sample,
     compare_errors,
     compare_successes,
@@ -173,11 +174,7 @@ def comparison_section(subject: Subject) -> Section | None:
     blocks = [Block(grid=grids[0])]
     if differences:
         blocks.append(Block(heading=f"Against {tested_name}", grid=grids[1], note=note))
-    data = {
-        "algorithms": [asdict(result) for result in results],
-        "against": tested_name,
-        "differences": [asdict(difference) for difference in differences],
-    }
+    data = {"algorithms": results, "against": tested_name, "differences": differences}
     return Section("algorithms", "Algorithms", "Algorithms on the same cases", blocks, data)
 
 
@@ -210,40 +207,14 @@ def comparison_grids(
     return first, Grid([*head, f"Difference{unit}", "p (error)"], rows)
 
 
-@dataclass(frozen=True)
-class Metric:
-    """One metric of a campaign, with a value for each case.
-
-    - larger_is_better: whether the metric is a success rate, not an error
-    - values: 0 or 1 for a rate, otherwise the error's magnitude; NaN for excluded cases
-    """
-
-    name: str
-    larger_is_better: bool
-    values: Float[np.ndarray, " n"]
-
-    @property
-    def text(self) -> str:
-        """The rate with its number of cases, or median and 95 % quantile."""
-        values = self.finite_values
-        if values.size == 0:
-            return NOTHING
-        if self.larger_is_better:
-            return f"{percent(self.summary_value)} of {values.size:,}"
-        return f"{number(self.summary_value)}, 95 % {number(float(np.quantile(values, 0.95)))}"
-
-    @property
-    def finite_values(self) -> Float[np.ndarray, " finite"]:
-        """Values of the cases that are not excluded."""
-        return np.asarray(self.values[np.isfinite(self.values)])
-
-    @property
-    def summary_value(self) -> float:
-        """The rate, or the median; NaN for no cases."""
-        values = self.finite_values
-        if values.size == 0:
-            return math.nan
-        return float(values.mean() if self.larger_is_better else np.median(values))
+def metric_text(metric: Metric) -> str:
+    """Format the rate with its number of cases, or median and 95 % quantile."""
+    values = metric.finite_values
+    if values.size == 0:
+        return NOTHING
+    if metric.is_rate:
+        return f"{percent(metric.summary)} of {values.size:,}"
+    return f"{number(metric.summary)}, 95 % {number(float(np.quantile(values, 0.95)))}"
 
 
 @dataclass(frozen=True)
@@ -263,30 +234,27 @@ def list_metrics(run: StoredRun) -> tuple[pd.DataFrame, list[Metric]]:
     """
     frame = read_sampling_design(run.configuration).exclude_nominal_case(run.frame)
     metrics: dict[str, Metric] = {}
+    terrains = number_stored_terrains(frame)
+
+    def add_metric(name: str, values: Float[np.ndarray, " n"], title: str = "", *, is_rate: bool = True) -> None:
+        metrics[name] = Metric(title or name, is_rate, Sample(values, terrains))
+
     error_columns = dict.fromkeys([primary_metric(frame, run.requirements)])
     for requirement in run.requirements:
         name, metric = str(requirement.get("id", "?")), str(requirement.get("metric", ""))
-        bound = requirement.get("bound")
-        is_bounded = isinstance(bound, int | float)
-        if metric not in frame or not (is_bounded or rates.is_flag(frame, metric)):
+        masks = requirement_masks(frame, requirement)
+        if masks is None:
             continue
-        try:
-            population = rates.population_mask(frame, str(requirement.get("population", "all")))
-        except ValueError:
-            continue
-        values = (bound, requirement.get("scale", 1))
-        limit, scale = (float(value) if isinstance(value, int | float) else math.nan for value in values)
-        success = success_mask(frame, metric, limit, scale)
-        metrics[name] = Metric(name, True, np.where(population, success.astype(np.float64), np.nan))
-        if is_bounded:
+        member, success = masks
+        add_metric(name, np.where(member, success.astype(np.float64), np.nan))
+        if metric in frame and isinstance(requirement.get("bound"), int | float):
             error_columns[metric] = None
     for column in filter(None, error_columns):
         magnitude = np.abs(numbers(frame, column))
-        metrics[column] = Metric(label(column), False, np.where(np.isfinite(magnitude), magnitude, np.nan))
+        add_metric(column, np.where(np.isfinite(magnitude), magnitude, np.nan), label(column), is_rate=False)
     if rates.is_flag(frame, "answered"):
-        metrics["answered"] = Metric("answered", True, rates.population_mask(frame, "valid").astype(np.float64))
-    completion = rates.population_mask(frame, "completed").astype(np.float64)
-    metrics["came to an end"] = Metric("came to an end", True, completion)
+        add_metric("answered", rates.population_mask(frame, "valid").astype(np.float64))
+    add_metric("came to an end", rates.population_mask(frame, "completed").astype(np.float64))
     return frame, list(metrics.values())
 
 
@@ -296,11 +264,14 @@ def compare_campaigns(first: StoredRun, second: StoredRun) -> tuple[bool, list[M
     are_paired = have_same_draws(first, second)
     second_metrics = {metric.name: metric for metric in metrics[1]}
     metric_pairs = [(metric, second_metrics[metric.name]) for metric in metrics[0] if metric.name in second_metrics]
-    compute_p_value = (
-        _paired_p_value if are_paired else partial(_unpaired_p_value, share_terrains=have_same_terrains(first, second))
-    )
+    share_terrains = have_same_terrains(first, second)
     p_values = correct_holm(
-        [compute_p_value(frames[0], metric, frames[1], other_metric) for metric, other_metric in metric_pairs]
+        [
+            _paired_p_value(frames[0], pair[0], frames[1], pair[1])
+            if are_paired
+            else _unpaired_p_value(*pair, share_terrains)
+            for pair in metric_pairs
+        ]
     )
     comparisons = [
         MetricComparison(pair[0].name, *pair, p_value) for pair, p_value in zip(metric_pairs, p_values, strict=True)
@@ -333,15 +304,17 @@ def have_same_terrains(first: StoredRun, second: StoredRun) -> bool:
 def campaign_diff_grid(names: Sequence[str], comparisons: Sequence[MetricComparison]) -> Grid:
     """Create a table with the metrics of both campaigns."""
     head = ["", *names, "p"]
-    return Grid(head, [[row.name, row.first.text, row.second.text, p_text(row.p_value)] for row in comparisons])
+    return Grid(
+        head, [[row.name, metric_text(row.first), metric_text(row.second), p_text(row.p_value)] for row in comparisons]
+    )
 
 
 def campaign_diff_data(comparisons: Sequence[MetricComparison]) -> list[dict[str, Any]]:
     """Convert the comparisons to JSON data: rate or median of each campaign with its cases; None for NaN."""
 
     def summarize(metric: Metric) -> dict[str, Any]:
-        key, cases = "rate" if metric.larger_is_better else "median", metric.finite_values.size
-        return {key: metric.summary_value if cases else None, "cases": cases}
+        key, cases = "rate" if metric.is_rate else "median", metric.finite_values.size
+        return {key: metric.summary if cases else None, "cases": cases}
 
     return [
         {"name": row.name, "first": summarize(row.first), "second": summarize(row.second)}
@@ -350,21 +323,18 @@ def campaign_diff_data(comparisons: Sequence[MetricComparison]) -> list[dict[str
     ]
 
 
-def build_sample(frame: pd.DataFrame, metric: Metric) -> Sample:
-    """Create a sample of a metric with the stored terrain numbers, which are comparable between campaigns."""
+def number_stored_terrains(frame: pd.DataFrame) -> Int[np.ndarray, " n"]:
+    """Return the stored terrain numbers of cases, which are comparable between campaigns."""
     groups = rates.terrain_groups(frame)
     if groups is None:
-        return Sample(metric.values, np.zeros(metric.values.size, dtype=np.int64))
+        return np.zeros(len(frame), dtype=np.int64)
     terrains = pd.to_numeric(frame["terrain"], errors="coerce").to_numpy(dtype=np.float64, na_value=np.nan)
     # negative numbers: one for each case of unknown terrain, and one for each terrain without a number
-    is_unknown = ~np.isfinite(terrains)
-    return Sample(metric.values, np.where(is_unknown, -1.0 - groups, np.nan_to_num(terrains)).astype(np.int64))
+    return np.where(np.isfinite(terrains), np.nan_to_num(terrains), -1.0 - groups).astype(np.int64)
 
 
-def _unpaired_p_value(
-    first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric, *, share_terrains: bool
-) -> float:
-    first_sample, second_sample = build_sample(first, first_metric), build_sample(second, second_metric)
+def _unpaired_p_value(first: Metric, second: Metric, share_terrains: bool) -> float:
+    first_sample, second_sample = first.sample, second.sample
     if not share_terrains:  # equal numbers are different terrains: shift the second numbers above the first
         if not first_sample.terrains.size or not second_sample.terrains.size:
             return math.nan
@@ -375,12 +345,12 @@ def _unpaired_p_value(
 
 def _paired_p_value(first: pd.DataFrame, first_metric: Metric, second: pd.DataFrame, second_metric: Metric) -> float:
     _, first_index, second_index = np.intersect1d(first["case"], second["case"], return_indices=True)
-    first_values, second_values = first_metric.values[first_index], second_metric.values[second_index]
+    first_values, second_values = first_metric.sample.values[first_index], second_metric.sample.values[second_index]
     finite = np.isfinite(first_values) & np.isfinite(second_values)
     if not finite.any():
         return math.nan
     groups = rates.terrain_groups(first)
     finite_groups = None if groups is None else groups[first_index][finite]
-    if first_metric.larger_is_better:  # a rate has the values 0 and 1
+    if first_metric.is_rate:
         return compare_successes(first_values[finite] > 0.5, second_values[finite] > 0.5, finite_groups)[2]
     return symmetry_p_value(second_values[finite] - first_values[finite], finite_groups)

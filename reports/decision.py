@@ -81,6 +81,18 @@ def _evaluate_all_cases(
     )
 
 
+def requirement_masks(frame: pd.DataFrame, requirement: Mapping[str, Any]) -> tuple[Mask, Mask] | None:
+    """Return the population of a requirement, and the cases that meet it; None if the rows lack its columns."""
+    verdict = _empty_verdict(requirement)
+    if _describe_missing_column(frame, verdict):
+        return None
+    try:
+        member = rates.population_mask(frame, verdict.population)
+    except ValueError:
+        return None
+    return member, rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale)
+
+
 def collect_evidence(
     frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, *, has_own_terrains: bool
 ) -> RequirementEvidence | None:
@@ -168,7 +180,7 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
     `valid` and `completed` exclude unfinished cases. Without this check, crashes instead of wrong answers could lead to
     PASS.
     """
-    if verdict.status in (Status.FAIL, Status.INSUFFICIENT, with_unfinished.status):
+    if not verdict.status.is_met or verdict.status is with_unfinished.status:
         return verdict
     n_unfinished = with_unfinished.n - verdict.n
     reason = (
@@ -176,7 +188,7 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
         f"population of answers. If they are counted as failures, the verdict is not {verdict.status}. It is therefore "
         "withheld."
     )
-    return replace(verdict, status=Status.INSUFFICIENT, reason=reason)
+    return verdict.withhold(reason)
 
 
 def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
@@ -235,6 +247,11 @@ def _describe_problem(frame: pd.DataFrame, verdict: Verdict) -> str:
         value = getattr(verdict, name)
         if not 0.0 < value < 1.0:
             return f"The requirement's {name} is {value}; it must lie between 0 and 1, both excluded."
+    return _describe_missing_column(frame, verdict)
+
+
+def _describe_missing_column(frame: pd.DataFrame, verdict: Verdict) -> str:
+    """Describe which column of the requirement's metric is missing or unsuitable; empty if there is none."""
     missing_column = next((part for part in verdict.metric.split(" + ") if part not in frame), None)
     if missing_column is not None:
         return f"The rows have no column '{missing_column}', which is the requirement's metric."

@@ -7,7 +7,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import takewhile
 from pathlib import Path
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.statistics.changes import Sample, correct_holm, difference_p_value
+from marsyard.reports.statistics.changes import Metric, Sample, correct_holm, difference_p_value
 from marsyard.reports.wording import count, format_fraction, number, percent
 
 #: Version of the tables, as `PRAGMA user_version`.
@@ -40,16 +40,6 @@ class NightCampaign:
     verdict: str
     exit_code: int
     sentence: str
-
-
-@dataclass(frozen=True)
-class NightMetric:
-    """One metric of a campaign in a night; `value`: rate or median error; `sample`: values of the cases."""
-
-    name: str
-    is_rate: bool
-    value: float
-    sample: Sample
 
 
 @dataclass(frozen=True)
@@ -103,13 +93,13 @@ class History:
             )
         return int(row[0])
 
-    def add(self, night: int, campaign: NightCampaign, metrics: Sequence[NightMetric]) -> None:
+    def add(self, night: int, campaign: NightCampaign, metrics: Sequence[Metric]) -> None:
         """Store the result of a campaign in a night."""
         rows, identity = [], (campaign.name, campaign.definition, campaign.directory)
         for metric in metrics:
             values, terrains = metric.sample.values[:MAX_CASES], metric.sample.terrains[:MAX_CASES]
             blobs = values.astype("<f4").tobytes(), terrains.astype("<i8").tobytes()
-            rows.append((night, campaign.name, metric.name, metric.is_rate, metric.value, *blobs))
+            rows.append((night, campaign.name, metric.name, metric.is_rate, metric.summary, *blobs))
         with self._transaction():
             self._connection.execute(
                 "INSERT INTO campaigns VALUES (?, ?, ?, ?, ?, ?, ?)",
@@ -117,11 +107,12 @@ class History:
             )
             self._connection.executemany("INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
-    def finish(self, night: int, state: str, changes: Sequence[tuple[str, str, float, bool]] = ()) -> None:
-        """End a night with its changes: campaign, metric, corrected p-value, whether it is a regression."""
+    def finish(self, night: int, state: str, changes: Sequence[Change] = ()) -> None:
+        """End a night with its changes."""
         with self._transaction():
             self._connection.executemany(
-                "INSERT INTO changes VALUES (?, ?, ?, ?, ?)", [(night, *change) for change in changes]
+                "INSERT INTO changes VALUES (?, ?, ?, ?, ?)",
+                [(night, item.campaign, item.metric, item.p_value, item.is_regression) for item in changes],
             )
             self._connection.execute(
                 "UPDATE nights SET state = ?, finished_utc = ? WHERE night = ?", (state, utc_now(), night)
@@ -140,17 +131,13 @@ class History:
         )
         return [NightCampaign(*row) for row in rows]
 
-    def metrics(self, night: int, campaign: str) -> list[NightMetric]:
+    def metrics(self, night: int, campaign: str) -> list[Metric]:
         """List the metrics of a campaign in a night."""
         rows = self._connection.execute(
-            "SELECT figure, rate, level, amounts, terrains FROM figures WHERE night = ? AND campaign = ? "
-            "ORDER BY rowid",
+            "SELECT figure, rate, amounts, terrains FROM figures WHERE night = ? AND campaign = ? ORDER BY rowid",
             (night, campaign),
         )
-        return [
-            NightMetric(name, bool(is_rate), float("nan") if value is None else value, _unpack(values, terrains))
-            for name, is_rate, value, values, terrains in rows
-        ]
+        return [Metric(name, bool(is_rate), _unpack(*stored)) for name, is_rate, *stored in rows]
 
     def earlier_samples(self, night: int, campaign: NightCampaign, metric: str) -> list[Sample]:
         """Read the samples of a metric in earlier finished nights since its last change, the latest first."""
@@ -230,7 +217,7 @@ class Comparison:
     """A metric of one night, and its samples in earlier nights (`before`)."""
 
     campaign: str
-    metric: NightMetric
+    metric: Metric
     before: Sequence[Sample]
 
 
@@ -253,8 +240,8 @@ def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
             campaign=comparison.campaign,
             metric=comparison.metric.name,
             is_rate=comparison.metric.is_rate,
-            before=compute_summary(sample, comparison.metric.is_rate),
-            now=compute_summary(comparison.metric.sample, comparison.metric.is_rate),
+            before=replace(comparison.metric, sample=sample).summary,
+            now=comparison.metric.summary,
             p_value=p_value,
             nights=len(comparison.before),
         )
@@ -270,14 +257,6 @@ def list_comparisons(history: History, night: int) -> list[Comparison]:
         for campaign in history.campaigns(night)
         for metric in history.metrics(night, campaign.name)
     ]
-
-
-def compute_summary(sample: Sample, is_rate: bool) -> float:
-    """Compute the rate or the median; NaN for no cases."""
-    values = sample.finite_cases().values
-    if values.size == 0:
-        return math.nan
-    return float(values.mean() if is_rate else np.median(values))
 
 
 def format_night_page(

@@ -28,7 +28,7 @@ from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
 
 #: Statuses that a claim can have passed with.
-_PASSED = frozenset({Status.PASS, Status.UNREGISTERED, Status.OTHER_CLAIMS})
+_PASSED = frozenset(status for status in Status if status is Status.PASS or status.is_qualified)
 #: Maximum number of related claims that are listed in a verdict.
 _MAX_LISTED = 10
 
@@ -130,8 +130,6 @@ def read_joint_evidence(evidence: Evidence) -> JointEvidence:
     """Read what the record of confirmations contains about the claim of a run."""
     if not evidence.is_confirmation:
         return JointEvidence()
-    if not evidence.claim:
-        return JointEvidence(True, f"{UNKNOWN}: an earlier version recorded this confirmation.")
     path = Path(evidence.record)
     try:
         record = read_record(path)
@@ -165,8 +163,8 @@ def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdi
         )
         return replace(verdict, status=Status.FAIL, reason=reason, further_cases=None)
     block = joint.find_block(cases)
-    if block and verdict.status in (Status.PASS, Status.MET_BY_RATE):
-        return replace(verdict, status=Status.INSUFFICIENT, reason=block, further_cases=None)
+    if block and verdict.status.is_met:
+        return verdict.withhold(block)
     if verdict.status is not Status.PASS:
         return verdict
     if joint.registration:

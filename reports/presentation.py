@@ -45,18 +45,31 @@ class TableRow:
 
 
 @dataclass(frozen=True)
+class CaseFigure:
+    """A figure of a case: its name (that of its file without the ending), and its caption on the page.
+
+    wide: whether the figure has the full width of the page
+    """
+
+    name: str
+    figure: Figure
+    caption: str = ""
+    wide: bool = True
+
+
+@dataclass(frozen=True)
 class CaseView:
-    """View of a case on the page.
+    """View of a case: its figures, and on the page further texts.
 
     - facts: names and values
     - head, rows: headings and rows of the case's table
     - legend: text that explains the figures; None for the legend of the `CaseKind`
     """
 
-    facts: Sequence[tuple[str, str]]
-    figures: Sequence[SvgFigure]
-    head: Sequence[str]
-    rows: Sequence[TableRow]
+    figures: Sequence[CaseFigure]
+    facts: Sequence[tuple[str, str]] = ()
+    head: Sequence[str] = ()
+    rows: Sequence[TableRow] = ()
     legend: str | None = None
 
 
@@ -65,15 +78,13 @@ class CaseKind:
     """Functions that draw the cases of one kind (landings, for example) from their products.
 
     - is_case: return whether the products are those of this kind of case
-    - view: create the view for the page; the text argument prefixes the identifiers of figures
-    - write: write the figures into a folder and return the paths; raises OSError if they cannot be written
+    - view: create the view; the second argument is true for files, which contain all figures, and false for the page
     - legend: text that explains the figures of a view
     """
 
     is_case: Callable[[Products], bool]
-    view: Callable[[Products, str], CaseView]
-    write: Callable[[Path, Products], list[Path]]
-    legend: str
+    view: Callable[[Products, bool], CaseView]
+    legend: str = ""
 
 
 @dataclass(frozen=True)
@@ -177,14 +188,6 @@ def _is_image(value: np.ndarray) -> bool:
     return value.ndim == 2 and np.issubdtype(value.dtype, np.integer) and min(value.shape) >= _MIN_IMAGE_PX
 
 
-def save_figures(directory: Path, figures: Mapping[str, Figure], dpi: int = 110) -> list[Path]:
-    """Write figures as PNG on white; returns their paths."""
-    paths = [directory / f"{name}.png" for name in figures]
-    for path, figure in zip(paths, figures.values(), strict=True):
-        figure.savefig(path, dpi=dpi, facecolor="#ffffff", metadata={"Software": None})
-    return paths
-
-
 def numeric_product(value: object) -> Float[np.ndarray, "..."] | None:
     """Convert a product to float64; None if it is not numeric."""
     if value is None:
@@ -211,24 +214,31 @@ def to_matrix(value: object) -> Float[np.ndarray, "_ _"] | None:
     return values if values is not None and values.ndim == 2 and values.size else None
 
 
+#: Shape of a product: lengths, names of lengths that are equal in products read together, and None for any length.
+Shape = tuple[int | str | None, ...]
+
+
 def check_shape(value: object, *shape: int | None) -> Float[np.ndarray, "..."] | None:
     """Convert a product to an array of a shape, where None is any length; None if it has another shape."""
-    values = numeric_product(value)
-    if values is None or values.ndim != len(shape):
-        return None
-    is_valid = all(
-        required_length in (None, length) for required_length, length in zip(shape, values.shape, strict=True)
-    )
-    return values if is_valid else None
+    arrays = read_arrays({"value": value}, {"value": shape})
+    return None if arrays is None else arrays[0]
 
 
 def read_arrays(
-    products: Products, shapes: Mapping[str, tuple[int | None, ...]], *, finite: bool = False
+    products: Products, shapes: Mapping[str, Shape], *, finite: bool = False
 ) -> list[Float[np.ndarray, "..."]] | None:
     """Read products by name and shape; None if a product is missing, invalid, or not finite if `finite` is set."""
-    arrays = [check_shape(products.get(name), *shape) for name, shape in shapes.items()]
-    valid_arrays = [array for array in arrays if array is not None and (not finite or np.isfinite(array).all())]
-    return valid_arrays if len(valid_arrays) == len(shapes) else None
+    arrays, lengths = [], dict[str, int]()
+    for name, shape in shapes.items():
+        values = numeric_product(products.get(name))
+        if values is None or values.ndim != len(shape) or (finite and not np.isfinite(values).all()):
+            return None
+        for required, length in zip(shape, values.shape, strict=True):
+            expected = lengths.setdefault(required, length) if isinstance(required, str) else required
+            if expected not in (None, length):
+                return None
+        arrays.append(values)
+    return arrays
 
 
 #: Number of selected cases of each group (largest errors, no answer, random); a case has half a megabyte of images.
@@ -241,14 +251,16 @@ _GALLERY_SEED, _NOTABLE_SEED = 20260301, 20260302
 
 @dataclass(frozen=True)
 class ShowcaseView:
-    """A stored case with its outcome, its view and its legend."""
+    """A stored case with its outcome, its view, and the figures of the view for the page."""
 
     case: int
     outcome: str
     view: CaseView
-    legend: str
+    figures: Sequence[SvgFigure]
 
 
+#: Resolution of figures in files.
+_FILE_DPI = 130
 #: Caption of the perspective view of a case with a timeline.
 _SPACE_CAPTION = (
     "The case in space: visible ground, true and estimated path, and the cameras at the times of images. "
@@ -308,28 +320,36 @@ def _select_cases(first: list[int], *groups: list[int]) -> list[int]:
     return cases
 
 
+def create_case_view(products: Products, *, complete: bool) -> CaseView:
+    """Create the view of a case, without figures if no system recognizes its products.
+
+    complete: whether the view is for files, which contain all figures
+    """
+    kind, timeline = find_case_kind(products), Timeline.from_products(products)
+    view = CaseView([]) if kind is None else kind.view(products, complete)
+    space = [] if timeline is None else [CaseFigure("space", draw_timeline(timeline), _SPACE_CAPTION, wide=False)]
+    legend = kind.legend if kind is not None and view.legend is None else view.legend
+    return replace(view, figures=[*view.figures, *space], legend=legend)
+
+
 def showcase_view(run: StoredRun, case: int) -> ShowcaseView | None:
-    """Create the view of a stored case; None if no system recognizes its products."""
-    products = run.products(case)
-    kind = find_case_kind(products)
-    if kind is None:
+    """Create the view of a stored case; None if it has no figure."""
+    view = create_case_view(run.products(case), complete=False)
+    if not view.figures:
         return None
-    view = kind.view(products, f"case{case}")
-    timeline = Timeline.from_products(products)
-    if timeline is not None:
-        figure = svg_figure(draw_timeline(timeline), f"case{case}space", _SPACE_CAPTION)
-        view = replace(view, figures=[*view.figures, figure])
+    figures = [svg_figure(item.figure, f"case{case}{item.name}", item.caption, wide=item.wide) for item in view.figures]
     rows = run.all_cases
     outcomes = rows.loc[rows["case"] == case, "outcome"] if {"case", "outcome"} <= {*rows} else pd.Series(dtype=object)
-    outcome = str(outcomes.iloc[0]) if len(outcomes) else NOTHING
-    return ShowcaseView(case, outcome, view, kind.legend if view.legend is None else view.legend)
+    return ShowcaseView(case, str(outcomes.iloc[0]) if len(outcomes) else NOTHING, view, figures)
 
 
-def write_case_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write a case's figures into a folder; returns their paths, or no path if no system recognizes the products.
+def write_case_figures(directory: Path, products: Products) -> list[Path]:
+    """Write a case's figures as PNG on white into a folder; returns their paths.
 
     Raises OSError if they cannot be written.
     """
-    kind, timeline = find_case_kind(products), Timeline.from_products(products)
-    paths = [] if kind is None else kind.write(directory, products)
-    return paths if timeline is None else [*paths, *save_figures(directory, {"space": draw_timeline(timeline)})]
+    view = create_case_view(products, complete=True)
+    figures = {directory / f"{item.name}.png": item.figure for item in view.figures}
+    for path, figure in figures.items():
+        figure.savefig(path, dpi=_FILE_DPI, facecolor="#ffffff", metadata={"Software": None})
+    return [*figures]

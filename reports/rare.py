@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -22,26 +21,11 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.stored import read_run, table
+from marsyard.reports.stored import read_study, table
 from marsyard.reports.wording import count, format_fraction
 
 #: Maximum number of replicates in the figure.
 _MAX_REPLICATES = 8
-
-
-def read_result(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of a study of rare violations with its `result`; empty for another or an unfinished study.
-
-    It is also empty for a study that an earlier version evaluated, without a counting bound.
-    """
-    study = table(record.get("study"))
-    return study if study.get("kind") == "rare" and table(table(study.get("result")).get("decision")) else {}
-
-
-def describe_result(directory: Path) -> list[str]:
-    """Describe the result of the study in a folder, one sentence each; empty without a result."""
-    study = read_result(read_run(directory).record)
-    return result_sentences(study)
 
 
 def probability_text(value: object) -> str:
@@ -49,15 +33,15 @@ def probability_text(value: object) -> str:
     return f"{value:.2g}" if isinstance(value, int | float) and math.isfinite(value) else "–"
 
 
-def result_sentences(study: Mapping[str, Any]) -> list[str]:
+def rare_sentences(study: Mapping[str, Any]) -> list[str]:
     """Describe verdict, counting bound, estimate and cost of a study; empty without a result.
 
     The first sentence contains the verdict, the second the counting bound.
     """
     if not study:
         return []
-    result = table(study.get("result"))
-    decision = table(result.get("decision"))
+    result = study["result"]
+    decision = result["decision"]
     limit = probability_text(study["max_probability"])
     basis = {
         "counting": ", by counting independent cases",
@@ -65,7 +49,7 @@ def result_sentences(study: Mapping[str, Any]) -> list[str]:
     }.get(str(decision["basis"]), "")
     return [
         f"{study['requirement']}: {result['verdict']}{basis}.",
-        f"{_counting_sentence(table(decision['counting']))} The limit is {limit}.",
+        f"{_counting_sentence(decision['counting'])} The limit is {limit}.",
         _estimate_sentence(study, decision),
         *filter(None, [str(decision["reason"]), *_remedies(study, decision)]),
         f"The study ran {count(int(result['cases']), 'case')}; {int(result['violations']):,} of them violate the "
@@ -91,7 +75,7 @@ def _counting_sentence(counting: Mapping[str, Any]) -> str:
 
 def _estimate_sentence(study: Mapping[str, Any], decision: Mapping[str, Any]) -> str:
     """Describe the estimate of the simulations."""
-    interval = table(decision["interval"])
+    interval = decision["interval"]
     method = "Subset simulation" if study["method"] == "subset" else "Importance sampling"
     if interval["estimate"] is None:
         return f"{method} has no estimate."
@@ -108,7 +92,7 @@ def _remedies(study: Mapping[str, Any], decision: Mapping[str, Any]) -> list[str
     random_cases, replicates = decision["additional_random_cases"], decision["additional_replicates"]
     sentences = []
     if random_cases:
-        counting = table(decision["counting"])
+        counting = decision["counting"]
         unit = "random cases" if counting["units"] == counting["cases"] else "random cases, each on a new terrain,"
         sentences.append(
             f"PASS needs {random_cases:,} additional {unit} without a violation: "
@@ -124,10 +108,10 @@ def _remedies(study: Mapping[str, Any], decision: Mapping[str, Any]) -> list[str
 
 def rare_section(subject: Subject) -> Section | None:
     """Create the section of a study of rare violations; None for another run."""
-    study = read_result(subject.run.record)
+    study = read_study(subject.run.record, "rare")
     if not study:
         return None
-    result = table(study.get("result"))
+    result = study["result"]
     replicates = result["replicates"]
     rows = [
         [
@@ -148,7 +132,7 @@ def rare_section(subject: Subject) -> Section | None:
             else "The interval contains those of importance sampling around the violations, and of the replicates."
         )
         + " Without an end at violations, the probability is that of the last level."
-        + _continuity_note(table(table(result["decision"]).get("continuity")))
+        + _continuity_note(table(result["decision"]["continuity"]))
     )
     figure = svg_figure(
         _draw_levels(replicates, float(study["max_probability"])),

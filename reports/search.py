@@ -9,24 +9,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.reports.section import Block, Grid, Section, Subject
-from marsyard.reports.stored import table
+from marsyard.reports.stored import read_study
 from marsyard.reports.wording import NOTHING, count, number
-
-
-def read_search(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the settings of a search with its `result`; empty for a run that is no search, or is not finished."""
-    study = table(record.get("study"))
-    result = table(study.get("result"))
-    if study.get("kind") != "search" or not result:
-        return {}
-    return study
 
 
 def search_sentences(study: Mapping[str, Any]) -> list[str]:
     """Describe the result of a search: violations, reduced violations, and cost; empty without a result."""
     if not study:
         return []
-    result = table(study.get("result"))
+    result = study["result"]
     cases_text = count(int(result["search_cases"]), "case")
     total_text = f"{count(int(result['cases']), 'case')} in all"
     if not result["violations"]:
@@ -61,10 +52,10 @@ def value_text(value: object) -> str:
 
 def search_section(subject: Subject) -> Section | None:
     """Create the section of a search; None for a run that is no search."""
-    study = read_search(subject.run.record)
+    study = read_study(subject.run.record, "search")
     if not study:
         return None
-    result = table(study.get("result"))
+    result = study["result"]
     rows = [
         [
             str(index),

@@ -15,9 +15,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import matplotlib as mpl
 import matplotlib.style
-import numpy as np
 import pandas as pd
-from jaxtyping import Float
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -103,61 +101,11 @@ def svg_markup(figure: Figure, key: str, description: str) -> str:
     return head + content.strip()
 
 
-def show_image(axes: Axes, image: Float[np.ndarray, "_ _"]) -> None:
-    """Draw an image in grey, its contrast stretched between the 1 % and the 99 % quantile."""
-    finite = image[np.isfinite(image)]
-    low, high = np.quantile(finite, (0.01, 0.99)) if finite.size else (0.0, 1.0)
-    axes.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1e-9), interpolation="antialiased")
-    axes.set_facecolor(INK)
-    axes.autoscale(enable=False)
-    _hide_frame(axes)
-
-
-def show_subframe(axes: Axes, image: Float[np.ndarray, "_ _"], quantiles: tuple[float, float] = (0.01, 0.99)) -> None:
-    """Draw part of an image in grey, pixels not interpolated, its contrast stretched between two quantiles."""
-    finite = image[np.isfinite(image)]
-    low, high = np.quantile(finite, quantiles) if finite.size else (0.0, 1.0)
-    levels = np.clip((np.nan_to_num(image, nan=low) - low) / max(float(high - low), 1e-9), 0.0, 1.0)
-    grey = np.round(255.0 * levels).astype(np.uint8)
-    axes.imshow(np.repeat(grey[..., None], 3, axis=2), interpolation="none", aspect="equal")
-    _hide_frame(axes)
-
-
-def _hide_frame(axes: Axes) -> None:
+def hide_frame(axes: Axes) -> None:
+    """Remove ticks, grid and frame of axes."""
     axes.set(xticks=[], yticks=[])
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
-
-
-@dataclass(frozen=True)
-class MarkedImage:
-    """An image with its title, and marks at pixels (u, v), each with matplotlib's properties of a line.
-
-    Pixels of shape (n, 2) are n markers, those of shape (2, n, 2) are n segments from the first to the second pixels.
-    """
-
-    title: str
-    image: Float[np.ndarray, "_ _"]
-    marks: Sequence[tuple[Float[np.ndarray, "... 2"], Mapping[str, Any]]] = ()
-
-
-@in_page_style
-def draw_marked_images(images: Sequence[MarkedImage], size_in: tuple[float, float]) -> Figure:
-    """Draw images with their marks in a row; `size_in` is the size of the figure, inches."""
-    figure = Figure(figsize=size_in, layout="constrained")
-    for axes, item in zip(np.ravel(figure.subplots(1, len(images))), images, strict=True):
-        show_image(axes, item.image)
-        for pixels, style in item.marks:
-            axes.plot(*np.moveaxis(pixels, -1, 0), **style)
-        axes.set_title(item.title, fontsize=9)
-    return figure
-
-
-def draw_images(images: Sequence[Float[np.ndarray, "_ _"]]) -> Figure:
-    """Draw numbered images in a row, for a case without details of the algorithm."""
-    rows, columns = images[0].shape
-    numbered = [MarkedImage(f"Image {number}", image) for number, image in enumerate(images, start=1)]
-    return draw_marked_images(numbered, (12.0, 12.0 / len(images) * rows / columns + 0.35))
 
 
 T = TypeVar("T")
@@ -221,7 +169,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class Block:
-    """A block of a section: heading, text, figures, table, note, and its numbers in `report.json`; all are optional."""
+    """A block of a section: heading, text, figures, table, note, and its numbers in `report.json`; all are optional.
+
+    The numbers may contain dataclasses, which become tables of `report.json`.
+    """
 
     heading: str = ""
     text: str = ""

@@ -264,7 +264,7 @@ def replay_command(run: StoredRun, case: str) -> str:
 def rerun_commands(run: StoredRun) -> list[str]:
     """Return shell commands that run the campaign again in a new folder, with a command for each appended block.
 
-    Records of earlier versions do not contain the original command, so it is built from name, cases and seed.
+    A campaign that Python code ran has no command; it is built from name, cases and seed.
     """
     if run.command is None:
         words = ["marsyard", "run", run.name]

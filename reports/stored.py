@@ -67,12 +67,7 @@ class StoredRun:
     @property
     def requirements(self) -> list[Mapping[str, Any]]:
         """The requirements of the campaign."""
-        stored_requirements = self.recorded("requirements")
-        return (
-            [item for item in stored_requirements if isinstance(item, Mapping)]
-            if isinstance(stored_requirements, list | tuple)
-            else []
-        )
+        return _read_requirements(self.record)
 
     @property
     def dispersed_paths(self) -> tuple[str, ...]:
@@ -172,12 +167,7 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         frame = _sort_rows(pd.read_parquet(path))
         return frame, frame
     first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
-    requirement_list = record.get("requirements")
-    requirements = (
-        [requirement for requirement in requirement_list if isinstance(requirement, Mapping)]
-        if isinstance(requirement_list, list)
-        else []
-    )
+    requirements = _read_requirements(record)
     # columns of all cases that verdicts, outcomes and figures use
     columns = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
     for requirement in requirements:
@@ -190,6 +180,13 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
         columns.update([metric, *axis_columns(metric, stored_names), *drivers])
     all_cases = pd.read_parquet(path, columns=[name for name in stored_names if name in columns])
     return _sort_rows(first_rows), _sort_rows(all_cases)
+
+
+def _read_requirements(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the requirements of a record or of its configuration; empty if they are invalid."""
+    stored = record.get("requirements")
+    stored = table(record.get("configuration")).get("requirements") if stored is None else stored
+    return [item for item in stored if isinstance(item, Mapping)] if isinstance(stored, list | tuple) else []
 
 
 def _is_condition(record: Mapping[str, Any], name: str) -> bool:
@@ -214,6 +211,12 @@ def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:
     if "case" not in frame or frame["case"].is_monotonic_increasing:
         return frame
     return frame.sort_values("case", kind="stable").reset_index(drop=True)
+
+
+def read_study(record: Mapping[str, Any], kind: str) -> Mapping[str, Any]:
+    """Return the settings of a study of a kind with its `result`; empty for another run, or without a result."""
+    study = table(record.get("study"))
+    return study if study.get("kind") == kind and table(study.get("result")) else {}
 
 
 def table(value: object) -> Mapping[str, Any]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from xml.etree import ElementTree as Xml
 
-from marsyard.reports.evaluation import OverallVerdict
+from marsyard.reports.overall import OverallVerdict
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
@@ -47,7 +47,7 @@ class Algorithm:
 
 
 def read_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from a campaign's record, the algorithm under test first; old records contain only names."""
+    """Read the algorithms from a campaign's record, the algorithm under test first."""
     stored_list = record.get("algorithms")
     entries = [table(entry) for entry in stored_list] if isinstance(stored_list, list) else []
     algorithms = [
@@ -62,8 +62,6 @@ def read_algorithms(record: Mapping[str, Any]) -> list[Algorithm]:
         for entry in entries
         if entry.get("spec")
     ]
-    if not algorithms:
-        algorithms = _algorithms_from_parameters(table(table(record.get("configuration")).get("parameters")))
     return sorted(algorithms, key=lambda algorithm: not algorithm.tested)
 
 
@@ -72,19 +70,6 @@ def format_tested_algorithms(algorithms: Sequence[Algorithm]) -> str:
     return ", ".join(algorithm.title for algorithm in algorithms if algorithm.tested)
 
 
-def _algorithms_from_parameters(parameters: Mapping[str, Any]) -> list[Algorithm]:
-    """Read the algorithms from the first table of parameters, at any depth, that has the key `algorithm`."""
-    tested_name = parameters.get("algorithm")
-    if isinstance(tested_name, str) and tested_name:
-        compared_names = parameters.get("compared")
-        names = compared_names if isinstance(compared_names, list) else []
-        return [Algorithm(tested_name), *(Algorithm(str(name), tested=False) for name in names)]
-    nested_lists = (_algorithms_from_parameters(value) for value in parameters.values() if isinstance(value, Mapping))
-    return next((algorithms for algorithms in nested_lists if algorithms), [])
-
-
-#: Verdicts of requirements that are neither met nor failed at their confidence; JUnit tests with them are skipped.
-_UNDECIDED = (Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS)
 #: Characters that XML 1.0 does not allow.
 _INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -163,7 +148,7 @@ def junit_xml(
         name=_clean_xml(campaign),
         tests=str(len(verdicts) + 1),
         failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
-        skipped=str(sum(status in _UNDECIDED for status in statuses)),
+        skipped=str(sum(status not in (Status.PASS, Status.FAIL) for status in statuses)),
     )
     cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
     if cells:
@@ -182,7 +167,7 @@ def junit_xml(
         )
         if verdict.status is Status.FAIL:
             Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
-        elif verdict.status in _UNDECIDED:
+        elif verdict.status is not Status.PASS:
             Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
         Xml.SubElement(test_case, "system-out").text = _clean_xml(f"{tested_text}{verdict.statement} {message}")
     completion = Xml.SubElement(suite, "testcase", classname=_clean_xml(campaign), name="all cases end")

@@ -10,7 +10,7 @@ grids) have no bounds; requirements with `decide_by = "estimate"` can still be d
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from marsyard.reports.statistics.clusters import TerrainEvidence
@@ -24,16 +24,26 @@ ESTIMATE = "estimate"
 
 
 class Status(StrEnum):
-    """Result of the evaluation of a requirement."""
+    """Result of the evaluation of a requirement, the most severe first."""
 
-    PASS = "PASS"  # noqa: S105  (a verdict, not a password)
-    MET_BY_RATE = "MET BY RATE"
     FAIL = "FAIL"
     INSUFFICIENT = "INSUFFICIENT"
+    MET_BY_RATE = "MET BY RATE"
     #: PASS of a confirmation whose record of earlier runs is missing, broken or not registered.
     UNREGISTERED = "PASS (unregistered)"
     #: PASS of a confirmation after other claims about the same campaign without PASS.
     OTHER_CLAIMS = "PASS (other claims)"
+    PASS = "PASS"  # noqa: S105  (a verdict, not a password)
+
+    @property
+    def is_qualified(self) -> bool:
+        """Whether it is PASS that needs a decision of a person."""
+        return self in (Status.UNREGISTERED, Status.OTHER_CLAIMS)
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the requirement is met, also if only by the observed rate or with a qualification."""
+        return self not in (Status.FAIL, Status.INSUFFICIENT)
 
 
 @dataclass(frozen=True)
@@ -117,6 +127,10 @@ class Verdict:
     source: str = ""
     kind: str = ""
     scale: Number = 1.0
+
+    def withhold(self, reason: str) -> Verdict:
+        """Return the verdict INSUFFICIENT for a reason that more cases cannot change."""
+        return replace(self, status=Status.INSUFFICIENT, reason=reason, further_cases=None)
 
     @property
     def plain_status(self) -> Status | None:

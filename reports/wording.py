@@ -203,8 +203,7 @@ def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]
     """Return the page's metric: the first numeric metric of a requirement, else the first error column, else None."""
     requirement_metrics = [str(requirement.get("metric", "")) for requirement in requirements]
     error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
-    # rows of earlier versions have an empty column for a sum
-    names = [name for name in [*requirement_metrics, *error_columns] if " + " not in name]
+    names = (*requirement_metrics, *error_columns)
     return next((name for name in names if name in frame and _is_number(frame, name)), None)
 
 

@@ -10,16 +10,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.history import (
-    FINISHED,
-    Comparison,
-    History,
-    NightCampaign,
-    NightMetric,
-    find_changes,
-    list_comparisons,
-)
-from marsyard.reports.statistics.changes import Sample
+from marsyard.reports.history import FINISHED, Comparison, History, NightCampaign, find_changes, list_comparisons
+from marsyard.reports.statistics.changes import Metric, Sample
 
 #: Assignments of cases to terrains.
 KINDS = ("a bank of 12 terrains", "20 new terrains every night", "a terrain for each case")
@@ -43,7 +35,7 @@ class CampaignSimulator:
         self._bank = self._draw_terrains(12)
         self._number = 0
 
-    def draw_metrics(self, kind: str, error_factor: float = 1.0) -> list[NightMetric]:
+    def draw_metrics(self, kind: str, error_factor: float = 1.0) -> list[Metric]:
         """Draw the metrics of a campaign in the next nightly run; every error is multiplied by `error_factor`."""
         self._number += 1
         terrains, (scale_m, answer_probability) = self._draw_terrains_of_cases(kind)
@@ -54,13 +46,9 @@ class CampaignSimulator:
         is_within_bound = (is_answered & (errors < _LIMIT_M)).astype(np.float64)
         errors = np.where(is_answered, errors, np.nan)
         return [
-            NightMetric(
-                "within the bound", True, float(is_within_bound.mean()), Sample(is_within_bound, terrain_numbers)
-            ),
-            NightMetric(
-                "answered", True, float(is_answered.mean()), Sample(is_answered.astype(np.float64), terrain_numbers)
-            ),
-            NightMetric("error (m)", False, float(np.nanmedian(errors)), Sample(errors, terrain_numbers)),
+            Metric("within the bound", True, Sample(is_within_bound, terrain_numbers)),
+            Metric("answered", True, Sample(is_answered.astype(np.float64), terrain_numbers)),
+            Metric("error (m)", False, Sample(errors, terrain_numbers)),
         ]
 
     def _draw_terrains_of_cases(self, kind: str) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
@@ -88,11 +76,7 @@ def count_false_alarms(nights: int, seed: int) -> int:
             for kind in KINDS:
                 history.add(night, NightCampaign(kind, "", "", "PASS", 0, ""), simulator.draw_metrics(kind))
             changes = find_changes(list_comparisons(history, night))
-            history.finish(
-                night,
-                FINISHED,
-                [(change.campaign, change.metric, change.p_value, change.is_regression) for change in changes],
-            )
+            history.finish(night, FINISHED, changes)
             alarm_count += bool(changes)
     return alarm_count
 

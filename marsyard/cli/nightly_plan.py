@@ -26,9 +26,9 @@ from marsyard.campaigns.running.engine import ProgressObserver, run_campaign
 from marsyard.cli.options import Exit
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign import write_atomic
-from marsyard.reports.comparison import build_sample, list_metrics
+from marsyard.reports.comparison import list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.history import Change, History, NightCampaign, NightMetric, format_night_page, list_comparisons
+from marsyard.reports.history import Change, History, NightCampaign, format_night_page, list_comparisons
 from marsyard.sim.parameters import Parameters
 
 #: Files and folders in the output folder of `marsyard nightly`.
@@ -118,18 +118,13 @@ class NightlyRun:
 
 def run_scheduled_campaign(run: NightlyRun, entry: PlannedCampaign, folder: Path, observer: ProgressObserver) -> None:
     """Run a campaign, evaluate it, and store its metrics; its errors do not affect the other campaigns."""
-    night_metrics = []
     try:
         campaign = entry.load(run.plan.seed, run.number, folder)
         name = campaign.configuration.name
         directory = run.out / RUNS / f"night-{run.number:05d}-{name}"
         run_campaign(campaign, directory, run.executor, observer)
         evaluation, _ = evaluate_and_store(directory)
-        frame, metrics = list_metrics(evaluation.run)
-        night_metrics = [
-            NightMetric(metric.name, metric.larger_is_better, metric.summary_value, build_sample(frame, metric))
-            for metric in metrics
-        ]
+        _, night_metrics = list_metrics(evaluation.run)
         verdict, definition = evaluation.overall_verdict, hash_definition(campaign)
         result = NightCampaign(name, definition, directory.name, verdict.word, evaluation.exit_code, verdict.sentence)
     except Exception as error:  # a defect in one campaign must not stop the others

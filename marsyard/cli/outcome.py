@@ -39,7 +39,7 @@ from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run, next_look, record_look
-from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.proportions import minimum_sample_size, planned_looks

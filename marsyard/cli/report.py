@@ -215,8 +215,7 @@ def nightly(
             plans.publish_page(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
         changes = find_changes(list_comparisons(history, night))
-        rows = [(change.campaign, change.metric, change.p_value, change.is_regression) for change in changes]
-        history.finish(night, FINISHED, rows)
+        history.finish(night, FINISHED, changes)
         plans.publish_page(history, night, out, changes)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}
     statuses |= {int(Exit.FAILED) for change in changes if change.is_regression}

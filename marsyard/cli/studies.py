@@ -230,9 +230,8 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
     """Store files and images of the reduced violations, write the report, print the result, and exit."""
     from marsyard.campaigns.running.replay import load_stored_campaign, replay
     from marsyard.campaigns.store.products import case_directory, save_packed
-    from marsyard.campaigns.store.record import read, stored_configuration
+    from marsyard.campaigns.store.record import stored_configuration
     from marsyard.campaigns.studies.search import write_regression_campaigns
-    from marsyard.reports.search import read_search, search_sentences
 
     campaign = load_stored_campaign(directory, stored_configuration(directory))
     files = write_regression_campaigns(campaign, result, directory)
@@ -240,35 +239,30 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
         rerun = replay(directory, failure.case)
         if rerun.products is not None:
             save_packed(case_directory(directory, failure.case), rerun.products, rerun.row)
-    sentences = search_sentences(read_search(read(directory)))
-    _write_and_print(directory, [*sentences, *(f"campaign: {path}" for path in files)])
+    _write_and_print(directory, [f"campaign: {path}" for path in files])
     raise typer.Exit(result.exit_code)
 
 
 def finish_rare(directory: Path, result: RareResult) -> NoReturn:
     """Write the report of a study of rare violations, print its result, and exit with the status of its verdict."""
-    from marsyard.reports.rare import describe_result
-
-    _write_and_print(directory, describe_result(directory))
+    _write_and_print(directory)
     raise typer.Exit(result.exit_code)
 
 
 def finish_budget(directory: Path, result: BudgetResult) -> NoReturn:
     """Write the report of an error budget, print its result, and exit."""
-    from marsyard.campaigns.store.record import read
-    from marsyard.reports.budget import budget_sentences, read_budget
-
-    _write_and_print(directory, budget_sentences(read_budget(read(directory))))
+    _write_and_print(directory)
     raise typer.Exit(result.exit_code)
 
 
-def _write_and_print(directory: Path, sentences: Sequence[str]) -> None:
-    """Write the report of a study, and print sentences and the path of the report."""
+def _write_and_print(directory: Path, files: Sequence[str] = ()) -> None:
+    """Write the report of a study, and print its sentences, `files`, and the path of the report."""
     from marsyard.campaigns.errors import report_write_errors
-    from marsyard.reports.campaign import write_report
+    from marsyard.campaigns.store.record import read
+    from marsyard.reports.campaign import study_sentences, write_report
 
     with report_write_errors("the report"):
         page = write_report(directory)
     console = options.console()
-    for line in (*sentences, f"report: {page}"):
+    for line in (*study_sentences(read(directory)), *files, f"report: {page}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)

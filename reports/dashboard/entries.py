@@ -255,15 +255,9 @@ def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequir
     return sorted(rows, key=_severity)
 
 
-#: Order of the requirements by their latest verdict.
-_SEVERITY = (
-    Status.FAIL, Status.INSUFFICIENT, Status.MET_BY_RATE, Status.UNREGISTERED, Status.OTHER_CLAIMS, Status.PASS,
-)  # fmt: skip
-
-
 def _severity(row: RequirementRow) -> int:
     """Return the rank of a row by its latest verdict: failed requirements first, those without a campaign last."""
-    return len(_SEVERITY) if row.latest is None else _SEVERITY.index(row.latest.verdict.status)
+    return len(Status) if row.latest is None else [*Status].index(row.latest.verdict.status)
 
 
 def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
@@ -290,7 +284,7 @@ def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
 def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
     """Count the requirements per latest verdict; requirements without a campaign come last."""
     statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
-    counts = [(str(status), statuses.count(status)) for status in _SEVERITY if status in statuses]
+    counts = [(str(status), statuses.count(status)) for status in Status if status in statuses]
     n_missing = sum(row.latest is None for row in rows)
     return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
 

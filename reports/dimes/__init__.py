@@ -1,1 +1,1 @@
-"""Reports of DIMES: its paper's figures, the field test, and the landing that uses its answer."""
+"""Reports of DIMES: its cases, its velocity errors, and the landing that uses its answer."""

@@ -1,45 +1,40 @@
 """Figures of one DIMES case, laid out as Figs. 7 to 9 of the field test's paper (`papers/dimes-field-test.txt`).
 
-The two image pairs are drawn side by side. Top row: the images rectified to a nadir view, with search windows (blue).
-Middle row: the correlated templates and windows, which the paper does not show. Bottom row: the images as delivered,
-with templates (red) and tracked positions (green). Dashed squares mark tracks that failed a validity check.
+Top row: the images rectified to a nadir view, with search windows (blue). Middle row: the correlated templates and
+windows, which the paper does not show. Bottom row: the images as delivered, with templates (red) and tracked positions
+(green). Dashed squares mark tracks that failed a validity check.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure, FigureBase
-from matplotlib.patches import Polygon, Rectangle
+from matplotlib.figure import Figure
 from matplotlib.path import Path as Outline
 from matplotlib.transforms import Bbox
 from scipy import ndimage
 
-from marsyard.reports.presentation import numeric_product, save_figures, to_matrix
-from marsyard.reports.section import INK, draw_images, in_page_style, show_subframe
+from marsyard.reports.images import DASHED, Image, Mark, Panel, draw_images, draw_panels, square
+from marsyard.reports.presentation import Products, check_shape, numeric_product, to_matrix
 
-Image = Float[np.ndarray, "_ _"]
-#: Colours of templates, matches and search windows.
-TEMPLATE, MATCH, WINDOW = "#ff4b3e", "#35d46b", "#4aa3ff"
+#: Colours of templates, matches and search windows, and of the overlap and the zero-phase point.
+TEMPLATE, MATCH, WINDOW, HINT = "#ff4b3e", "#35d46b", "#4aa3ff", "#f2e35a"
 #: Side of a template's square on a delivered image if the products do not contain the side, pixels.
 _DEFAULT_SIDE_PX = 15.0
 _PAIRS = (0, 1)
 _MAX_TRACKS = 2
-#: Relative heights of the rows of a pair's figure, and inches per unit: a figure with all rows is 8.3 in high.
+#: Relative heights of the rows of a pair's figure, inches per unit (a figure with all rows is 8.3 in high), and cells
+#: of a row.
 _ROW_HEIGHTS = {"rectified": 1.95, "templates": 1.0, "delivered": 1.95}
-_IN_PER_UNIT = 8.3 / 4.9
+_IN_PER_UNIT, _CELLS = 8.3 / 4.9, 2 * _MAX_TRACKS
 #: Side of a rectified image as drawn, pixels.
 _RECTIFIED_PX = 384
 #: Valid template numbers. The figure shows at most `_MAX_TRACKS` templates per pair; the table lists all.
 _TEMPLATE_NUMBERS = range(100)
-#: Matplotlib line style of tracks that failed a validity check: offset, and lengths of dash and gap.
-_DASHED = (0, (2, 1.5))
 
 
 @dataclass(frozen=True)
@@ -57,65 +52,92 @@ class Track:
     values: Mapping[str, float]
     patch: Image | None
     window: Image | None
-    position: tuple[float, float] | None
+    position: Float[np.ndarray, "2"] | None
+
+    def style(self, colour: str) -> dict[str, Any]:
+        """Style of the track's squares of a colour."""
+        return {"color": colour, "linewidth": 1.8, "linestyle": "-" if self.valid else DASHED}
+
+    def pixel(self, prefix: str) -> Float[np.ndarray, "2"]:
+        """Column and row of the `template` or the `match` in the delivered image; NaN if unknown."""
+        return np.array([self.values.get(f"{prefix}_{axis}", np.nan) for axis in "uv"])
 
 
-def is_dimes_case(products: Mapping[str, Any]) -> bool:
+def is_dimes_case(products: Products) -> bool:
     """Whether products contain the three images of a DIMES case."""
     return all(to_matrix(products.get(f"image_{number}")) is not None for number in (1, 2, 3))
 
 
-def read_tracks(products: Mapping[str, Any]) -> list[Track]:
+def read_tracks(products: Products) -> list[Track]:
     """Read the tracks of a case; rows with an unknown pair or template are skipped."""
-    try:
-        table = np.atleast_2d(np.asarray(products.get("tracks", ()), dtype=np.float64))
-        names = [str(name) for name in np.asarray(products.get("tracks_columns", ())).ravel()]
-    except (TypeError, ValueError):
+    table = check_shape(products.get("tracks"), None, None)
+    names = [str(name) for name in np.asarray(products.get("tracks_columns", ())).ravel()]
+    if table is None or table.shape[1] != len(names):
         return []
-    if table.size == 0 or table.shape[1] != len(names):
-        return []
-    case_tracks = []
-    for row in (dict(zip(names, (float(value) for value in values), strict=True)) for values in table):
-        if row.get("pair") not in _PAIRS or row.get("template") not in _TEMPLATE_NUMBERS:
-            continue
-        pair, template = int(row["pair"]), int(row["template"])
-        patch, window = (to_matrix(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
-        match = numeric_product(products.get(f"match_{pair}_{template}"))
-        position = (float(match[0]), float(match[1])) if match is not None and match.size == 2 else None
-        case_tracks.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
-    return case_tracks
+    tracks = []
+    for row in (dict(zip(names, values, strict=True)) for values in table.tolist()):
+        if row.get("pair") in _PAIRS and row.get("template") in _TEMPLATE_NUMBERS:
+            pair, template = int(row["pair"]), int(row["template"])
+            patch, window = (to_matrix(products.get(f"{part}_{pair}_{template}")) for part in ("template", "window"))
+            position = check_shape(products.get(f"match_{pair}_{template}"), 2)
+            tracks.append(Track(pair, template, row.get("valid", 0.0) == 1.0, row, patch, window, position))
+    return tracks
 
 
-@in_page_style
-def draw_dimes_case(products: Mapping[str, Any]) -> Figure:
-    """Draw both image pairs of a case, side by side; raises ValueError without the three images."""
-    figure = Figure(figsize=(12.0, max(_figure_height_in(products, pair) for pair in _PAIRS)), layout="constrained")
-    columns = figure.add_gridspec(1, 2)
-    for pair in _PAIRS:
-        _draw_pair(figure.add_subfigure(columns[pair]), products, pair)
-    return figure
+def draw_dimes_case(products: Products, pairs: Sequence[int] = _PAIRS) -> Figure:
+    """Draw image pairs of a case (0 or 1) side by side; raises ValueError without their images."""
+    rows_of_pairs = [_arrange_pair(products, pair) for pair in pairs]
+    heights = {name: height for name, height in _ROW_HEIGHTS.items() if any(name in rows for rows in rows_of_pairs)}
+    rows = [
+        [panel for rows in rows_of_pairs for panel in rows.get(name, [Panel() for _ in range(_CELLS)])]
+        for name in heights
+    ]
+    size_in = (6.0 * len(pairs), _IN_PER_UNIT * sum(heights.values()))
+    return draw_panels(rows, size_in, [*heights.values()])
 
 
-@in_page_style
-def draw_dimes_pair(products: Mapping[str, Any], pair: int) -> Figure:
-    """Draw one image pair of a case, 0 or 1; raises ValueError without its images."""
-    figure = Figure(figsize=(6.0, _figure_height_in(products, pair)), layout="constrained")
-    _draw_pair(figure, products, pair)
-    return figure
+def _arrange_pair(products: Products, pair: int) -> dict[str, list[Panel]]:
+    """Create the non-empty rows of panels of a pair, from top to bottom."""
+    images = [read_square_image(products, f"image_{number}") for number in (pair + 1, pair + 2)]
+    tracks = _drawn_tracks(products, pair)
+    lattices = [check_shape(products.get(f"rectified_{pair}_{index}"), None, None, 2) for index in (0, 1)]
+    rows = {}
+    if any(lattice is not None for lattice in lattices):
+        panels = [_rectified_panel(products, images[index], lattices[index], tracks, pair, index) for index in (0, 1)]
+        rows["rectified"] = _spread(panels)
+    if any(track.patch is not None for track in tracks):
+        panels = [panel for track in tracks for panel in _template_panels(track)]
+        rows["templates"] = panels + [Panel() for _ in range(_CELLS - len(panels))]
+    delivered = []
+    for index, (prefix, colour) in enumerate((("template", TEMPLATE), ("match", MATCH))):
+        marks = [mark for track in tracks for mark in _track_marks(track, prefix, colour)]
+        marks += _hint_marks(products, pair, index, images[index].shape)
+        content = f": {('templates', 'tracked positions')[index]}" if tracks else ""
+        delivered.append(Panel(images[index], f"Image {pair + index + 1}{content}", marks))
+    return rows | {"delivered": _spread(delivered)}
 
 
-def describe_marks(products: Mapping[str, Any], pair: int) -> str:
+def _spread(panels: Sequence[Panel]) -> list[Panel]:
+    """Extend panels over the cells of a row."""
+    return [panel for panel in panels for _ in range(_CELLS // len(panels))]
+
+
+def _drawn_tracks(products: Products, pair: int) -> list[Track]:
+    return [track for track in read_tracks(products) if track.pair == pair][:_MAX_TRACKS]
+
+
+def describe_marks(products: Products, pair: int) -> str:
     """Describe the marks in the figure of an image pair; marks that are not in the figure are omitted."""
     earlier, later = pair + 1, pair + 2
-    pair_tracks = [track for track in read_tracks(products) if track.pair == pair][:_MAX_TRACKS]
-    texts = [f"Red: templates in image {earlier}."] if pair_tracks else ["No templates."]
-    if any(track.window is not None for track in pair_tracks):
+    tracks = _drawn_tracks(products, pair)
+    texts = [f"Red: templates in image {earlier}."] if tracks else ["No templates."]
+    if any(track.window is not None for track in tracks):
         texts.append(f"Blue: search windows in image {later}.")
-    if any(track.position is not None or np.isfinite(track.values.get("match_u", np.nan)) for track in pair_tracks):
+    if any(track.position is not None or np.isfinite(track.pixel("match")[0]) for track in tracks):
         texts.append(f"Green: tracked positions in image {later}.")
-    if not all(track.valid for track in pair_tracks):
+    if not all(track.valid for track in tracks):
         texts.append("Dashed: the template failed a validity check.")
-    shapes = [_read_image(products, f"image_{number}").shape for number in (earlier, later)]
+    shapes = [read_square_image(products, f"image_{number}").shape for number in (earlier, later)]
     if _visible_overlap(products, pair, shapes[0]) is not None:
         texts.append(f"Dotted yellow line: border of the overlap with image {later}, if there is no horizontal motion.")
     if any(_visible_zero_phase(products, pair, index, shape) is not None for index, shape in enumerate(shapes)):
@@ -123,107 +145,47 @@ def describe_marks(products: Mapping[str, Any], pair: int) -> str:
     return " ".join(texts)
 
 
-def draw_delivered_images(products: Mapping[str, Any]) -> Figure:
+def draw_delivered_images(products: Products) -> Figure:
     """Draw the three images, binned to square pixels; raises ValueError if one is missing."""
-    return draw_images([_read_image(products, f"image_{number}") for number in (1, 2, 3)])
+    return draw_images([read_square_image(products, f"image_{number}") for number in (1, 2, 3)])
 
 
-def write_dimes_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write `dimes.png` into a folder, or `images.png` if the algorithm has no DIMES details; returns the path."""
-    if "tracks" in products:
-        return save_figures(directory, {"dimes": draw_dimes_case(products)})
-    return save_figures(directory, {"images": draw_delivered_images(products)})
-
-
-def _row_heights(products: Mapping[str, Any], pair: int) -> dict[str, float]:
-    """Return the relative heights of the non-empty rows of a pair's figure, from top to bottom."""
-    has_content = {
-        "rectified": any(
-            numeric_product(products.get(f"rectified_{pair}_{image_index}")) is not None for image_index in (0, 1)
-        ),
-        "templates": any(track.pair == pair and track.patch is not None for track in read_tracks(products)),
-        "delivered": True,
-    }
-    return {name: _ROW_HEIGHTS[name] for name, is_drawn in has_content.items() if is_drawn}
-
-
-def _figure_height_in(products: Mapping[str, Any], pair: int) -> float:
-    return _IN_PER_UNIT * sum(_row_heights(products, pair).values())
-
-
-def _draw_pair(figure: FigureBase, products: Mapping[str, Any], pair: int) -> None:
-    images = [_read_image(products, f"image_{number}") for number in (pair + 1, pair + 2)]
-    pair_tracks = [track for track in read_tracks(products) if track.pair == pair][:_MAX_TRACKS]
-    heights = _row_heights(products, pair)
-    cells = figure.add_gridspec(len(heights), 1, height_ratios=[*heights.values()])
-    grid = {name: cells[index] for index, name in enumerate(heights)}
-    if "rectified" in grid:
-        rectified_cells = grid["rectified"].subgridspec(1, 2)
-        for image_index, image in enumerate(images):
-            _draw_rectified(
-                figure.add_subplot(rectified_cells[image_index]), products, image, pair_tracks, pair, image_index
-            )
-    if "templates" in grid:
-        template_cells = grid["templates"].subgridspec(1, 2 * _MAX_TRACKS)
-        for index in range(_MAX_TRACKS):
-            panels = [figure.add_subplot(template_cells[2 * index + column]) for column in (0, 1)]
-            if index < len(pair_tracks):
-                _draw_template_window(panels, pair_tracks[index])
-            else:
-                for axes in panels:
-                    axes.set_axis_off()
-    delivered_cells = grid["delivered"].subgridspec(1, 2)
-    for image_index, (image, prefix, colour) in enumerate(
-        zip(images, ("template", "match"), (TEMPLATE, MATCH), strict=True)
-    ):
-        axes = figure.add_subplot(delivered_cells[image_index])
-        show_subframe(axes, image)
-        axes.set_facecolor(INK)
-        _mark_tracks(axes, pair_tracks, prefix, colour)
-        _outline_overlap(axes, products, pair, image_index)
-        content = f": {('templates', 'tracked positions')[image_index]}" if pair_tracks else ""
-        axes.set_title(f"Image {pair + image_index + 1}{content}", fontsize=9)
-
-
-def _draw_rectified(
-    axes: Axes, products: Mapping[str, Any], image: Image, pair_tracks: Sequence[Track], pair: int, image_index: int
-) -> None:
-    """Draw an image of a pair, rectified, with its templates (first image) or windows and matches (second image).
+def _rectified_panel(
+    products: Products, image: Image, lattice: Float[np.ndarray, "n n 2"] | None, tracks: Sequence[Track], pair: int,
+    index: int,
+) -> Panel:  # fmt: skip
+    """Create the panel of a rectified image with its templates (first image) or windows and matches (second image).
 
     `rectified_frame_<pair>` contains west and north edge and spacing of the lattice, metres; `gsd_<pair>` is the pixel
     size of templates and windows, metres (`marsyard.algorithms.dimes.details`).
     """
-    lattice = numeric_product(products.get(f"rectified_{pair}_{image_index}"))
-    frame, gsd = numeric_product(products.get(f"rectified_frame_{pair}")), numeric_product(products.get(f"gsd_{pair}"))
-    if lattice is None or lattice.ndim != 3 or lattice.shape[2] != 2 or frame is None or frame.size != 3:
-        axes.set_axis_off()
-        return
+    frame, gsd = check_shape(products.get(f"rectified_frame_{pair}"), 3), numeric_product(products.get(f"gsd_{pair}"))
+    if lattice is None or frame is None:
+        return Panel()
     rectified = _rectify(image, lattice)
-    show_subframe(axes, rectified)
-    axes.set_facecolor(INK)
-    west, north, lattice_spacing_m = (float(value) for value in frame.ravel())
-    pixel_m = lattice_spacing_m * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
+    edge_m = frame[:2] * np.array([1.0, -1.0])
+    pixel_m = frame[2] * (lattice.shape[0] - 1) / (rectified.shape[0] - 1)
     spacing_m = float(gsd[0]) if gsd is not None and gsd.size == 1 else np.nan
 
-    def draw_ground_square(ground: Float[np.ndarray, "2"], side_px: int, colour: str, is_valid: bool) -> None:
-        centre = ((ground[0] - west) / pixel_m, (north - ground[1]) / pixel_m)
-        _draw_square(axes, centre, side_px * spacing_m / pixel_m, colour, is_valid)
+    def ground_square(ground_m: Float[np.ndarray, "2"], side_px: int, style: Mapping[str, Any]) -> list[Mark]:
+        centre = (ground_m * np.array([1.0, -1.0]) - edge_m) / pixel_m
+        return square(centre, side_px * spacing_m / pixel_m, style)
 
-    for track in pair_tracks:
-        ground = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
+    marks = []
+    for track in tracks:
+        ground_m = np.array([track.values.get(f"ground_{axis}_m", np.nan) for axis in ("east", "north")])
         if track.patch is None or track.window is None:
             continue
-        if image_index == 0:
-            draw_ground_square(ground, len(track.patch), TEMPLATE, track.valid)
-        else:
-            draw_ground_square(ground, len(track.window), WINDOW, True)
-            if track.position is not None:
-                # the window is centred on `ground`
-                centre = 0.5 * (len(track.window) - 1)
-                offset = np.array([track.position[1] - centre, centre - track.position[0]])
-                draw_ground_square(ground + spacing_m * offset, len(track.patch), MATCH, track.valid)
-    content = f": {('templates', 'search windows')[image_index]}" if pair_tracks else ""
-    axes.set_title(f"Image {pair + image_index + 1}, rectified{content}", fontsize=9)
+        if index == 0:
+            marks += ground_square(ground_m, len(track.patch), track.style(TEMPLATE))
+            continue
+        marks += ground_square(ground_m, len(track.window), {"color": WINDOW, "linewidth": 1.8})
+        if track.position is not None:
+            # the window is centred on `ground_m`; rows increase to the south
+            offset = (track.position[::-1] - 0.5 * (len(track.window) - 1)) * np.array([1.0, -1.0])
+            marks += ground_square(ground_m + spacing_m * offset, len(track.patch), track.style(MATCH))
+    content = f": {('templates', 'search windows')[index]}" if tracks else ""
+    return Panel(rectified, f"Image {pair + index + 1}, rectified{content}", marks)
 
 
 def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndarray, "m m"]:
@@ -237,86 +199,62 @@ def _rectify(image: Image, lattice: Float[np.ndarray, "n n 2"]) -> Float[np.ndar
     return np.asarray(np.where(is_inside, values, np.nan))
 
 
-def _draw_template_window(axes: Sequence[Axes], track: Track) -> None:
-    """Draw the template and the search window of a track on two axes, and the match in the window."""
-    line = "-" if track.valid else _DASHED
-    template_title, window_title = (f"{name} {track.template + 1}" for name in ("Template", "Search window"))
-    parts = ((track.patch, template_title, TEMPLATE, line), (track.window, window_title, WINDOW, "-"))
-    for panel, (image, title, colour, style) in zip(axes, parts, strict=True):
-        if image is None:
-            panel.set_axis_off()
-            continue
-        show_subframe(panel, image)
-        panel.set_facecolor(INK)
-        panel.spines[:].set(visible=True, edgecolor=colour, linewidth=2.2, linestyle=style)
-        panel.set_title(title, fontsize=9)
-    if track.position is not None and track.patch is not None and track.window is not None:
-        _draw_square(axes[1], track.position[::-1], float(len(track.patch)), MATCH, track.valid)
+def _template_panels(track: Track) -> list[Panel]:
+    """Create the panels of the template and of the search window of a track, with the match in the window."""
+    frame: dict[str, Any] = {"edgecolor": TEMPLATE, "linewidth": 2.2, "linestyle": "-" if track.valid else DASHED}
+    marks: list[Mark] = []
+    if track.position is not None and track.patch is not None:
+        marks = square(track.position[::-1], float(len(track.patch)), track.style(MATCH))
+    template = Panel(track.patch, f"Template {track.template + 1}", frame=frame)
+    window_frame = {"edgecolor": WINDOW, "linewidth": 2.2}
+    return [template, Panel(track.window, f"Search window {track.template + 1}", marks, window_frame)]
 
 
-def _mark_tracks(axes: Axes, pair_tracks: Sequence[Track], prefix: str, colour: str) -> None:
-    """Draw squares with template numbers at the `template` or `match` pixels (`prefix`) of the tracks."""
-    box = {"facecolor": "#000000", "alpha": 0.55, "pad": 1.0, "linewidth": 0.0}
-    for track in pair_tracks:
-        u, v = track.values.get(f"{prefix}_u", np.nan), track.values.get(f"{prefix}_v", np.nan)
-        side_px = track.values.get("template_side_px", _DEFAULT_SIDE_PX)
-        if np.isfinite((u, v)).all():
-            _draw_square(axes, (u, v), side_px, colour, track.valid)
-            axes.annotate(
-                str(track.template + 1), (u, v - side_px / 2), xytext=(0, 3), textcoords="offset points", ha="center",
-                va="bottom", color=colour, fontsize=9, fontweight="bold", annotation_clip=True, bbox=box,
-            )  # fmt: skip
+def _track_marks(track: Track, prefix: str, colour: str) -> list[Mark]:
+    """Create the square with the template's number at the `template` or `match` pixel (`prefix`) of a track."""
+    side_px = track.values.get("template_side_px", _DEFAULT_SIDE_PX)
+    return square(track.pixel(prefix), side_px, track.style(colour), str(track.template + 1))
 
 
-def _outline_overlap(axes: Axes, products: Mapping[str, Any], pair: int, image_index: int) -> None:
-    """Outline the overlap in the first image, and mark the zero-phase point (direction opposite to the sun)."""
-    shape = axes.get_images()[0].get_size()
-    polygon = _visible_overlap(products, pair, shape) if image_index == 0 else None
+def _hint_marks(products: Products, pair: int, index: int, shape: tuple[int, ...]) -> list[Mark]:
+    """Create the outline of the overlap in the first image, and the zero-phase point (opposite to the sun)."""
+    marks = []
+    polygon = _visible_overlap(products, pair, shape) if index == 0 else None
     if polygon is not None:
-        axes.add_patch(Polygon(polygon, fill=False, edgecolor="#f2e35a", linewidth=0.9, linestyle=":"))
-    zero_phase = _visible_zero_phase(products, pair, image_index, shape)
+        outline = np.vstack([polygon, polygon[:1]])[:, None]
+        marks.append(Mark(outline, {"color": HINT, "linewidth": 0.9, "linestyle": ":"}))
+    zero_phase = _visible_zero_phase(products, pair, index, shape)
     if zero_phase is not None:
-        axes.plot([zero_phase[0]], [zero_phase[1]], marker="x", color="#f2e35a", markersize=7)
+        marks.append(Mark(zero_phase[None], {"color": HINT, "marker": "x", "markersize": 7}))
+    return marks
 
 
-def _visible_overlap(products: Mapping[str, Any], pair: int, shape: tuple[int, ...]) -> Float[np.ndarray, "_ 2"] | None:
+def _visible_overlap(products: Products, pair: int, shape: tuple[int, ...]) -> Float[np.ndarray, "_ 2"] | None:
     """Return the outline of the overlap (u, v) in the first image of a pair; None if no part of it is in the image."""
-    polygon = to_matrix(products.get(f"overlap_{pair}"))
-    if polygon is None or polygon.shape[1] != 2 or not np.isfinite(polygon).all():
+    polygon = check_shape(products.get(f"overlap_{pair}"), None, 2)
+    if polygon is None or not polygon.size or not np.isfinite(polygon).all():
         return None
-    outline, image_box = (
-        Outline(np.vstack([polygon, polygon[:1]])),
-        Bbox([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]]),
-    )
-    return polygon if outline.intersects_bbox(image_box, filled=False) else None
+    image_box = Bbox([[-0.5, -0.5], [shape[1] - 0.5, shape[0] - 0.5]])
+    return polygon if Outline(np.vstack([polygon, polygon[:1]])).intersects_bbox(image_box, filled=False) else None
 
 
 def _visible_zero_phase(
-    products: Mapping[str, Any], pair: int, image_index: int, shape: tuple[int, ...]
-) -> tuple[float, float] | None:
+    products: Products, pair: int, index: int, shape: tuple[int, ...]
+) -> Float[np.ndarray, "2"] | None:
     """Return the zero-phase point (u, v) in an image of a pair; None if it is not in the image."""
-    pixels = to_matrix(products.get(f"zero_phase_{pair}"))
-    if pixels is None or pixels.shape != (2, 2):
+    pixels = check_shape(products.get(f"zero_phase_{pair}"), 2, 2)
+    if pixels is None:
         return None
-    u, v = (float(value) for value in pixels[image_index])
-    return (u, v) if 0 <= u < shape[1] and 0 <= v < shape[0] else None
+    is_inside = ((pixels[index] >= 0.0) & (pixels[index] < shape[::-1])).all()
+    return np.asarray(pixels[index]) if is_inside else None
 
 
-def _draw_square(axes: Axes, centre: tuple[float, float], side: float, colour: str, is_valid: bool) -> None:
-    if np.isfinite([*centre, side]).all():
-        corner, line = (centre[0] - side / 2, centre[1] - side / 2), "-" if is_valid else _DASHED
-        axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=colour, linewidth=1.8, linestyle=line))
-
-
-def _read_image(products: Mapping[str, Any], key: str) -> Image:
+def read_square_image(products: Products, key: str) -> Image:
     """Read an image and average its columns to square pixels; raises ValueError if the image is missing."""
     counts = to_matrix(products.get(key))
     if counts is None:
         raise ValueError(f"the products contain no image '{key}'")
-    rows, binning = len(counts), column_binning(counts)
-    if binning == 1:
-        return counts
-    return np.asarray(counts.reshape(rows, rows, binning).mean(axis=2), dtype=np.float64)
+    return np.asarray(counts.reshape(len(counts), -1, column_binning(counts)).mean(axis=2))
 
 
 def column_binning(counts: Image) -> int:

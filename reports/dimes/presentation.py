@@ -14,21 +14,24 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from marsyard.algorithms.interface import VelocityOutcome
-from marsyard.reports import presentation
 from marsyard.reports.dimes import case_figures as figures
-from marsyard.reports.dimes.sections import field_test_section, ignition_section, landing_section, sensitivity_section
+from marsyard.reports.dimes.sections import ignition_section, landing_section, sensitivity_section
+from marsyard.reports.images import Panel, fill_panels
 from marsyard.reports.presentation import (
+    CaseFigure,
     CaseKind,
     CaseView,
     Cause,
     Presentation,
+    Products,
     TableRow,
     check_shape,
     numeric_product,
+    read_arrays,
     to_float,
     to_matrix,
 )
-from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style, svg_figure
+from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.wording import NOTHING, label, note_text, number, percent
 
 #: Columns of the tracks that the table shows in other columns, or not at all because they are too wide.
@@ -55,22 +58,26 @@ _LEGEND = (
 )
 
 
-def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a DIMES case, without templates and tracks if the algorithm provides no DIMES details."""
+def view(products: Products, complete: bool = False) -> CaseView:
+    """Create the view of a DIMES case, without templates and tracks if the algorithm provides no DIMES details.
+
+    The complete view has one figure of both image pairs, the page a figure of each pair.
+    """
+    facts = _format_velocities(products)
     if "tracks" not in products:
-        images = figures.draw_delivered_images(products)
-        figure = svg_figure(images, f"{key}images", "The three images that the algorithm received.", wide=True)
-        return CaseView(_format_velocities(products), [figure], [], [], _describe_images(products).capitalize())
-    svg_figures = []
-    for index in (0, 1):
-        caption = f"Pair {index + 1}: images {index + 1} and {index + 2}. {figures.describe_marks(products, index)}"
-        svg_figures.append(svg_figure(figures.draw_dimes_pair(products, index), f"{key}pair{index}", caption))
-    facts = [*_format_velocities(products), *_format_selection(products)]
+        caption = "The three images that the algorithm received."
+        figure = CaseFigure("images", figures.draw_delivered_images(products), caption)
+        return CaseView([figure], facts, legend=_describe_images(products).capitalize())
+    drawn = [CaseFigure("dimes", figures.draw_dimes_case(products))] if complete else []
+    for pair in () if complete else (0, 1):
+        caption = f"Pair {pair + 1}: images {pair + 1} and {pair + 2}. {figures.describe_marks(products, pair)}"
+        drawn.append(CaseFigure(f"pair{pair}", figures.draw_dimes_case(products, [pair]), caption, wide=False))
+    head, rows = _create_track_table(products)
     legend = _LEGEND.format(images=_describe_images(products))
-    return CaseView(facts, svg_figures, *_create_track_table(products), legend)
+    return CaseView(drawn, [*facts, *_format_selection(products)], head, rows, legend)
 
 
-def _create_track_table(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
+def _create_track_table(products: Products) -> tuple[list[str], list[TableRow]]:
     """Create the headings and the rows of the table of tracks."""
     tracks = figures.read_tracks(products)
     names = dict.fromkeys(name for track in tracks for name in track.values)
@@ -99,7 +106,7 @@ def _format_position(u: float, v: float) -> str:
     return NOTHING if math.isnan(u + v) else f"{u:.1f}, {v:.1f}".replace("-", "−")
 
 
-def _format_velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _format_velocities(products: Products) -> list[tuple[str, str]]:
     """Format the estimated velocity, the true velocity and the error, if the products contain them."""
     facts, velocities = [], []
     for key, name in (
@@ -116,7 +123,7 @@ def _format_velocities(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-def _format_selection(products: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _format_selection(products: Products) -> list[tuple[str, str]]:
     """Format the smallest differences between velocity changes of tracks and of the IMU, if the products have them."""
     combinations = check_shape(products.get("combinations"), None, 3)
     if combinations is None or not len(combinations):
@@ -128,7 +135,7 @@ def _format_selection(products: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [("Velocity change between the pairs: difference from the IMU", text)]
 
 
-def _describe_images(products: Mapping[str, Any]) -> str:
+def _describe_images(products: Products) -> str:
     """Describe how the images in the figure differ from the received images."""
     counts = to_matrix(products.get("image_1"))
     columns = 1 if counts is None else figures.column_binning(counts)
@@ -142,17 +149,14 @@ def _describe_images(products: Mapping[str, Any]) -> str:
 _MAX_PER_ROW = 10
 
 
-def _read_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"] | None:
+def _read_stream(products: Products) -> Float[np.ndarray, "n 6"] | None:
     """Read a row for each image: start and end of the time span, estimate, truth (east, north); NaN if missing."""
-    parts = presentation.read_arrays(
-        products, dict.fromkeys(("after_spans_s", "after_velocities_m_s", "after_true_m_s"), (None, 2))
-    )
-    if parts is None or len({len(part) for part in parts}) > 1 or not len(parts[0]):
-        return None
-    return np.concatenate(parts, axis=1)
+    names = ("after_spans_s", "after_velocities_m_s", "after_true_m_s")
+    parts = read_arrays(products, dict.fromkeys(names, ("n", 2)))
+    return np.concatenate(parts, axis=1) if parts is not None and len(parts[0]) else None
 
 
-def is_stream_case(products: Mapping[str, Any]) -> bool:
+def is_stream_case(products: Products) -> bool:
     """Whether products contain the answers of a velocity stream after each of its images."""
     table = _read_stream(products)
     return table is not None and all(
@@ -160,7 +164,7 @@ def is_stream_case(products: Mapping[str, Any]) -> bool:
     )
 
 
-def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
+def view_stream(products: Products, _complete: bool = False) -> CaseView:
     """Create the view of a velocity stream: its images, and the estimate after each image."""
     rows = []
     for image_number, row in enumerate(_require_stream(products), start=1):
@@ -170,10 +174,10 @@ def view_stream(products: Mapping[str, Any], key: str) -> CaseView:
     head = ["After image", "From (s)", "To (s)", "East (m/s)", "North (m/s)"]
     head += ["True east", "True north", "Error (m/s)"]
     caption = "Images of the stream, and the estimated velocity after each image."
-    return CaseView([], [svg_figure(draw_stream_case(products), f"{key}stream", caption, wide=True)], head, rows)
+    return CaseView([CaseFigure("stream", draw_stream_case(products), caption)], head=head, rows=rows)
 
 
-def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
+def _require_stream(products: Products) -> Float[np.ndarray, "n 6"]:
     """Read the velocity stream as in `_read_stream`. Raises ValueError if it is missing."""
     table = _read_stream(products)
     if table is None:
@@ -182,22 +186,18 @@ def _require_stream(products: Mapping[str, Any]) -> Float[np.ndarray, "n 6"]:
 
 
 @in_page_style
-def draw_stream_case(products: Mapping[str, Any]) -> Figure:
+def draw_stream_case(products: Products) -> Figure:
     """Draw the images in rows, and both components of the velocity after each image."""
     table = _require_stream(products)
     n_rows = -(-len(table) // _MAX_PER_ROW)
     figure = Figure(figsize=(12.0, 3.4 + 1.6 * n_rows), layout="constrained")
     cells = figure.add_gridspec(2, 1, height_ratios=(1.6 * n_rows, 3.4))
     upper, lower = (figure.add_subfigure(part) for part in (cells[0], cells[1]))
-    panels = upper.subplots(n_rows, min(len(table), _MAX_PER_ROW), squeeze=False)
-    for index, axes in enumerate(panels.ravel()):
-        axes.set_axis_off()
-        image = to_matrix(products.get(f"image_{index + 1}"))
-        if image is not None and index < len(table):
-            low, high = np.quantile(image, (0.01, 0.99))  # contrast stretch
-            axes.imshow(image, cmap="gray", vmin=low, vmax=max(high, low + 1.0), aspect="auto")
-            axes.set_box_aspect(1.0)
-            axes.set_title(str(index + 1), fontsize=9)
+    names = range(1, len(table) + 1)
+    panels = [Panel(figures.read_square_image(products, f"image_{name}"), str(name)) for name in names]
+    n_columns = min(len(table), _MAX_PER_ROW)
+    panels += [Panel() for _ in range(n_rows * n_columns - len(panels))]
+    fill_panels(upper, [panels[first : first + n_columns] for first in range(0, len(panels), n_columns)])
     answered_rows = table[np.isfinite(table[:, 2])]
     start, end = answered_rows[:, 0], answered_rows[:, 1]
     centres = 0.5 * (start + end)
@@ -213,14 +213,9 @@ def draw_stream_case(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-STREAM_CASE = CaseKind(
-    is_stream_case,
-    view_stream,
-    lambda directory, products: presentation.save_figures(directory, {"stream": draw_stream_case(products)}),
-    note_text("dimes.stream_legend"),
-)
+STREAM_CASE = CaseKind(is_stream_case, view_stream, note_text("dimes.stream_legend"))
 # every view has its own legend
-DIMES_CASE = CaseKind(figures.is_dimes_case, view, figures.write_dimes_figures, legend="")
+DIMES_CASE = CaseKind(figures.is_dimes_case, view)
 
 
 def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
@@ -251,4 +246,3 @@ DIMES = Presentation(
     outcomes=(VelocityOutcome,),
     explain=explain,
 )
-FIELD_TEST = Presentation(first=(field_test_section,), explain=explain)

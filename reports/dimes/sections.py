@@ -1,56 +1,39 @@
-"""Sections about descents: field test, velocity errors at thruster ignition, landings, influence of conditions.
+"""Sections about descents: velocity errors at thruster ignition, landings, influence of conditions.
 
 The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, Rows, distribution_block, quantile_block, rate_block
-from marsyard.reports.dimes.landing import (
-    SPEED_CORRECTED,
-    SPEED_UNCORRECTED,
-    create_speed_block,
-    landing_fractions,
-    landing_rows,
-    omit_empty_rows,
-)
-from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import (
-    MARKERS,
     MUTED,
-    REQUIREMENT,
     SERIES,
     Block,
     Grid,
     Section,
     Subject,
-    SvgFigure,
-    build_grid,
     create_section,
     has_values,
     in_page_style,
     new_axes,
     svg_figure,
 )
+from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.tables import error_summaries, statistics_rows
 from marsyard.reports.wording import (
     NOTHING,
-    axis_columns,
-    count,
     format_fraction,
     label,
     magnitude_label,
@@ -60,141 +43,7 @@ from marsyard.reports.wording import (
     percent,
 )
 from marsyard.scenarios.columns import split_unit
-
-#: Rows of the paper's Fig. 11 by (category, run).
-FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
-    (group["category"], row["run"]): row
-    for group in read_paper(Path(__file__).with_name("paper.toml"))["fig_11"]
-    for row in group["runs"]
-}
-#: A difference from the paper is marked as large above this value, percentage points.
-LARGE_DIFFERENCE_POINTS = 10.0
-
-
-def field_test_section(subject: Subject) -> Section | None:
-    """Create the section that compares the field test with the paper's Figs. 10 and 11; None for other campaigns."""
-    frame, bound = subject.frame, subject.bound
-    if not {"run", "category"}.issubset(frame.columns) or not rates.is_flag(frame, "answered"):
-        return None
-    cells = field_cells(subject)
-    grid = build_grid(
-        cells,
-        {
-            "Category and run": lambda cell: f"{cell['category']}: {cell['run']}",
-            "Triples": lambda cell: f"{cell['valid'].n:,}",
-            "Valid": lambda cell: f"{cell['valid'].hits:,}",
-            "% valid": lambda cell: percent(cell["valid"].fraction),
-            f"{format_fraction(CONFIDENCE)} interval": lambda cell: rates.range_text(
-                cell["valid"].lower, cell["valid"].upper
-            ),
-            "Paper": lambda cell: NOTHING if cell["paper_percent"] is None else f"{cell['paper_percent']} %",
-            "Difference": lambda cell: _difference_text(cell["difference_points"]),
-            "Errors above the bound" if bound is None else f"Errors above {bound:g}": lambda cell: (
-                NOTHING if cell["errors_above_bound"] is None else f"{cell['errors_above_bound']:,}"
-            ),
-            "Largest error": lambda cell: number(cell["largest"]),
-        },
-    )
-    blocks = [Block(grid=grid, note=_field_note(cells))]
-    svg_figures = scatter_figures(subject)
-    if svg_figures:
-        note = ""
-        if bound is not None and subject.metric is not None:
-            note = note_text("dimes.errors", bound=f"{bound:g}", unit=split_unit(subject.metric)[1])
-        blocks.append(Block(heading="Errors by category", figures=svg_figures, note=note))
-    data = {"cells": [cell | {"valid": asdict(cell["valid"])} for cell in cells]}
-    return Section("field-test", "Field test", "Runs and categories, next to the paper's Fig. 11", blocks, data)
-
-
-def field_cells(subject: Subject) -> list[dict[str, Any]]:
-    """List the results of each category and run: first those of the paper, in its order, then others."""
-    frame, cells = subject.frame, []
-    names = frame[["category", "run"]].dropna().drop_duplicates()
-    pairs = [(str(category), str(run)) for category, run in names.itertuples(index=False)]
-    for category, run in [*(pair for pair in FIG_11 if pair in pairs), *(pair for pair in pairs if pair not in FIG_11)]:
-        rows = frame[frame["category"].eq(category) & frame["run"].eq(run)]
-        answered = rates.population_mask(rows, "valid")
-        errors = np.abs(numbers(rows[answered], subject.metric)) if subject.metric else np.array([])
-        errors = errors[np.isfinite(errors)]
-        fraction, paper_percent = rates.fraction_of(answered, rows), FIG_11.get((category, run), {}).get("percent")
-        cells.append(
-            {
-                "category": category,
-                "run": run,
-                "valid": fraction,
-                "errors_above_bound": None if subject.bound is None else int((errors > subject.bound).sum()),
-                "largest": float(errors.max()) if errors.size else math.nan,
-                "paper_percent": paper_percent,
-                "difference_points": math.nan if paper_percent is None else 100.0 * fraction.fraction - paper_percent,
-            }
-        )
-    return cells
-
-
-def _difference_text(points: float) -> str:
-    mark = " (large)" if abs(points) > LARGE_DIFFERENCE_POINTS else ""
-    return NOTHING if math.isnan(points) else f"{points:+.1f} pp{mark}".replace("-", "−")
-
-
-def _field_note(cells: Sequence[Mapping[str, Any]]) -> str:
-    """Describe definitions, the paper's misprints, and cells that differ from the paper."""
-    definitions = note_text("dimes.field_test")
-    if not any(cell["paper_percent"] is not None for cell in cells):
-        return definitions
-    inconsistent_rows = [
-        f"{run}, {category} ({row['valid']} + {row['invalid']} ≠ {row['total']})"
-        for (category, run), row in FIG_11.items()
-        if row["valid"] + row["invalid"] != row["total"]
-    ]
-    totals = sum(row["total"] for row in FIG_11.values())
-    counts = sum(row["valid"] + row["invalid"] for row in FIG_11.values())
-    large = [cell for cell in cells if abs(cell["difference_points"]) > LARGE_DIFFERENCE_POINTS]
-    names = "; ".join(f"{cell['category']}, {cell['run']}" for cell in large) or "none"
-    return (
-        f"{definitions} The paper's table has misprints in the rows {'; '.join(inconsistent_rows)}. Its totals sum to "
-        f"{totals:,}, its counts to {counts:,}. This report uses the totals. For Pisgah Run 3, same direction, the "
-        f"paper prints 99 %, but its counts result in 97 %. These results differ from the paper by more than "
-        f"{LARGE_DIFFERENCE_POINTS:g} percentage points: {names}."
-    )
-
-
-def scatter_figures(subject: Subject) -> list[SvgFigure]:
-    """Draw the signed errors of each category on equal axes (the paper's Fig. 10)."""
-    frame, metric = subject.frame, subject.metric
-    components = axis_columns(metric, [str(name) for name in frame.columns])[:2] if metric else []
-    if len(components) < 2:
-        return []
-    points = np.column_stack([numbers(frame, component) for component in components])
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.any():
-        return []
-    axis_limit = 1.06 * max(float(np.abs(points[finite]).max()), subject.bound or 0.0)
-    categories = [*(category for category, _ in FIG_11), *sorted(frame["category"].dropna().unique())]
-    svg_figures = []
-    for index, category in enumerate(dict.fromkeys(str(name) for name in categories)):
-        rows = frame[finite & frame["category"].eq(category).to_numpy(dtype=np.bool_)]
-        if len(rows):
-            caption = f"{category[:1].upper()}{category[1:]}: {count(len(rows), 'valid triple')}."
-            figure = _draw_scatter(rows, components, subject, axis_limit)
-            svg_figures.append(svg_figure(figure, f"fieldtest{index}", caption))
-    return svg_figures
-
-
-@in_page_style
-def _draw_scatter(rows: Rows, components: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
-    figure, axes = new_axes(4.2, 4.4)
-    runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
-    for index, run in enumerate(runs):
-        x, y = (numbers(rows[rows["run"].eq(run)], component) for component in components)
-        style: dict[str, Any] = {"marker": MARKERS[index % len(MARKERS)], "color": SERIES[index % len(SERIES)]}
-        axes.plot(x, y, linestyle="", markersize=4.0, alpha=0.7, markeredgewidth=0.0, label=run, **style)
-    if subject.bound is not None:
-        axes.add_patch(Circle((0, 0), subject.bound, fill=False, color=REQUIREMENT, linewidth=1.6, linestyle="--"))
-    axes.set(xlim=(-axis_limit, axis_limit), ylim=(-axis_limit, axis_limit), aspect="equal")
-    axes.set(xlabel=label(components[0]), ylabel=label(components[1]))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2, handletextpad=0.2)
-    return figure
-
+from marsyard.scenarios.descent.parameters import LandingParameters
 
 _FIRING = "firing_velocity_error_m_s"
 _FIRING_NOTE = (
@@ -216,12 +65,11 @@ def ignition_section(subject: Subject) -> Section | None:
     summaries = error_summaries(frame, _FIRING)
     rows, too_few_cases = omit_empty_rows(statistics_rows([summary for _, summary in summaries]))
     grid = Grid(["", *(name for name, _ in summaries)], rows)
-    data = {name: asdict(summary) for name, summary in summaries}
     return create_section(
         "firing",
         "Ignition",
         "Velocity error at thruster ignition",
-        Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}", data=data),
+        Block(grid=grid, note=f"{too_few_cases}{_FIRING_NOTE}", data=dict(summaries)),
         quantile_block(
             frame,
             [Quantity("firing_after_s")],
@@ -312,9 +160,10 @@ def sensitivity_section(subject: Subject) -> Section | None:
         for effect in effects
     ]
     head = ["", "5 % to 95 % quantile", "Rank correlation", "Standardised coefficient", f"Effect ({unit})"]
-    data = {"drivers": [asdict(effect) for effect in effects]}
     blocks = [Block(figures=[effect_svg]), Block(grid=Grid(head, rows), note=note)]
-    return Section("sensitivity", "Sensitivity", "Sensitivity of the error to the conditions", blocks, data)
+    return Section(
+        "sensitivity", "Sensitivity", "Sensitivity of the error to the conditions", blocks, {"drivers": effects}
+    )
 
 
 def estimate_effects(subject: Subject, metric: str) -> list[ConditionEffect]:
@@ -382,3 +231,103 @@ def effect_figure(effects: Sequence[ConditionEffect], unit: str) -> Figure:
     axes.set(xlabel=f"change of the mean magnitude ({unit})", ylim=(len(effects) - 0.5, -0.5))
     axes.grid(visible=False, axis="y")
     return figure
+
+
+SPEED_CORRECTED, SPEED_UNCORRECTED = "touchdown_speed_corrected_m_s", "touchdown_speed_uncorrected_m_s"
+#: Minimum change of speed that counts as an improvement or a degradation, m/s.
+MIN_SPEED_CHANGE_M_S = 1.0
+#: Speeds above which the table gives the fraction of cases, m/s.
+SPEEDS_M_S = (5.0, 10.0, 15.0, 20.0, 25.0)
+
+
+def landing_rows(subject: Subject) -> pd.DataFrame | None:
+    """Select the landings with both speeds; None without a landing."""
+    speeds = np.column_stack([numbers(subject.frame, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)])
+    landings = subject.frame[np.isfinite(speeds).all(axis=1)]
+    return landings if len(landings) else None
+
+
+def landing_fractions(landings: Rows) -> dict[str, rates.CaseFraction]:
+    """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
+    change = numbers(landings, SPEED_CORRECTED) - numbers(landings, SPEED_UNCORRECTED)
+    fractions = {
+        f"slower by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(
+            change < -MIN_SPEED_CHANGE_M_S, landings
+        ),
+        f"faster by more than {MIN_SPEED_CHANGE_M_S:g} m/s": rates.fraction_of(change > MIN_SPEED_CHANGE_M_S, landings),
+    }
+    if rates.is_flag(landings, "in_time_assumed"):
+        name = "assumed computation time ends before ignition"
+        fractions[name] = rates.fraction_of(rates.flag_mask(landings, "in_time_assumed"), landings)
+    return fractions
+
+
+def _landing_model(subject: Subject) -> dict[str, str]:
+    """Return the parameters of the campaign's model of the last seconds, for the note of the table of speeds."""
+    model = LandingParameters.model_validate(subject.run.parameter("landing") or {})
+    return {
+        "computation": f"{model.computation_s:g}",
+        "deadband": f"{model.steering_deadband_m_s:g}",
+        "max_steering": f"{model.max_steering_m_s:g}",
+        "steering": f"{100.0 * model.steering_error:g}",
+        "burn": f"{model.burn_error_m_s:g}",
+    }
+
+
+_LANDING_NOTE = (
+    "{missing}{bounds}Steering tilts the rocket burn against the reported velocity, which the IMU propagates to "
+    "ignition. It removes at most {max_steering} m/s. {not_steered} of {landings} landings are not steered and have "
+    "the same speed in both columns. Possible reasons: no velocity was reported; the computation ended after ignition "
+    "(assumed duration: {computation} s); the propagated velocity was at most {deadband} m/s. The burn adds an error "
+    "of {burn} m/s to each landing. Steering adds an error of {steering} % of the removed velocity. Both errors are "
+    "assumed, rms per axis. The speed with steering is therefore usually larger than the velocity error at ignition. "
+    "Largest decrease of the speed by steering: {gain}. Largest increase: {loss}."
+)
+
+
+def create_speed_block(landings: Rows, subject: Subject) -> Block:
+    """Create the table of touchdown speeds with and without steering: mean, quantiles, fractions above speeds."""
+    columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
+    groups = rates.terrain_groups(landings)
+    change = columns[0] - columns[1]
+    rows = [["mean (m/s)", *(number(float(values.mean())) for values in columns)]]
+    for probability in (0.5, 0.95, 0.99):
+        texts = []
+        for values in columns:
+            bound = quantile_bounds(values, probability, CONFIDENCE, groups)[1]
+            bound_text = f" (≤ {number(bound)})" if np.isfinite(bound) else ""
+            texts.append(f"{number(rates.quantile(values, probability))}{bound_text}")
+        name = "median" if probability == 0.5 else f"{format_fraction(probability)} quantile"
+        rows.append([f"{name} (m/s)", *texts])
+    rows += [
+        [f"faster than {speed:g} m/s", *(percent(float(np.mean(values > speed))) for values in columns)]
+        for speed in SPEEDS_M_S
+    ]
+    improved, degraded, *_ = landing_fractions(landings).values()
+    data = {
+        "landings": len(landings),
+        "reduced_fraction": improved.fraction,
+        "increased_fraction": degraded.fraction,
+        "mean_with_m_s": float(columns[0].mean()),
+        "mean_without_m_s": float(columns[1].mean()),
+        "largest_gain_m_s": float(-change.min()),
+        "largest_loss_m_s": float(change.max()),
+    }
+    gain, loss = (f"{number(value)} m/s" if value > 0.0 else "none" for value in (-change.min(), change.max()))
+    kept_rows, missing = omit_empty_rows(rows)
+    has_bounds = any("≤" in text for row in kept_rows for text in row)
+    bounds = f"The sign ≤ marks upper bounds at {format_fraction(CONFIDENCE)} confidence. " if has_bounds else ""
+    note = _LANDING_NOTE.format(
+        missing=missing, bounds=bounds, gain=gain, loss=loss, not_steered=int((change == 0.0).sum()),
+        landings=len(landings), **_landing_model(subject),
+    )  # fmt: skip
+    grid = Grid(["", "With steering", "Without steering"], kept_rows)
+    return Block(heading="Speeds with and without steering", grid=grid, note=note, data=data)
+
+
+def omit_empty_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Sequence[str]], str]:
+    """Omit the rows that have only dashes; return the other rows and a sentence that names the omitted rows."""
+    is_empty = [all(text == NOTHING for text in row[1:]) for row in rows]
+    names = [row[0].split(" (")[0] for row, empty in zip(rows, is_empty, strict=True) if empty]
+    sentence = f"Too few cases to estimate: {', '.join(names)}. " if names else ""
+    return [row for row, empty in zip(rows, is_empty, strict=True) if not empty], sentence

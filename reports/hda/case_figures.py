@@ -10,7 +10,6 @@ products raise ValueError.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,8 +20,9 @@ from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColorm
 from matplotlib.figure import Figure
 
 from marsyard.reports.hda import products as stages
-from marsyard.reports.presentation import save_figures
-from marsyard.reports.section import MUTED, MarkedImage, draw_marked_images, in_page_style, show_image
+from marsyard.reports.images import Mark, Panel, draw_panels, show_image
+from marsyard.reports.presentation import Products
+from marsyard.reports.section import MUTED, in_page_style
 
 Product = TypeVar("Product")
 
@@ -60,26 +60,27 @@ _LOST: dict[str, Any] = {
 }  # fmt: skip
 
 
-def draw_tracks(products: Mapping[str, Any]) -> Figure:
+def draw_tracks(products: Products) -> Figure:
     """Draw Fig. 1: features in the first image, their tracks in the second."""
     images = _require(stages.read_images(products), "images")
     tracks = _require(stages.read_tracked_features(products), "tracks")
     is_tracked = tracks.accepted
-    features = [(tracks.first[is_tracked], _TRACKED)]
+    features = [Mark(tracks.first[is_tracked], _TRACKED)]
     if not is_tracked.all():
-        features.append((tracks.first[~is_tracked], _LOST))
+        features.append(Mark(tracks.first[~is_tracked], _LOST))
+    left = Panel(images[0], f"First image: {len(tracks.first)} features", features)
     segments = np.stack([tracks.first[is_tracked], tracks.second[is_tracked]])
-    left = MarkedImage(f"First image: {len(tracks.first)} features", images[0], features)
-    marks = [(segments, _SEGMENT | {"color": TRACKED_COLOUR, "alpha": 0.9}), (tracks.second[is_tracked], _TRACKED)]
-    right = MarkedImage(f"Second image: {int(is_tracked.sum())} tracks", images[1], marks)
-    figure = draw_marked_images([left, right], _PAIR_SIZE_IN)
+    track_style = _SEGMENT | {"color": TRACKED_COLOUR, "alpha": 0.9}
+    marks = [Mark(segments, track_style), Mark(tracks.second[is_tracked], _TRACKED)]
+    right = Panel(images[1], f"Second image: {int(is_tracked.sum())} tracks", marks)
+    figure = draw_panels([[left, right]], _PAIR_SIZE_IN)
     style: dict[str, Any] = {"frameon": True, "facecolor": BLACK, "framealpha": 0.5, "fontsize": 8}
     figure.axes[0].legend(loc="lower left", labelcolor=WHITE, **style)
     return figure
 
 
 @in_page_style
-def draw_motion(products: Mapping[str, Any]) -> Figure:
+def draw_motion(products: Products) -> Figure:
     """Draw Fig. 2: three orthographic views of motion and structure."""
     motion, maps = _require(stages.read_motion(products), "motion"), stages.read_landing_maps(products)
     # without a map the vertical is unknown; the first camera's optical axis replaces it
@@ -93,7 +94,7 @@ def draw_motion(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def draw_epipolar(products: Mapping[str, Any]) -> Figure:
+def draw_epipolar(products: Products) -> Figure:
     """Draw Fig. 3: structure pixels in the first image, their segments and matches in the second."""
     images = _require(stages.read_images(products), "images")
     matches = _require(stages.read_matches(products), "matches")
@@ -109,15 +110,15 @@ def draw_epipolar(products: Mapping[str, Any]) -> Figure:
         n_matches = f"{int(matches.accepted[indices].sum()):,} of {n_matches}"
     segments = np.stack([matches.starts[indices], matches.ends[indices]])
     matched = matches.matched[indices][matches.accepted[indices]]
-    first_marks = [(matches.grid[indices], _SQUARE | {"color": "#ff4b3e"})]
-    second_marks = [(segments, _SEGMENT | {"color": "#35d46b"}), (matched, _SQUARE | {"color": BLUE})]
-    left = MarkedImage(f"First image: {n_pixels} structure pixels", images[0], first_marks)
-    right = MarkedImage(f"Second image: {n_matches} matches", images[1], second_marks)
-    return draw_marked_images([left, right], _PAIR_SIZE_IN)
+    first_marks = [Mark(matches.grid[indices], _SQUARE | {"color": "#ff4b3e"})]
+    second_marks = [Mark(segments, _SEGMENT | {"color": "#35d46b"}), Mark(matched, _SQUARE | {"color": BLUE})]
+    left = Panel(images[0], f"First image: {n_pixels} structure pixels", first_marks)
+    right = Panel(images[1], f"Second image: {n_matches} matches", second_marks)
+    return draw_panels([[left, right]], _PAIR_SIZE_IN)
 
 
 @in_page_style
-def draw_elevation(products: Mapping[str, Any]) -> Figure:
+def draw_elevation(products: Products) -> Figure:
     """Draw Fig. 4: two views of the elevation map."""
     maps = _require(stages.read_landing_maps(products), "maps")
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
@@ -129,7 +130,7 @@ def draw_elevation(products: Mapping[str, Any]) -> Figure:
 
 
 @in_page_style
-def draw_maps(products: Mapping[str, Any]) -> Figure:
+def draw_maps(products: Products) -> Figure:
     """Draw Fig. 5 (A): elevation, roughness, slope and safe landing map; bottom row: truth in the same coordinates."""
     maps = _require(stages.read_landing_maps(products), "maps")
     truth = _require(stages.read_ground_truth(products), "truth")
@@ -202,7 +203,7 @@ def drawn_sites(maps: stages.LandingMaps) -> dict[str, Float[np.ndarray, "2"]]:
 
 
 @in_page_style
-def draw_site(products: Mapping[str, Any]) -> Figure:
+def draw_site(products: Products) -> Figure:
     """Draw Fig. 7 and Fig. 5 (B): the first image; safe landing map and site on the image, and on the terrain."""
     images = _require(stages.read_images(products), "images")
     maps = _require(stages.read_landing_maps(products), "maps")
@@ -231,7 +232,6 @@ def draw_site(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-Products = Mapping[str, Any]
 #: For each file name, in the paper's order: function that reads the products, and function that draws the figure.
 _FIGURES: Mapping[str, tuple[Callable[[Products], object], Callable[[Products], Figure]]] = {
     "fig1-tracks": (stages.read_tracked_features, draw_tracks),
@@ -247,11 +247,6 @@ FIGURES = {name: draw for name, (_, draw) in _FIGURES.items()}
 def available_figures(products: Products) -> list[str]:
     """List the names of the figures whose stages a case reached."""
     return [name for name, (read_stage, _) in _FIGURES.items() if read_stage(products) is not None]
-
-
-def write_hda_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write the figures of the stages that a case reached into a folder; returns their paths."""
-    return save_figures(directory, {name: FIGURES[name](products) for name in available_figures(products)}, dpi=130)
 
 
 def _require(product: Product | None, name: str) -> Product:

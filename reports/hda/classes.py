@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -128,10 +128,7 @@ def create_class_blocks(frame: Rows) -> list[Block]:
         caption = "Bars are the intervals of the table. There is no bar if the rate is 0."
         figures.append(section.svg_figure(class_figure(hazards), "classes", caption))
     blocks = [Block(heading="Missed hazards by size", figures=figures, grid=class_grid)] if hazards else []
-    data = {
-        "rates": {name: asdict(item) for name, item in rates.items()},
-        "classes": [asdict(item) for item in classes],
-    }
+    data = {"rates": rates, "classes": classes}
     heading, note = "Safe footprints and large hazards", f"{_CLASS_NOTE} {_RATE_NOTE}"
     return [*blocks, Block(heading=heading, grid=rate_grid, note=note, data=data)]
 
@@ -242,8 +239,7 @@ def limits_section(subject: Subject) -> Section | None:
         Block(heading="Knees", grid=drop_empty_columns(knee_grid), note=note_text("hda.limits")),
         Block(heading="By size", grid=size_grid),
     ]
-    data = {"curves": [asdict(curve) for curve in curves]}
-    return Section("limits", "Limits", "Tracking by change between the images", blocks, data)
+    return Section("limits", "Limits", "Tracking by change between the images", blocks, {"curves": curves})
 
 
 def tracking_curves(frame: pd.DataFrame) -> list[TrackingCurve]:

@@ -15,20 +15,26 @@ from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.blocks import rate_block
 from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
-from marsyard.reports.hda.case_figures import (
-    FIGURES,
-    available_figures,
-    drawn_sites,
-    is_unknown_everywhere,
-    write_hda_figures,
-)
+from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
 from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
-from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, is_true, to_float
-from marsyard.reports.section import Section, Subject, create_section, draw_images, svg_figure
+from marsyard.reports.images import draw_images
+from marsyard.reports.presentation import (
+    CaseFigure,
+    CaseKind,
+    CaseView,
+    Cause,
+    Presentation,
+    Products,
+    TableRow,
+    is_true,
+    to_float,
+)
+from marsyard.reports.section import Section, Subject, create_section
 from marsyard.reports.wording import note_text, number
 
 _CAPTIONS: Mapping[str, str] = {
+    "fig1-tracks": "Fig. 1: features of the first image and their tracks in the second image.",
     "fig2-motion": "Fig. 2: estimated motion and structure. Rectangles are the fields of view on the ground; short "
     "lines are the axes of the cameras.",
     "fig3-epipolar": "Fig. 3: structure pixels (red), epipolar segments (green), matches (blue).",
@@ -50,29 +56,23 @@ _LEGEND = (
     "unknown if the images do not show the complete footprint. The a-priori site is set before the images are "
     "processed."
 )
-#: This figure is not on the page, since its images are those of Fig. 3; only `marsyard replay` draws it.
+#: This figure is only in files, since its images are those of Fig. 3.
 _OMITTED_FIGURE = "fig1-tracks"
 
 
-def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a landing case; it contains only the images if no stage of the paper has results.
-
-    `key` is the prefix of the identifiers of figures.
-    """
-    names = [name for name in available_figures(products) if name != _OMITTED_FIGURE]
+def view(products: Products, complete: bool = False) -> CaseView:
+    """Create the view of a landing case; it contains only the images if no stage of the paper has results."""
+    names = [name for name in available_figures(products) if complete or name != _OMITTED_FIGURE]
+    head, rows = _stage_rows(products)
     image_pair = stages.read_images(products)
     if not names and image_pair is not None:
-        caption = "The two images that the algorithm received."
-        figure = svg_figure(draw_images(image_pair), f"{key}images", caption, wide=True)
-        return CaseView([], [figure], *_stage_rows(products), note_text("hda.plain_legend"))
-    named_figures = [(name, FIGURES[name](products)) for name in names]
-    svg_figures = [
-        svg_figure(figure, f"{key}{name[:4]}", _caption(name, products), wide=True) for name, figure in named_figures
-    ]
-    return CaseView([], svg_figures, *_stage_rows(products))
+        figure = CaseFigure("images", draw_images(image_pair), "The two images that the algorithm received.")
+        return CaseView([figure], head=head, rows=rows, legend=note_text("hda.plain_legend"))
+    figures = [CaseFigure(name, FIGURES[name](products), _caption(name, products)) for name in names]
+    return CaseView(figures, head=head, rows=rows)
 
 
-def _caption(name: str, products: Mapping[str, Any]) -> str:
+def _caption(name: str, products: Products) -> str:
     """Create the caption of a figure, with the marks and the state of the map that it contains."""
     maps = stages.read_landing_maps(products)
     sentences = [_CAPTIONS[name]]
@@ -83,7 +83,7 @@ def _caption(name: str, products: Mapping[str, Any]) -> str:
     return " ".join(sentences)
 
 
-def _stage_rows(products: Mapping[str, Any]) -> tuple[list[str], list[TableRow]]:
+def _stage_rows(products: Products) -> tuple[list[str], list[TableRow]]:
     """Create head and rows of the table of results by stage."""
     tracks, motion = stages.read_tracked_features(products), stages.read_motion(products)
     matches, maps = stages.read_matches(products), stages.read_landing_maps(products)
@@ -152,7 +152,7 @@ def sites_section(subject: Subject) -> Section | None:
 
 
 HDA = Presentation(
-    cases=(CaseKind(stages.is_hda_case, view, write_hda_figures, _LEGEND),),
+    cases=(CaseKind(stages.is_hda_case, view, _LEGEND),),
     sections=(
         sections.threshold_section, sections.faults_section, limits_section, sections.map_section, touchdown_section,
         sites_section, run_times_section,

@@ -116,10 +116,8 @@ def read_images(products: Mapping[str, Any]) -> tuple[Float[np.ndarray, "_ _"], 
 
 def read_tracked_features(products: Mapping[str, Any]) -> TrackedFeatures | None:
     """Read features and tracks; None if missing."""
-    arrays = read_arrays(products, {"features": (None, 2), "tracked": (None, 2), "tracks_accepted": (None,)})
-    if arrays is None or len({len(array) for array in arrays}) > 1:
-        return None
-    return TrackedFeatures(arrays[0], arrays[1], arrays[2] > 0.5)
+    arrays = read_arrays(products, {"features": ("n", 2), "tracked": ("n", 2), "tracks_accepted": ("n",)})
+    return None if arrays is None else TrackedFeatures(arrays[0], arrays[1], arrays[2] > 0.5)
 
 
 def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
@@ -135,17 +133,17 @@ def read_motion(products: Mapping[str, Any]) -> EstimatedMotion | None:
 
 def read_matches(products: Mapping[str, Any]) -> EpipolarMatches | None:
     """Read structure pixels and matches; None if missing."""
-    shapes = dict.fromkeys(("grid", "segment_starts", "segment_ends", "matched"), (None, 2))
-    arrays = read_arrays(products, {**shapes, "matches_accepted": (None,)})
-    if arrays is None or len({len(array) for array in arrays}) > 1:
+    shapes = dict.fromkeys(("grid", "segment_starts", "segment_ends", "matched"), ("n", 2))
+    arrays = read_arrays(products, {**shapes, "matches_accepted": ("n",)})
+    if arrays is None:
         return None
     return EpipolarMatches(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4] > 0.5)
 
 
 def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     """Read the maps; None if the case has no elevation map."""
-    maps = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), (None, None)))
-    if maps is None or len({values.shape for values in maps}) > 1 or min(maps[0].shape) < 2:
+    maps = read_arrays(products, dict.fromkeys(("elevation", "roughness", "slope", "safety"), ("v", "u")))
+    if maps is None or min(maps[0].shape) < 2:
         return None
     shapes = {"corner": (2,), "apriori": (2,), "surface_from_camera": (3, 3), "world_from_surface": (3, 3)}
     frames = read_arrays(products, shapes | {"limits": (3,)}, finite=True)

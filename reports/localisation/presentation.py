@@ -1,14 +1,18 @@
-"""Presentation of localisation on a map: report sections, and views of cases."""
+"""Presentation of localisation on a map: report sections, and views of cases.
+
+Figures of a case: errors over time, the map with the track, and the landmarks of the last image.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
+from matplotlib.figure import Figure
 
 from marsyard.algorithms.localisation.interface import PositionOutcome
 from marsyard.reports.blocks import (
@@ -22,30 +26,126 @@ from marsyard.reports.blocks import (
     rate_block,
     scatter_block,
 )
-from marsyard.reports.common_sections import evaluate_consistency
-from marsyard.reports.localisation import case_figures as figures
-from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, save_figures, to_float
-from marsyard.reports.rates import CaseFraction, finite_values, fraction_of
-from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
+from marsyard.reports.images import Mark, Panel, draw_panels
+from marsyard.reports.presentation import (
+    CaseFigure,
+    CaseKind,
+    CaseView,
+    Cause,
+    Presentation,
+    Products,
+    TableRow,
+    check_shape,
+    read_arrays,
+    to_float,
+    to_matrix,
+)
+from marsyard.reports.rates import CaseFraction, fraction_of
+from marsyard.reports.section import (
+    INK,
+    MUTED,
+    REQUIREMENT,
+    SERIES,
+    Section,
+    Subject,
+    create_section,
+    has_values,
+    in_page_style,
+)
 from marsyard.reports.wording import number, numbers
+
+_AXES = ("east", "north", "up")
+#: Enlargement of the landmarks' residuals.
+_RESIDUAL_SCALE = 20.0
+
+
+def is_localisation_case(products: Products) -> bool:
+    """Return whether products contain the track of a localisation case and its map, with the outcomes of the track."""
+    shapes = {"track": ("n", 7), "inliers": ("n",), "true_xy_m": (None, 2), "estimated_xy_m": (None, 2)}
+    arrays = read_arrays(products, shapes)
+    extent = read_arrays(products, {"map_extent_m": (4,)}, finite=True)
+    if arrays is None or extent is None or to_matrix(products.get("map")) is None:
+        return False
+    outcomes = products.get("outcomes")
+    names = [str(name) for name in outcomes] if isinstance(outcomes, list | tuple | np.ndarray) else []
+    return len(arrays[0]) == len(names) and set(names) <= set(PositionOutcome.__members__)
+
+
+def read_track(products: Products) -> Float[np.ndarray, "n 7"]:
+    """Read the track: time, errors east, north, up, and their standard deviations; NaN for a refusal."""
+    track = check_shape(products.get("track"), None, 7)
+    if track is None:
+        raise ValueError("the products contain no track of a localisation case")
+    return track
+
+
+@in_page_style
+def draw_errors(products: Products) -> Figure:
+    """Draw the position error of each component over time, with bands of three standard deviations."""
+    track = read_track(products)
+    valid = track[np.isfinite(track[:, 0])]
+    figure = Figure(figsize=(12.0, 3.2), layout="constrained")
+    for component, (name, axes) in enumerate(zip(_AXES, figure.subplots(1, 3), strict=True)):
+        band = 3.0 * valid[:, 4 + component]
+        axes.fill_between(valid[:, 0], -band, band, color=MUTED, alpha=0.25, linewidth=0.0)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
+        axes.plot(valid[:, 0], valid[:, 1 + component], marker="o", color=SERIES[component])
+        axes.set(xlabel="Time after the start (s)", ylabel=f"Position error {name} (m)")
+    return figure
+
+
+@in_page_style
+def draw_map(products: Products) -> Figure:
+    """Draw the map with true and estimated positions."""
+    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    extent = np.asarray(products["map_extent_m"], dtype=np.float64) / 1e3
+    axes.imshow(products["map"], cmap="gray", origin="lower", extent=tuple(extent), interpolation="antialiased")
+    true, estimated = (np.asarray(products[name], dtype=np.float64) / 1e3 for name in ("true_xy_m", "estimated_xy_m"))
+    initial = check_shape(products.get("initial_xy_m"), 2)
+    if initial is not None:
+        axes.plot(*initial / 1e3, marker="X", color=SERIES[3], linestyle="none", markersize=9.0, label="initial")
+    axes.plot(*true.T, color=SERIES[0], linewidth=3.0, label="true")
+    axes.plot(*estimated.T, marker="o", color=SERIES[1], linestyle="none", markersize=4.0, label="estimated")
+    axes.set(xlabel="East (km)", ylabel="North (km)")
+    axes.grid(visible=False)
+    axes.legend(frameon=True, facecolor="white", framealpha=1.0, labelcolor="black")
+    return figure
+
+
+def draw_landmarks(products: Products) -> Figure | None:
+    """Draw the last image with its landmarks and their residuals; None without landmarks."""
+    shapes = {"landmarks_px": ("n", 2), "landmarks_residual_px": ("n", 2), "landmarks_used": ("n",)}
+    arrays, image = read_arrays(products, shapes), to_matrix(products.get("image_2"))
+    if arrays is None or image is None:
+        return None
+    pixels, residuals, flags = arrays
+    used = flags > 0.5
+    marks = []
+    for mask, colour, marker in ((used, SERIES[2], "o"), (~used, REQUIREMENT, "x")):
+        style = {"marker": marker, "linestyle": "none", "markersize": 4.0, "fillstyle": "none"}
+        segments = np.stack([pixels[mask], pixels[mask] + _RESIDUAL_SCALE * residuals[mask]])
+        marks += [Mark(pixels[mask], style | {"color": colour}), Mark(segments, {"color": colour, "linewidth": 0.8})]
+    return draw_panels([[Panel(image, marks=marks)]], (6.0, 6.0))
+
 
 _LEGEND = "The blue line is the true position; the bands are three standard deviations that the algorithm reports."
 #: Required position error: the bound of a false fix.
 _MAX_POSITION_ERROR_M = 40.0
 
 
-def view(products: Mapping[str, Any], key: str) -> CaseView:
+def view(products: Products, _complete: bool = False) -> CaseView:
     """Create the view of a localisation case: error over time, map, landmarks, and a table of the estimates."""
-    svg_figures = [
-        svg_figure(figures.draw_errors(products), f"{key}errors", "Position error over time.", wide=True),
-        svg_figure(figures.draw_map(products), f"{key}map", "True and estimated positions on the map."),
+    drawn = [
+        CaseFigure("errors", draw_errors(products), "Position error over time."),
+        CaseFigure("map", draw_map(products), "True and estimated positions on the map.", wide=False),
     ]
-    landmarks = figures.draw_landmarks(products)
+    landmarks = draw_landmarks(products)
     if landmarks is not None:
         caption = "Landmarks in the last image: used (green), rejected (red); residuals enlarged twenty times."
-        svg_figures.append(svg_figure(landmarks, f"{key}landmarks", caption))
+        drawn.append(CaseFigure("landmarks", landmarks, caption, wide=False))
     rows = []
-    track, outcomes, inliers = figures.read_track(products), products["outcomes"], products["inliers"]
+    track, outcomes, inliers = read_track(products), products["outcomes"], products["inliers"]
     for index, (values, outcome) in enumerate(zip(track, outcomes, strict=True)):
         is_valid = bool(np.isfinite(values[0]))
         name = f"image {index + 1}" if index < len(track) - 1 else "end"
@@ -54,16 +154,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
         errors = [number(float(value)) if is_valid else "" for value in (*values[1:4], np.hypot(*values[4:6]))]
         rows.append(TableRow([name, text, used, *errors], is_valid))
     head = ["Estimate", "Outcome", "Landmarks used", "Error east (m)", "north (m)", "up (m)", "Reported sd (m)"]
-    return CaseView([], svg_figures, head, rows)
-
-
-def write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write the figures of a case into a folder."""
-    named_figures = {"errors": figures.draw_errors(products), "map": figures.draw_map(products)}
-    landmarks = figures.draw_landmarks(products)
-    if landmarks is not None:
-        named_figures["landmarks"] = landmarks
-    return save_figures(directory, named_figures)
+    return CaseView(drawn, head=head, rows=rows)
 
 
 _FIXED_IN_TIME = Rate("fixed_in_time", "Position reported within 10 s", flag_rate("fixed_in_time"))
@@ -101,36 +192,6 @@ _ERRORS = (
 )
 
 
-#: Degrees of freedom: the components of the horizontal position.
-_DEGREES_OF_FREEDOM = 2
-#: Probability of the interval of the mean, and of the error ellipse.
-_PROBABILITY = 0.9
-
-
-def create_consistency_block(frame: pd.DataFrame) -> Block | None:
-    """Compare the normalised squared errors (NEES) with the chi-square distribution with two degrees of freedom."""
-    nees = finite_values(frame, "position_nees")
-    if nees.size == 0:
-        return None
-    result = evaluate_consistency(nees, _DEGREES_OF_FREEDOM, _PROBABILITY)
-    rows = [
-        ["Descents with a final position", f"{nees.size:,}"],
-        ["Mean of the normalised squared error", number(result["mean"])],
-        [
-            f"{100 * _PROBABILITY:.0f} % interval of this mean for a correct covariance",
-            f"{result['lower']:.2f} to {result['upper']:.2f}",
-        ],
-        [f"Errors within the {100 * _PROBABILITY:.0f} % ellipse", f"{100.0 * result['inside']:.1f} %"],
-    ]
-    note = (
-        "The normalised squared error is e' P^-1 e with the horizontal error e and its reported covariance P. Its mean "
-        "is 2 for a correct covariance; larger values mean that the errors are larger than reported. The interval "
-        "assumes independent descents."
-    )
-    data = {"nees": {name: result[name] for name in ("n", "mean", "lower", "upper", "inside")}}
-    return Block(heading="Consistency of the covariance", grid=Grid(["", ""], rows), note=note, data=data)
-
-
 def position_section(subject: Subject) -> Section | None:
     """Create the section on the position on the map; None for cases of another system."""
     frame = subject.frame
@@ -153,7 +214,6 @@ def position_section(subject: Subject) -> Section | None:
         rate_block(rates_by_name, "Descents", "Positions"),
         distribution,
         quantile_block(frame, _QUANTITIES, {"5 %": 0.05, "Median": 0.5, "95 %": 0.95, "99 %": 0.99}, "Distributions"),
-        create_consistency_block(frame),
     )
 
 
@@ -200,7 +260,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 
 LOCALISATION = Presentation(
-    cases=(CaseKind(figures.is_localisation_case, view, write_figures, _LEGEND),),
+    cases=(CaseKind(is_localisation_case, view, _LEGEND),),
     first=(position_section,),
     sections=(conditions_section,),
     outcomes=(PositionOutcome,),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,10 +12,19 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports import presentation
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
-from marsyard.reports.presentation import CaseKind, CaseView, Presentation, TableRow, numeric_product, to_matrix
+from marsyard.reports.images import Image, show_image
+from marsyard.reports.presentation import (
+    CaseFigure,
+    CaseKind,
+    CaseView,
+    Presentation,
+    Products,
+    TableRow,
+    check_shape,
+    to_matrix,
+)
 from marsyard.reports.section import (
     MARKERS,
     MUTED,
@@ -28,7 +35,6 @@ from marsyard.reports.section import (
     Subject,
     in_page_style,
     new_axes,
-    show_image,
     svg_figure,
 )
 from marsyard.reports.wording import NOTHING, label, number, numbers
@@ -126,21 +132,18 @@ _LEGEND = (
 )
 
 
-def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a measured case."""
+def view(products: Products, complete: bool = False) -> CaseView:
+    """Create the view of a measured case; only the complete view has all pairs of images."""
     pairs = read_matched_pairs(products)
-    svg_figures = [
-        svg_figure(draw_pair(pair), f"{key}matches{pair.number}", f"{pair.caption}.", wide=True)
-        for pair in pairs[:_MAX_PAIRS]
-    ]
-    n_omitted = len(pairs) - _MAX_PAIRS
-    facts = [("Pairs not shown", str(n_omitted))] if n_omitted > 0 else []
+    drawn_pairs = pairs if complete else pairs[:_MAX_PAIRS]
+    figures = [CaseFigure(f"matches-{pair.number}", draw_pair(pair), f"{pair.caption}.") for pair in drawn_pairs]
+    n_omitted = len(pairs) - len(drawn_pairs)
+    facts = [("Pairs not shown", str(n_omitted))] if n_omitted else []
     if DIMES_CASE.is_case(products) and "tracks" in products:
-        dimes = DIMES_CASE.view(products, key)
-        return CaseView([*facts, *dimes.facts], [*svg_figures, *dimes.figures], dimes.head, dimes.rows)
-    named_figures = [(name, FIGURES[name](products)) for name in _landing_figures(products)]
-    captions = _FIGURES_WITHOUT_TRUTH
-    svg_figures += [svg_figure(figure, f"{key}{name[:4]}", captions[name], wide=True) for name, figure in named_figures]
+        dimes = DIMES_CASE.view(products, complete)
+        return CaseView([*figures, *dimes.figures], [*facts, *dimes.facts], dimes.head, dimes.rows)
+    names = [name for name in available_figures(products) if name in _FIGURES_WITHOUT_TRUTH]
+    figures += [CaseFigure(name, FIGURES[name](products), _FIGURES_WITHOUT_TRUTH[name]) for name in names]
     head = ["Images", "Inliers", "Outliers", "Median residual (px)", "90 % quantile (px)"]
     head += ["Offset right (px)", "Offset down (px)"]
     rows = []
@@ -153,25 +156,11 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
             values = [np.median(residuals), percentile_90, *np.nanmedian(offsets, axis=0)]
             texts = [number(float(value)) for value in values]
         rows.append(TableRow([*head_cells, *texts], succeeded=residuals.size > 0))
-    return CaseView(facts, svg_figures, head, rows)
-
-
-def _landing_figures(products: Mapping[str, Any]) -> list[str]:
-    return [name for name in available_figures(products) if name in _FIGURES_WITHOUT_TRUTH]
-
-
-def _write_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    pairs = read_matched_pairs(products)
-    written = presentation.save_figures(directory, {f"matches-{pair.number}": draw_pair(pair) for pair in pairs})
-    if DIMES_CASE.is_case(products) and "tracks" in products:
-        return [*written, *DIMES_CASE.write(directory, products)]
-    figures = {name: FIGURES[name](products) for name in _landing_figures(products)}
-    return [*written, *presentation.save_figures(directory, figures, dpi=130)]
+    return CaseView(figures, facts, head, rows)
 
 
 MEASURED = Presentation(
-    cases=(CaseKind(lambda products: bool(read_matched_pairs(products)), view, _write_figures, _LEGEND),),
-    first=(agreement_section,),
+    cases=(CaseKind(lambda products: bool(read_matched_pairs(products)), view, _LEGEND),), first=(agreement_section,)
 )
 
 
@@ -194,7 +183,7 @@ class MatchedPair:
     """
 
     number: int
-    images: tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_ _"]]
+    images: tuple[Image, Image]
     pixels: Float[np.ndarray, "n 2 2"]
     offsets: Float[np.ndarray, "n 2"]
     inlier: Bool[np.ndarray, " n"]
@@ -213,14 +202,14 @@ class MatchedPair:
         return f"Images {self.number} and {self.number + 1}: {residuals.size:,} matches{median}"
 
 
-def read_matched_pairs(products: Mapping[str, Any]) -> list[MatchedPair]:
+def read_matched_pairs(products: Products) -> list[MatchedPair]:
     """Read the valid pairs of a case's products (`marsyard.scenarios.measured.consistency.agreement_products`)."""
     pairs = []
     for image_number in _IMAGE_NUMBERS:
-        table = numeric_product(products.get(f"matches_{image_number}"))
-        first, second = (to_matrix(products.get(f"image_{image_number + offset}")) for offset in (0, 1))
         # columns of the table: (u, v) in both images, offset (u, v), and 1 for inliers
-        if table is not None and table.ndim == 2 and table.shape[1] == 7 and first is not None and second is not None:
+        table = check_shape(products.get(f"matches_{image_number}"), None, 7)
+        first, second = (to_matrix(products.get(f"image_{image_number + offset}")) for offset in (0, 1))
+        if table is not None and first is not None and second is not None:
             pixels, is_inlier = table[:, :4].reshape(-1, 2, 2), table[:, 6] > 0.0
             pairs.append(MatchedPair(image_number, (first, second), pixels, table[:, 4:6], is_inlier))
     return pairs

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,26 +18,25 @@ from jaxtyping import Float
 from matplotlib import patheffects
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.gridspec import SubplotSpec
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle
 from scipy import ndimage
 
-from marsyard.reports.presentation import check_shape, numeric_product, save_figures, to_matrix
-from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style, show_subframe
+from marsyard.reports.images import Image, Mark, Panel, box, draw_panels, square
+from marsyard.reports.presentation import Products, check_shape, numeric_product, to_matrix
+from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style
 
-Image = Float[np.ndarray, "_ _"]
 Point = Float[np.ndarray, "2"]
 #: Orange and blue of Okabe and Ito; the true position is a white cross with a dark outline. The target's square is
 #: solid and the window is dashed, since colour must not be the only distinction.
 TARGET, WINDOW, TRUTH = "#f0a202", "#56b4e9", "#ffffff"
 _OUTLINE = [patheffects.Stroke(linewidth=2.0, foreground="#000000"), patheffects.Normal()]
 #: Styles of the marks in the subframes.
-_WINDOW_STYLE: dict[str, Any] = {"edgecolor": WINDOW, "linewidth": 1.3, "linestyle": (0, (4, 2)), "fill": False}
-_TARGET_STYLE: dict[str, Any] = {"edgecolor": TARGET, "linewidth": 1.3, "linestyle": "-", "fill": False}
+_WINDOW_STYLE: dict[str, Any] = {"color": WINDOW, "linewidth": 1.3, "linestyle": (0, (4, 2)), "label": "search window"}
+_TARGET_STYLE: dict[str, Any] = {"color": TARGET, "linewidth": 1.3, "label": "tracked target"}
 _TRUTH_STYLE: dict[str, Any] = {
     "color": TRUTH, "marker": "+", "markersize": 5.5, "markeredgewidth": 0.9, "path_effects": _OUTLINE, "linestyle": "",
+    "label": "true projection of the designated point",
 }  # fmt: skip
 #: Side of the enlarged template as drawn, pixels.
 _ENLARGED_PX = 126
@@ -48,6 +46,7 @@ _MAX_COLUMNS, _CELL_SIZE_IN = 4, (3.0, 2.35)
 _MIN_SPACING = 0.07
 #: Quantiles of a subframe's values that are drawn as black and as white.
 _CONTRAST_QUANTILES = (0.005, 0.998)
+_TITLE_STYLE = {"fontsize": 7.5, "fontweight": "normal", "loc": "left", "linespacing": 1.25}
 #: Minimum ratio of height to width of the path's axes, since paths are mostly straight.
 _MIN_ASPECT = 0.5
 #: Valid numbers of stops.
@@ -107,18 +106,18 @@ class RoverPath:
     rocks: Float[np.ndarray, "rocks 3"]
 
 
-def is_vtt_case(products: Mapping[str, Any]) -> bool:
+def is_vtt_case(products: Products) -> bool:
     """Whether products contain the image of a stop and a template's size."""
     return to_matrix(products.get("stop_1_left")) is not None and read_template_px(products) is not None
 
 
-def read_template_px(products: Mapping[str, Any]) -> float | None:
+def read_template_px(products: Products) -> float | None:
     """Read the side of the template, pixels; None if unknown."""
     side = numeric_product(products.get("template_px"))
     return float(side) if side is not None and side.ndim == 0 and np.isfinite(side) else None
 
 
-def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
+def read_stops(products: Products) -> list[StopImages]:
     """Read the stops in order, up to the first stop without a left subframe."""
     stops: list[StopImages] = []
     states, table = products.get("states"), products.get("figures")
@@ -145,7 +144,7 @@ def read_stops(products: Mapping[str, Any]) -> list[StopImages]:
     return stops
 
 
-def read_rover_path(products: Mapping[str, Any]) -> RoverPath | None:
+def read_rover_path(products: Products) -> RoverPath | None:
     """Read the top view of the run; None if missing."""
     target = numeric_product(products.get("target_m"))
     stops, estimated = _read_positions(products.get("rover_true_m")), _read_positions(products.get("rover_estimated_m"))
@@ -170,37 +169,34 @@ def _read_positions(value: object) -> Float[np.ndarray, "n 2"]:
 
 
 @in_page_style
-def draw_stops(products: Mapping[str, Any], max_stops: int | None = None) -> Figure:
+def draw_stops(products: Products, max_stops: int | None = None) -> Figure:
     """Draw the subframes of all stops, or of `max_stops` evenly spaced stops including the first and the last."""
     stops = read_stops(products)
     if max_stops is not None and len(stops) > max_stops:
-        stops = [
-            stops[index] for index in np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))
-        ]
+        indices = np.unique(np.rint(np.linspace(0, len(stops) - 1, max_stops)).astype(np.int64))
+        stops = [stops[index] for index in indices]
     side_px = read_template_px(products)
     if not stops or side_px is None:
         raise ValueError("the products contain no image of a stop")
     columns = min(_MAX_COLUMNS, len(stops))
-    rows = -(-len(stops) // columns)
-    layout = ConstrainedLayoutEngine(w_pad=0.03, h_pad=0.06, wspace=0.02, hspace=0.02)
-    figure = Figure(figsize=(_CELL_SIZE_IN[0] * columns, _CELL_SIZE_IN[1] * rows), layout=layout)
-    grid = figure.add_gridspec(rows, columns)
-    for index, stop in enumerate(stops):
-        _draw_stop(figure, grid[index // columns, index % columns], stop, side_px)
-    marks: list[Any] = []
-    if any(np.isfinite([*stop.window, *stop.corners[0]]).all() for stop in stops):
-        marks.append(Rectangle((0, 0), 1, 1, label="search window", **_WINDOW_STYLE))
-    if any(stop.is_matched for stop in stops):
-        marks.append(Rectangle((0, 0), 1, 1, label="tracked target", **_TARGET_STYLE))
-    if any(np.isfinite(stop.point).all() for stop in stops):
-        marks.append(Line2D([], [], label="true projection of the designated point", **_TRUTH_STYLE))
-    if marks:
-        figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), fontsize=7.5)
+    rows: list[list[Panel]] = []
+    for first in range(0, len(stops), columns):
+        panels = [_stop_panels(stop, side_px) for stop in stops[first : first + columns]]
+        panels += [(Panel(), Panel(), Panel()) for _ in range(columns - len(panels))]
+        # a stop has two rows of three cells: the left subframe extends over two columns and both rows
+        rows.append([panel for left, enlarged, _ in panels for panel in (left, left, enlarged)])
+        rows.append([panel for left, _, right in panels for panel in (left, left, right)])
+    figure = draw_panels(rows, (_CELL_SIZE_IN[0] * columns, 0.5 * _CELL_SIZE_IN[1] * len(rows)))
+    labels = {mark.style["label"] for row in rows for panel in row for mark in panel.marks}
+    styles = (_WINDOW_STYLE, _TARGET_STYLE, _TRUTH_STYLE)
+    handles = [Line2D([], [], **style) for style in styles if style["label"] in labels]
+    if handles:
+        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=7.5)
     return figure
 
 
 @in_page_style
-def draw_path(products: Mapping[str, Any]) -> Figure:
+def draw_path(products: Products) -> Figure:
     """Draw the top view of the path, and the target's estimates; raises ValueError if the path is missing."""
     rover_path = read_rover_path(products)
     if rover_path is None:
@@ -213,49 +209,34 @@ def draw_path(products: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def write_vtt_figures(directory: Path, products: Mapping[str, Any]) -> list[Path]:
-    """Write `stops.png` and, if the products contain the path, `way.png` into a folder; returns their paths."""
-    figures = {"stops": draw_stops(products)}
-    if read_rover_path(products) is not None:
-        figures["way"] = draw_path(products)
-    return save_figures(directory, figures)
+def _stop_panels(stop: StopImages, side_px: float) -> tuple[Panel, Panel, Panel]:
+    """Create the panels of the left subframe of a stop, of the enlarged match, and of the right subframe.
 
-
-def _draw_stop(figure: Figure, cell: SubplotSpec, stop: StopImages, side_px: float) -> None:
-    """Draw the subframes of a stop and the enlarged match; `side_px` is the side of the template, pixels."""
-    cells = cell.subgridspec(2, 2, width_ratios=(2.0, 1.0))
-    left = figure.add_subplot(cells[:, 0])
-    show_subframe(left, stop.left, _CONTRAST_QUANTILES)
-    corner = stop.corners[0]
+    side_px: side of the template, pixels
+    """
+    corner, target = stop.corners[0], stop.matches[0] - stop.corners[0]
+    marks = square(target, side_px, _TARGET_STYLE)
     if np.isfinite([*stop.window, *corner]).all():
-        _draw_rectangle(left, stop.window[:2] - corner - 0.5, stop.window[2:], _WINDOW_STYLE)
-    point, limits = stop.point - corner, (left.get_xlim(), left.get_ylim()[::-1])
-    if all(low <= value <= high for value, (low, high) in zip(point, limits, strict=True)):
-        left.plot(*point[:, None], **_TRUTH_STYLE)
-    if stop.is_matched:
-        _draw_target(left, stop.matches[0] - corner, side_px)
-    left.set_title("\n".join(_title_lines(stop)), fontsize=7.5, fontweight="normal", loc="left", linespacing=1.25)
-    enlarged = figure.add_subplot(cells[0, 1])
+        marks.insert(0, box(stop.window[:2] - corner - 0.5, stop.window[2:], _WINDOW_STYLE))
+    point = stop.point - corner
+    if ((point >= -0.5) & (point <= np.array(stop.left.shape[::-1]) - 0.5)).all():
+        marks.append(Mark(point[None], _TRUTH_STYLE))
+    title = "\n".join(_title_lines(stop))
+    left = Panel(stop.left, title, marks, contrast=_CONTRAST_QUANTILES, title_style=_TITLE_STYLE)
+    enlarged = Panel(text="not found")
     if stop.is_matched:
         steps = (np.arange(_ENLARGED_PX) + 0.5) / _ENLARGED_PX * side_px - 0.5 * side_px
-        u, v = (stop.matches[0] - corner)[:, None] + steps
+        u, v = target[:, None] + steps
         pixels = np.meshgrid(v, u, indexing="ij")
-        show_subframe(
-            enlarged, ndimage.map_coordinates(stop.left, pixels, order=0, mode="nearest"), _CONTRAST_QUANTILES
-        )
-        enlarged.spines[:].set(visible=True, edgecolor=TARGET, linewidth=1.6)
-    else:
-        enlarged.set_axis_off()
-        enlarged.text(0.5, 0.5, "not found", ha="center", va="center", color=INK, fontsize=9, fontweight="bold")
-    right = figure.add_subplot(cells[1, 1])
+        template = ndimage.map_coordinates(stop.left, pixels, order=0, mode="nearest")
+        frame = {"edgecolor": TARGET, "linewidth": 1.6}
+        enlarged = Panel(template, frame=frame, contrast=_CONTRAST_QUANTILES)
     if stop.right is None:
-        right.set_axis_off()
-        return
+        return left, enlarged, Panel()
     match = stop.matches[1] - stop.corners[1]
     columns = _select_columns(stop.right.shape[1], stop.left.shape[1], float(match[0]))
-    show_subframe(right, stop.right[:, columns], _CONTRAST_QUANTILES)
-    if np.isfinite(match).all():
-        _draw_target(right, match - [columns.start, 0.0], side_px)
+    marks = square(match - np.array([columns.start, 0.0]), side_px, _TARGET_STYLE)
+    return left, enlarged, Panel(stop.right[:, columns], marks=marks, contrast=_CONTRAST_QUANTILES)
 
 
 def _select_columns(available: int, shown: int, centre: float) -> slice:
@@ -282,15 +263,6 @@ def _title_lines(stop: StopImages) -> list[str]:
     state = "" if stop.state in ("", "normal") else f" ({stop.state})"
     first_line = f"Stop {stop.number}{state}: {texts.get('range_m', '')}".rstrip(": ")
     return [first_line, *(line or " " for line in lines)]
-
-
-def _draw_target(axes: Axes, centre: Float[np.ndarray, "2"], side_px: float) -> None:
-    _draw_rectangle(axes, centre - 0.5 * side_px, np.full(2, side_px), _TARGET_STYLE)
-
-
-def _draw_rectangle(axes: Axes, corner: Point, size: Point, style: Mapping[str, Any]) -> None:
-    (x, y), (width, height) = corner.tolist(), size.tolist()
-    axes.add_patch(Rectangle((x, y), width, height, **style))
 
 
 def _draw_path_axes(axes: Axes, rover_path: RoverPath) -> None:

@@ -7,17 +7,19 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.algorithms.vtt.accuracy import HandOffOutcome
-from marsyard.reports.presentation import CaseKind, CaseView, Cause, Presentation, TableRow, is_true, to_float
-from marsyard.reports.section import svg_figure
-from marsyard.reports.vtt import sections
-from marsyard.reports.vtt.case_figures import (
-    draw_path,
-    draw_stops,
-    is_vtt_case,
-    read_rover_path,
-    read_stops,
-    write_vtt_figures,
+from marsyard.reports.presentation import (
+    CaseFigure,
+    CaseKind,
+    CaseView,
+    Cause,
+    Presentation,
+    Products,
+    TableRow,
+    is_true,
+    to_float,
 )
+from marsyard.reports.vtt import sections
+from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, read_rover_path, read_stops
 from marsyard.reports.vtt.goal import goal_section
 from marsyard.reports.wording import NOTHING, label, number, percent
 from marsyard.scenarios.rover.stops import RunOutcome
@@ -58,18 +60,17 @@ _LEGEND = (
 )
 
 
-def view(products: Mapping[str, Any], key: str) -> CaseView:
-    """Create the view of a tracking case."""
+def view(products: Products, complete: bool = False) -> CaseView:
+    """Create the view of a tracking case; only the complete view has the images of all stops."""
     stops = read_stops(products)
-    shows_selection = len(stops) > _MAX_STOPS
+    shows_selection = len(stops) > _MAX_STOPS and not complete
     captions = [f"{_MAX_STOPS} of the {len(stops)} stops."] if shows_selection else []
     captions.append(_CAPTION)
     if stops[0].right is not None and 2 * len(stops[0].right) < len(stops[0].left):
         captions.append(_STRIP_CAPTION)
-    caption = " ".join(captions)
-    svg_figures = [svg_figure(draw_stops(products, _MAX_STOPS), f"{key}stops", caption, wide=True)]
+    figures = [CaseFigure("stops", draw_stops(products, None if complete else _MAX_STOPS), " ".join(captions))]
     if read_rover_path(products) is not None:
-        svg_figures.append(svg_figure(draw_path(products), f"{key}way", _PATH_CAPTION, wide=True))
+        figures.append(CaseFigure("way", draw_path(products), _PATH_CAPTION))
     names = [name for name in _QUANTITIES if any(name in stop.quantities for stop in stops)]
     # without a loss, the tracker's state does not vary
     shows_state = any(stop.state not in ("", "normal") for stop in stops)
@@ -79,7 +80,7 @@ def view(products: Mapping[str, Any], key: str) -> CaseView:
         texts += [_format(name, stop.quantity(name)) for name in names]
         rows.append(TableRow(texts, stop.is_matched))
     head = ["Stop", *(["State"] if shows_state else []), *(_HEADS.get(name, label(name)) for name in names)]
-    return CaseView([], svg_figures, head, rows)
+    return CaseView(figures, head=head, rows=rows)
 
 
 def _format(name: str, value: float) -> str:
@@ -116,7 +117,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 
 VTT = Presentation(
-    cases=(CaseKind(is_vtt_case, view, write_vtt_figures, _LEGEND),),
+    cases=(CaseKind(is_vtt_case, view, _LEGEND),),
     first=(*sections.SECTIONS, goal_section),
     outcomes=(RunOutcome, HandOffOutcome),
     explain=explain,

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,8 +24,14 @@ from marsyard.reports.papers import paper_section, read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
 from marsyard.reports.stored import table
-from marsyard.reports.vtt.goal import is_closed_loop, is_tracking, losses_grid, losses_note, selectable_targets
-from marsyard.reports.vtt.table_1 import table_1_section
+from marsyard.reports.vtt.goal import (
+    is_closed_loop,
+    is_tracking,
+    losses_grid,
+    losses_note,
+    selectable_targets,
+    table_1_section,
+)
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
@@ -213,9 +218,7 @@ def steps_section(subject: Subject) -> Section | None:
     oblique = _obliquity_grid(subject.frame, "%" if motion["per_cent"] else "deg")
     if oblique is not None:
         blocks.append(Block(heading="By obliquity of the surface", grid=oblique, note=_OBLIQUITY_NOTE))
-    keys = ("good", "all_targets", "false_tracks")
-    data = [cell | {name: asdict(cell[name]) for name in keys} for cell in steps]
-    return Section("steps", "Steps", motion["title"], blocks, {"cells": data})
+    return Section("steps", "Steps", motion["title"], blocks, {"cells": steps})
 
 
 def _read_motion(subject: Subject) -> Mapping[str, Any] | None:
@@ -328,8 +331,7 @@ def terrains_section(subject: Subject) -> Section | None:
             rates.fraction_text(held_fraction) if held_fraction.n else NOTHING,
         ]
         rows.append([name, *paper, *simulated_texts, percent(slip)])
-        fractions = {"failed": asdict(failure_fraction), "failed_all": asdict(failure_fraction_all)}
-        fractions["stuck_held"] = asdict(held_fraction)
+        fractions = {"failed": failure_fraction, "failed_all": failure_fraction_all, "stuck_held": held_fraction}
         data.append({"name": name, **fractions, "causes": cause_counts, "slip_max": slip})
     head = ["Terrain", "Failures, paper", "Reason, paper", "Failures, ours", f"{format_fraction(CONFIDENCE)} interval"]
     head += ["Cause, ours", "Failures, all targets", "Stuck: target held", "Maximum wheel slip"]
@@ -390,7 +392,7 @@ def regression_section(subject: Subject) -> Section | None:
     if loss_grid.rows:
         note = losses_note(frame)
         blocks.append(Block(heading="Runs that lost the target", grid=loss_grid, note=note))
-    data = {"tracked": asdict(rates.flag_fraction(frame, "tracked"))}
+    data = {"tracked": rates.flag_fraction(frame, "tracked")}
     return Section("regression", "Regression", "Regression runs on the engineering model", blocks, data)
 
 

@@ -14,5 +14,5 @@ SYSTEM = System(
     tasks=("marsyard.scenarios.velocity:VELOCITY",),
     folder=Path(__file__).resolve().parent,
     columns={"fieldtest": "marsyard.scenarios.fieldtest.row:COLUMNS"},
-    report="marsyard.reports.dimes.presentation:FIELD_TEST",
+    report="marsyard.reports.fieldtest.presentation:FIELD_TEST",
 )

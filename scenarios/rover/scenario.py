@@ -368,7 +368,9 @@ def run_tracker(p: RoverScenarioParameters, track: Callable[[], Run]) -> Algorit
         run = track()
         return ScoredTrack(run, {**score.score_run(p, run), **score.tracking_row(run)})
 
-    return run_algorithm(track_and_score, lambda answer: cast(ScoredTrack, answer))
+    algorithm_run = run_algorithm(track_and_score, lambda answer: cast(ScoredTrack, answer))
+    # the time includes that of the images, which follow from the answers
+    return algorithm_run if algorithm_run.answer is None else replace(algorithm_run, row={})
 
 
 def score_track(p: RoverScenarioParameters, track: ScoredTrack | None, *, is_tested: bool) -> Score:

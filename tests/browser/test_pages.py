@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pandas as pd
@@ -16,6 +14,7 @@ from playwright.sync_api import Page
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
+from tests.reports import synthetic_run
 from tests.reports.hda import synthetic_landing
 from tests.reports.localisation import synthetic_localisation
 from tests.reports.vtt import tracking_rows
@@ -28,26 +27,15 @@ OpenPage = Callable[..., tuple[Page, Any]]
 LEVELS = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22a", "wcag22aa"]
 
 
-def _load_synthetic_runs() -> ModuleType:
-    """Import tests/reports/conftest.py, which writes synthetic runs."""
-    path = Path(__file__).resolve().parents[1] / "reports" / "conftest.py"
-    spec = importlib.util.spec_from_file_location("synthetic_runs", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture(scope="module")
 def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a dashboard of three campaigns, one of them with images of a case."""
-    folder, synthetic_runs = tmp_path_factory.mktemp("campaigns"), _load_synthetic_runs()
+    folder = tmp_path_factory.mktemp("campaigns")
     for day, (site, cases) in enumerate((("gusev", 300), ("meridiani", 24), ("gusev", 24)), start=1):
-        frame = synthetic_runs.synthetic_frame(cases, terrains=1000, seed=day, n_crashed=day == 2)
-        products = synthetic_runs.synthetic_products() if day == 1 else None
-        changes = {"started_utc": f"2026-01-0{day}T00:00:00Z", "name": f"dimes-{site}"}
-        directory = synthetic_runs.write_run(folder / f"run-{day}", frame, products=products, **changes)
+        frame = synthetic_run.make_rows(cases, terrains=1000, seed=day, n_crashed=day == 2)
+        products = synthetic_run.synthetic_products() if day == 1 else None
+        changes: dict[str, Any] = {"started_utc": f"2026-01-0{day}T00:00:00Z", "name": f"dimes-{site}"}
+        directory = synthetic_run.write_run(folder / f"run-{day}", frame, products=products, **changes)
         record = (directory / "campaign.json").read_text()
         directory.joinpath("campaign.json").write_text(
             record.replace('"configuration": {', f'"configuration": {{"parameters": {{"site": "{site}"}}, ', 1)
@@ -184,7 +172,7 @@ def test_one_click_leads_from_the_report_to_the_images_of_a_violation(
     frame, products, metric = _make_case_with_images(system)
     requirement = {"id": "R", "metric": metric, "probability": 0.9, "confidence": 0.9, "population": "all"}
     frame[metric] = frame["case"] != 3
-    directory = _load_synthetic_runs().write_run(tmp_path, frame, [requirement], products=products)
+    directory = synthetic_run.write_run(tmp_path, frame, [requirement], products=products)
     shutil.copytree(directory / "cases" / "3", directory / "cases" / "5")
     page, log = open_page(write_report(directory))
     # with several cases, their images are folded
@@ -200,8 +188,7 @@ def test_one_click_leads_from_the_report_to_the_images_of_a_violation(
 def _make_case_with_images(system: str) -> tuple[pd.DataFrame, dict[str, Any], str]:
     """Return rows of a system, products of case 3, and the metric of a requirement."""
     if system == "descent":
-        runs = _load_synthetic_runs()
-        return runs.synthetic_frame(24), runs.synthetic_products(), "answered"
+        return synthetic_run.make_rows(24), synthetic_run.synthetic_products(), "answered"
     if system == "landing":
         return synthetic_landing.landing_frame(24), synthetic_landing.synthetic_products(), "site_safe"
     if system == "rover":

@@ -5,7 +5,6 @@ Exit status: 0 requirements met, 1 failed, 2 error, 3 no verdict.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
 import sys
@@ -33,13 +32,13 @@ from marsyard.reports.presentation import notable_cases
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, write_campaign
+from tests.reports.synthetic_run import MakeRun, make_rows, write_run
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
 ]
 Command = Callable[..., tuple[int, str, str]]
-MakeRun = Callable[..., Path]
 COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 REQUIREMENTS = """
 [[requirements]]
@@ -54,18 +53,10 @@ campaigns = ["dimes-*"]
 
 @pytest.fixture
 def make_run(tmp_path: Path) -> MakeRun:
-    """Return a function that writes a synthetic run of tests/reports/conftest.py."""
-    path = Path(__file__).resolve().parents[1] / "reports" / "conftest.py"
-    spec = importlib.util.spec_from_file_location("synthetic_runs", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    """Return a function that writes a synthetic run of 40 cases."""
 
     def write_synthetic_run(name: str, row_seed: int = 1, **changes: Any) -> Path:
-        frame = module.synthetic_frame(40, seed=row_seed)[COLUMNS]
-        directory: Path = module.write_run(tmp_path / name, frame, **changes)
-        return directory
+        return write_run(tmp_path / name, make_rows(40, seed=row_seed)[COLUMNS], **changes)
 
     return write_synthetic_run
 

@@ -17,7 +17,7 @@ from marsyard.campaigns.running.replay import differing_columns
 from marsyard.result import Result, open_result
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.objects import name_object
-from tests.reports.conftest import VELOCITY, synthetic_frame, write_run
+from tests.reports.synthetic_run import VELOCITY, make_rows, write_run
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
@@ -143,7 +143,7 @@ def test_arguments_of_a_file_are_rejected_for_a_campaign(tmp_path: Path) -> None
 def result(tmp_path: Path) -> Result:
     """Return the result of a synthetic campaign with violations."""
     available = {"id": "A", "metric": "answered", "probability": 0.5, "confidence": 0.5}
-    return Result(write_run(tmp_path / "run", synthetic_frame(60, error_scale=4.0), [VELOCITY, available]))
+    return Result(write_run(tmp_path / "run", make_rows(60, error_scale=4.0), [VELOCITY, available]))
 
 
 def test_result_has_tables_of_cases_verdicts_and_violations(result: Result) -> None:
@@ -178,7 +178,7 @@ def test_cases_and_figures_are_shown(result: Result) -> None:
 
 
 def test_results_are_compared(result: Result, tmp_path: Path) -> None:
-    other = Result(write_run(tmp_path / "other", synthetic_frame(60, seed=2), [VELOCITY]))
+    other = Result(write_run(tmp_path / "other", make_rows(60, seed=2), [VELOCITY]))
     differences = result.compare(other)
     assert len(differences) >= 2
     assert result.compare(other.directory).equals(differences)

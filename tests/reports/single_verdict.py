@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,6 @@ def make_cases(n: int, failures: int, *, error: float = 6.0) -> pd.DataFrame:
     )
 
 
-def evaluate(frame: pd.DataFrame, requirement: dict[str, Any], **changes: Any) -> Verdict:
+def evaluate(frame: pd.DataFrame, requirement: Mapping[str, Any], **changes: Any) -> Verdict:
     (verdict,) = evaluate_requirements(frame, [{**requirement, **changes}])
     return verdict

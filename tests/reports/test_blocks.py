@@ -74,9 +74,9 @@ def test_section_contains_its_blocks_and_their_data_in_order() -> None:
     assert [len(block.figures) for block in section.blocks] == [0, 1, 1, 0, 1, 0]
     assert section.blocks[-1].note == "Synthetic data."
     low, high = section.data["by_condition"]
-    assert (low["altitude_m"], low["answered"]["hits"], low["answered"]["n"]) == (400.0, 20, 20)
-    assert (high["altitude_m"], high["answered"]["hits"], high["answered"]["n"]) == (800.0, 10, 20)
-    assert section.data["rates"]["answered"]["fraction"] == pytest.approx(0.75)
+    assert (low["altitude_m"], low["answered"].hits, low["answered"].n) == (400.0, 20, 20)
+    assert (high["altitude_m"], high["answered"].hits, high["answered"].n) == (800.0, 10, 20)
+    assert section.data["rates"]["answered"].fraction == pytest.approx(0.75)
     # medians of the errors: 1 m at 400 m, 2 m at 800 m
     (effect,) = section.data["effects"]
     assert (effect["centres"], effect["medians"]) == ([400.0, 800.0], [1.0, 2.0])

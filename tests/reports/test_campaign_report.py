@@ -20,9 +20,8 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.record import SCHEMA
 from marsyard.reports.sections import script_hash
 from marsyard.sim.cache import hide_folders
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
 VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}
 #: Minimum columns of a report.
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
@@ -106,35 +105,33 @@ FULL_COLUMNS = [
     "error",
     "traceback",
 ]
-RUNS: dict[str, Callable[[Rows], pd.DataFrame]] = {
-    "small": lambda rows: rows(24)[FULL_COLUMNS],
-    "large": lambda rows: rows(2000, error_scale=1.5, terrains=60)[FULL_COLUMNS],
-    "crashed": lambda rows: rows(24, n_crashed=3)[FULL_COLUMNS],
-    "only crashed": lambda rows: rows(4, n_crashed=4)[FULL_COLUMNS],
-    "no answer": lambda rows: rows(24, answer_rate=0.0)[FULL_COLUMNS],
-    "one case": lambda rows: rows(1, answer_rate=1.0)[FULL_COLUMNS],
-    "no rows": lambda rows: rows(24).head(0),
-    "exact": lambda rows: rows(24, answer_rate=1.0, error_scale=0.0)[FULL_COLUMNS],
-    "no errors": lambda rows: rows(24)[["case", "outcome"]],
-    "only cases": lambda rows: rows(24)[["case"]],
-    "wide range": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
-    "infinite": lambda rows: rows(24)[FULL_COLUMNS].assign(velocity_error_x_m_s=np.inf),
+RUNS: dict[str, Callable[[], pd.DataFrame]] = {
+    "small": lambda: make_rows(24)[FULL_COLUMNS],
+    "large": lambda: make_rows(2000, error_scale=1.5, terrains=60)[FULL_COLUMNS],
+    "crashed": lambda: make_rows(24, n_crashed=3)[FULL_COLUMNS],
+    "only crashed": lambda: make_rows(4, n_crashed=4)[FULL_COLUMNS],
+    "no answer": lambda: make_rows(24, answer_rate=0.0)[FULL_COLUMNS],
+    "one case": lambda: make_rows(1, answer_rate=1.0)[FULL_COLUMNS],
+    "no rows": lambda: make_rows(24).head(0),
+    "exact": lambda: make_rows(24, answer_rate=1.0, error_scale=0.0)[FULL_COLUMNS],
+    "no errors": lambda: make_rows(24)[["case", "outcome"]],
+    "only cases": lambda: make_rows(24)[["case"]],
+    "wide range": lambda: make_rows(24)[FULL_COLUMNS].assign(velocity_error_m_s=np.geomspace(1e-9, 1e9, 24)),
+    "infinite": lambda: make_rows(24)[FULL_COLUMNS].assign(velocity_error_x_m_s=np.inf),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", RUNS)
-def test_report_is_valid_for_any_run(make_rows: Rows, make_run: MakeRun, kind: str) -> None:
-    text, page, report = _write_and_read(make_run(RUNS[kind](make_rows)))
+def test_report_is_valid_for_any_run(make_run: MakeRun, kind: str) -> None:
+    text, page, report = _write_and_read(make_run(RUNS[kind]()))
     _check_page(text, page)
     assert report["schema"] == SCHEMA
     assert report["verdict"] in text
     assert len(text) < 1_000_000
 
 
-def test_small_report_contains_the_main_results(
-    make_rows: Rows, make_run: MakeRun, dimes_products: dict[str, Any]
-) -> None:
+def test_small_report_contains_the_main_results(make_run: MakeRun, dimes_products: dict[str, Any]) -> None:
     directory = make_run(make_rows(24, n_crashed=1), products=dimes_products)
     text, page, report = _write_and_read(directory)
     _check_page(text, page)
@@ -161,7 +158,7 @@ def test_small_report_contains_the_main_results(
 
 
 @pytest.mark.slow
-def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: MakeRun) -> None:
+def test_report_without_requirements_has_exit_code_0(make_run: MakeRun) -> None:
     text, page, report = _write_and_read(make_run(make_rows(24)[FULL_COLUMNS], []))
     _check_page(text, page)
     assert "has no requirement" in text
@@ -169,10 +166,8 @@ def test_report_without_requirements_has_exit_code_0(make_rows: Rows, make_run: 
     assert "velocity error (m/s)" in text
 
 
-def test_requirement_met_by_rate_has_its_own_symbol(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
-) -> None:
-    requirement = {**velocity, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
+def test_requirement_met_by_rate_has_its_own_symbol(make_run: MakeRun) -> None:
+    requirement = {**VELOCITY, "probability": 0.9, "confidence": 0.999, "decide_by": "estimate"}
     directory = make_run(make_rows(24)[MIN_COLUMNS], [requirement])
     text, _, report = _write_and_read(directory)
     assert '<div class="headline status-met-by-rate">' in text
@@ -184,7 +179,7 @@ def test_requirement_met_by_rate_has_its_own_symbol(
 
 
 @pytest.mark.slow
-def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: MakeRun) -> None:
+def test_few_terrains_give_an_insufficient_verdict(make_run: MakeRun) -> None:
     text, _, report = _write_and_read(
         make_run(make_rows(400, answer_rate=1.0, error_scale=0.1)[[*MIN_COLUMNS, "terrain"]])
     )
@@ -192,9 +187,7 @@ def test_few_terrains_give_an_insufficient_verdict(make_rows: Rows, make_run: Ma
     assert "400 cases lie on 4 terrains, of which 0 have a failure. The bounds hold for every distribution" in text
 
 
-def test_texts_from_files_are_escaped(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any], dimes_products: dict[str, Any]
-) -> None:
+def test_texts_from_files_are_escaped(make_run: MakeRun, dimes_products: dict[str, Any]) -> None:
     frame = make_rows(24, n_crashed=2)[FULL_COLUMNS]
     frame["outcome"] = frame["outcome"].replace("VALID", HOSTILE)
     frame = frame.assign(error=HOSTILE, traceback=HOSTILE, site=[HOSTILE, "b"] * 12, gl_version=HOSTILE)
@@ -202,7 +195,7 @@ def test_texts_from_files_are_escaped(
     products = {**dimes_products, "tracks_columns": [*dimes_products["tracks_columns"][:-1], HOSTILE]}
     directory = make_run(
         frame,
-        [{**velocity, "id": HOSTILE, "statement": HOSTILE}, {**velocity, "metric": HOSTILE, "population": HOSTILE}],
+        [{**VELOCITY, "id": HOSTILE, "statement": HOSTILE}, {**VELOCITY, "metric": HOSTILE, "population": HOSTILE}],
         products=products,
         name=HOSTILE.replace("/", "_"),
         description=HOSTILE,
@@ -234,14 +227,14 @@ def test_texts_from_files_are_escaped(
         '{"name": "\\ud800", "seed": [1], "description": {"a": "b"}}',
     ],
 )
-def test_damaged_record_gives_a_valid_page(make_rows: Rows, make_run: MakeRun, record: str) -> None:
+def test_damaged_record_gives_a_valid_page(make_run: MakeRun, record: str) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     (directory / "campaign.json").write_text(record, encoding="utf-8")
     text, page, _ = _write_and_read(directory)
     _check_page(text, page)
 
 
-def test_missing_record_and_damaged_products_give_a_valid_page(make_rows: Rows, make_run: MakeRun) -> None:
+def test_missing_record_and_damaged_products_give_a_valid_page(make_run: MakeRun) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS], products={"image_1": np.zeros((4, 4))})
     (directory / "campaign.json").unlink()
     (directory / "cases" / "3" / "products.npz").write_bytes(b"not an archive")
@@ -250,7 +243,7 @@ def test_missing_record_and_damaged_products_give_a_valid_page(make_rows: Rows, 
     _check_page(text, page)
 
 
-def test_interrupted_campaign_is_marked(make_rows: Rows, make_run: MakeRun) -> None:
+def test_interrupted_campaign_is_marked(make_run: MakeRun) -> None:
     text, _, report = _write_and_read(make_run(make_rows(6)[MIN_COLUMNS], state="interrupted", cases=24))
     assert "Not finished." in text
     assert report["state"] == "interrupted"
@@ -265,13 +258,13 @@ def test_folder_without_valid_row_table_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_report_is_reproducible(make_rows: Rows, make_run: MakeRun) -> None:
+def test_report_is_reproducible(make_run: MakeRun) -> None:
     directory = make_run(make_rows(24)[[*MIN_COLUMNS, "off_nadir_max_deg", "terrain"]])
     first = write_report(directory).read_bytes()
     assert write_report(directory).read_bytes() == first
 
 
-def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun, make_rows: Rows) -> None:
+def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun) -> None:
     """The requirement multiplies the metric by 60: 60 x 0.05 is above the bound of 2, 60 x 0.01 is not."""
     frame = make_rows(24).assign(velocity_error_m_s=np.where(np.arange(24) < 6, 0.05, 0.01), answered=True)
     requirement = {"id": "SCALED", "metric": "velocity_error_m_s", "bound": 2.0, "scale": 60.0}
@@ -284,7 +277,7 @@ def test_wrong_answers_are_counted_in_the_unit_of_the_metric(make_run: MakeRun, 
 
 
 def test_reports_contain_no_folder_of_the_user(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     home = tmp_path / "home of alice"
     monkeypatch.setenv("HOME", str(home))

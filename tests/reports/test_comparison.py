@@ -1,5 +1,8 @@
-"""Tests of paired comparisons of algorithms and of the consistency of covariances."""
+"""Tests of comparisons of algorithms and of campaigns, and of the consistency of covariances."""
 
+from __future__ import annotations
+
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,7 +11,17 @@ import pytest
 from scipy import stats
 
 from marsyard.reports.common_sections import evaluate_consistencies, evaluate_consistency
-from marsyard.reports.comparison import compare_algorithms, select_algorithm
+from marsyard.reports.comparison import (
+    MetricComparison,
+    campaign_diff_grid,
+    compare_algorithms,
+    compare_campaigns,
+    list_metrics,
+    select_algorithm,
+)
+from marsyard.reports.statistics.changes import difference_p_value
+from marsyard.reports.stored import read_run
+from tests.reports.synthetic_run import MakeRun, make_rows
 
 
 def make_paired_rows(first_errors: list[float], other_errors: list[float]) -> pd.DataFrame:
@@ -65,7 +78,76 @@ def test_correct_covariances_are_consistent_at_95_percent() -> None:
     assert evaluate_consistency(stats.chi2.rvs(2, size=50, random_state=rng) / 4.0)["word"] == "pessimistic"
 
 
-def test_consistency_covers_all_algorithms_with_covariances() -> None:
-    frame = make_paired_rows([1, 2], [3, 4]).assign(**{"other.velocity_nees": [2.0, 2.0]})
+@pytest.mark.parametrize("column", ["velocity_nees", "position_nees"])
+def test_consistency_covers_all_algorithms_with_covariances(column: str) -> None:
+    frame = make_paired_rows([1, 2, 3], [3, 4, 5]).assign(**{f"other.{column}": [2.0, 2.0, np.nan]})
     ((name, values),) = evaluate_consistencies(frame).items()
     assert (name, values["n"], values["mean"], values["word"]) == ("other", 2, 2.0, "consistent")
+    # the sum of two values with two degrees of freedom each
+    assert values["lower"] == pytest.approx(stats.chi2.ppf(0.025, 4) / 2)
+
+
+def _compare(first: Path, second: Path) -> tuple[bool, dict[str, MetricComparison]]:
+    is_paired, comparisons = compare_campaigns(read_run(first), read_run(second))
+    return is_paired, {comparison.name: comparison for comparison in comparisons}
+
+
+def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_run: MakeRun) -> None:
+    frame = make_rows(200, terrains=40)
+    worse_frame = frame.assign(velocity_error_m_s=frame["velocity_error_m_s"] * 1.02)
+    is_paired, comparisons = _compare(make_run(frame), make_run(worse_frame, name="other"))
+    assert is_paired
+    # errors larger by 2 %: the paired test detects them in spite of the large scatter
+    assert comparisons["velocity error (m/s)"].p_value < 1e-9
+    assert comparisons["answered"].p_value == 1.0
+    assert comparisons["came to an end"].second.summary == 1.0
+    # with four terrains the sign test has p = 2 / 2^4; Holm's correction for 4 metrics multiplies it by 4
+    four_terrains = make_rows(200)
+    worse_frame = four_terrains.assign(velocity_error_m_s=four_terrains["velocity_error_m_s"] * 1.02)
+    _, comparisons = _compare(
+        make_run(four_terrains, name="four-terrains"), make_run(worse_frame, name="four-terrains-worse")
+    )
+    assert comparisons["velocity error (m/s)"].p_value == pytest.approx(4 * 2 / 2**4)
+
+
+def test_terrains_of_different_banks_are_not_paired(make_run: MakeRun) -> None:
+    banks = [{"parameters": {"location": {"bank_seed": seed}}} for seed in (1, 2)]
+    runs = [make_run(make_rows(100), name=f"run-{seed}", configuration=bank) for seed, bank in enumerate(banks)]
+    assert not _compare(*runs)[0]
+    assert _compare(runs[0], runs[0])[0]
+
+
+def test_campaigns_with_different_draws_are_compared_as_two_samples(make_run: MakeRun) -> None:
+    first = make_run(make_rows(300))
+    is_paired, comparisons = _compare(first, make_run(make_rows(300, seed=2), name="same", seed=8))
+    assert not is_paired
+    assert min(comparison.p_value for comparison in comparisons.values()) > 0.01
+    _, worse_comparisons = _compare(
+        first, make_run(make_rows(300, seed=2, answer_rate=0.6, error_scale=2.0), name="worse", seed=8)
+    )
+    assert worse_comparisons["answered"].p_value < 1e-6
+    # no permutation of 10,000 has a larger difference
+    assert worse_comparisons["velocity error (m/s)"].p_value < 1e-3
+    grid = campaign_diff_grid(["a", "b"], list(worse_comparisons.values()))
+    assert ["answered", "< 0.001"] in [[row[0], row[-1]] for row in grid.rows]
+
+
+def test_terrains_of_different_sites_are_not_paired(make_run: MakeRun) -> None:
+    # Errors depend on the terrain. Terrain numbers of two sites denote different terrains, so no pairs exist.
+    def write_site_run(name: str, seed: int) -> Path:
+        terrain_error = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
+        frame = make_rows(400, terrains=20, answer_rate=1.0, seed=seed)
+        frame["velocity_error_m_s"] = terrain_error[frame["terrain"]] + 0.1 * np.arange(400) / 400
+        configuration = {"parameters": {"site": name}}
+        return make_run(frame, name=name, seed=seed, configuration=configuration)
+
+    gusev, meridiani = read_run(write_site_run("gusev", 1)), read_run(write_site_run("meridiani", 6))
+    assert min(entry.p_value for entry in compare_campaigns(gusev, meridiani)[1]) > 0.05
+    first, second = ({item.name: item.sample for item in list_metrics(run)[1]} for run in (gusev, meridiani))
+    assert difference_p_value(first["velocity error (m/s)"], second["velocity error (m/s)"]) < 1e-3
+
+
+def test_campaigns_without_common_metric_are_compared_by_completion(make_run: MakeRun) -> None:
+    first = make_run(make_rows(20)[["case", "outcome"]], [])
+    _, comparisons = _compare(first, make_run(make_rows(20), name="other", seed=8))
+    assert set(comparisons) == {"came to an end"}

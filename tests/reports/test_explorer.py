@@ -8,18 +8,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from marsyard.reports.explorer import MAX_POINTS, ExploredRequirement, choose_points, explorer_data
 from marsyard.reports.presentation import gallery_cases, notable_cases
 from marsyard.reports.sections import embed_json
 from marsyard.reports.stored import read_run
+from tests.reports.synthetic_run import make_rows
 
-Rows = Callable[..., pd.DataFrame]
 METRIC = "velocity_error_m_s"
 
 
-def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> None:
+def test_points_include_worst_unanswered_and_crashed_cases() -> None:
     frame = make_rows(12_000, n_crashed=3)
     points = choose_points(frame, METRIC)
     assert points.size == MAX_POINTS
@@ -34,7 +33,7 @@ def test_points_include_worst_unanswered_and_crashed_cases(make_rows: Rows) -> N
     assert choose_points(frame.head(50), METRIC).tolist() == list(range(50))
 
 
-def test_explorer_data_contain_labels_outcomes_and_values(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_explorer_data_contain_labels_outcomes_and_values(make_run: Callable[..., Path]) -> None:
     frame = make_rows(30, n_crashed=1)
     run = read_run(make_run(frame))
     status = np.where(np.arange(30) == 4, 1, 0)
@@ -62,7 +61,7 @@ def test_embedded_data_are_escaped() -> None:
     assert json.loads(text) == hostile
 
 
-def test_notable_cases_are_worst_unanswered_and_random_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_notable_cases_are_worst_unanswered_and_random_cases(make_run: Callable[..., Path]) -> None:
     frame = make_rows(60, n_crashed=2)
     cases = notable_cases(read_run(make_run(frame)))
     errors = frame["velocity_error_m_s"]
@@ -75,7 +74,7 @@ def test_notable_cases_are_worst_unanswered_and_random_cases(make_rows: Rows, ma
     assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
 
 
-def test_gallery_starts_with_first_worst_and_unanswered_cases(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_gallery_starts_with_first_worst_and_unanswered_cases(make_run: Callable[..., Path]) -> None:
     frame = make_rows(40)
     run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
     cases = gallery_cases(run)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import bisect
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -27,9 +25,8 @@ from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics.proportions import proportion_lower
 from marsyard.reports.verdicts import Status
 from marsyard.result import open_result
-from tests.reports.conftest import VELOCITY
+from tests.reports.synthetic_run import VELOCITY, MakeRun
 
-MakeRun = Callable[..., Path]
 RATE, CONFIDENCE = 0.9, 0.9
 REQUIREMENT = {**VELOCITY, "population": "all", "probability": RATE, "confidence": CONFIDENCE}
 

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from rich.console import Console
 
 from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.statistics.proportions import proportion_lower
 from marsyard.reports.verdicts import Verdict
-
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
 
 def _make_verdict(confidence: float, decide_by: str = "confidence", n: int = 100) -> Verdict:
@@ -51,11 +46,9 @@ def test_stated_number_bounds_the_false_passes_of_a_simulation() -> None:
 
 
 @pytest.mark.parametrize("requirements", [1, 2])
-def test_statement_is_printed_and_shown(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any], tmp_path: Path, requirements: int
-) -> None:
-    second = {**velocity, "id": "SECOND", "bound": 9.0}
-    directory = make_run(make_rows(24), [velocity, second][:requirements])
+def test_statement_is_printed_and_shown(make_run: MakeRun, tmp_path: Path, requirements: int) -> None:
+    second = {**VELOCITY, "id": "SECOND", "bound": 9.0}
+    directory = make_run(make_rows(24), [VELOCITY, second][:requirements])
     console = Console(record=True, width=200)
     evaluate_and_report(directory, console)
     write_site(tmp_path / "site", [directory])

@@ -11,7 +11,8 @@ import pytest
 from marsyard.campaigns.studies.decision import RareSample, decide_rare
 from marsyard.campaigns.studies.runner import convert_to_json
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
-from marsyard.reports.rare import read_result, result_sentences
+from marsyard.reports.rare import rare_sentences
+from marsyard.reports.stored import read_study
 
 
 def create_study(limit: float, violations: int, cases: int, terrains: int = 0, probability: float = 1e-4) -> Any:
@@ -31,7 +32,7 @@ def create_study(limit: float, violations: int, cases: int, terrains: int = 0, p
 
 
 def test_pass_states_the_counting_bound() -> None:
-    sentences = result_sentences(create_study(1e-2, 0, 1000))
+    sentences = rare_sentences(create_study(1e-2, 0, 1000))
     assert sentences[0] == "VEL: PASS, by counting independent cases."
     # 1 - 0.05^(1/1000) = 0.0030
     assert sentences[1] == (
@@ -42,7 +43,7 @@ def test_pass_states_the_counting_bound() -> None:
 
 
 def test_estimate_below_the_limit_states_the_random_cases_that_decide() -> None:
-    text = " ".join(result_sentences(create_study(1e-3, 0, 1000)))
+    text = " ".join(rare_sentences(create_study(1e-3, 0, 1000)))
     assert "VEL: INSUFFICIENT." in text
     assert "Subset simulation estimates 0.0001" in text
     assert "no PASS rests on it" in text
@@ -51,27 +52,22 @@ def test_estimate_below_the_limit_states_the_random_cases_that_decide() -> None:
 
 
 def test_estimate_above_the_limit_states_the_replicates_that_decide() -> None:
-    text = " ".join(result_sentences(create_study(8e-5, 0, 1000)))
+    text = " ".join(rare_sentences(create_study(8e-5, 0, 1000)))
     assert "would decide the verdict if the estimate remains: marsyard append DIR" in text
     assert "--random" not in text
 
 
 def test_fail_states_its_assumption() -> None:
-    sentences = result_sentences(create_study(1e-5, 0, 1000))
+    sentences = rare_sentences(create_study(1e-5, 0, 1000))
     assert sentences[0] == "VEL: FAIL, by the interval of the simulations; it assumes a continuous margin."
 
 
 def test_shared_terrains_are_stated() -> None:
-    text = " ".join(result_sentences(create_study(1e-2, 0, 1000, terrains=50)))
+    text = " ".join(rare_sentences(create_study(1e-2, 0, 1000, terrains=50)))
     assert "1,000 independent random cases on 50 terrains, which are counted instead of cases" in text
     assert "each on a new terrain" in text
 
 
 @pytest.mark.parametrize("study", [{}, {"kind": "search", "result": {"violations": 1}}])
 def test_other_studies_have_no_sentences(study: dict[str, Any]) -> None:
-    assert result_sentences(read_result({"study": study})) == []
-
-
-def test_result_without_a_counting_bound_is_not_read() -> None:
-    study = {"kind": "rare", "requirement": "VEL", "max_probability": 1e-2, "result": {"verdict": "PASS"}}
-    assert read_result({"study": study}) == {}
+    assert rare_sentences(read_study({"study": study}, "rare")) == []

@@ -17,12 +17,11 @@ from marsyard.reports.history import (
     Comparison,
     History,
     NightCampaign,
-    NightMetric,
     find_changes,
     format_night_page,
     list_comparisons,
 )
-from marsyard.reports.statistics.changes import Sample
+from marsyard.reports.statistics.changes import Metric, Sample
 
 N_CASES, N_TERRAINS = 100, 12
 
@@ -36,14 +35,14 @@ def _make_error_pool(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw_metrics(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
-) -> list[NightMetric]:
+) -> list[Metric]:
     """Draw the metrics of one nightly run from the pool; `error_factor` multiplies every error."""
     terrains = rng.integers(0, N_TERRAINS, N_CASES)
     errors = error_factor * pool[0][terrains, rng.integers(0, 200, N_CASES)]
     is_answered = (rng.random(N_CASES) < pool[1][terrains]).astype(np.float64)
     rates = [("within 2 m", (errors < 2.0).astype(np.float64)), ("answered", is_answered)]
-    metrics = [NightMetric(name, True, float(values.mean()), Sample(values, terrains)) for name, values in rates]
-    return [*metrics, NightMetric("error (m)", False, float(np.median(errors)), Sample(errors, terrains))]
+    metrics = [Metric(name, True, Sample(values, terrains)) for name, values in rates]
+    return [*metrics, Metric("error (m)", False, Sample(errors, terrains))]
 
 
 def _detect_changes(
@@ -126,11 +125,7 @@ def test_reported_change_restarts_the_history(tmp_path: Path) -> None:
         night = _add_run(history, 5, error_factor=3.0)
         regressions = find_changes(list_comparisons(history, night))
         assert "error (m)" in {entry.metric for entry in regressions}
-        history.finish(
-            night,
-            FINISHED,
-            [(entry.campaign, entry.metric, entry.p_value, entry.is_regression) for entry in regressions],
-        )
+        history.finish(night, FINISHED, regressions)
         # after a reported change, later runs are compared with that run only
         next_night = _add_run(history, 6, error_factor=3.0)
         n_compared = {entry.metric.name: len(entry.before) for entry in list_comparisons(history, next_night)}

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
-import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.record import read_report
-
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
+from tests.reports.synthetic_run import MakeRun, make_rows
 
 
 @pytest.mark.parametrize(
@@ -28,8 +24,8 @@ MakeRun = Callable[..., Path]
         {"cases": 0},
     ],
 )
-def test_report_is_read_as_written(make_rows: Rows, make_run: MakeRun, options: dict[str, float]) -> None:
-    rows = make_rows(**options | {"cases": max(1, options["cases"])}).head(int(options["cases"]))
+def test_report_is_read_as_written(make_run: MakeRun, options: dict[str, Any]) -> None:
+    rows = make_rows(**options | {"cases": max(1, options["cases"])}).head(options["cases"])
     directory = make_run(rows[["case", "outcome", "answered", "terrain", "velocity_error_m_s"]])
     write_report(directory)
     text = (directory / "report.json").read_text()
@@ -42,7 +38,7 @@ def test_report_is_read_as_written(make_rows: Rows, make_run: MakeRun, options: 
 
 
 @pytest.mark.parametrize(("key", "value"), [("schema", 6), ("verdicts", [{"n": 1}]), ("cases", "many")])
-def test_other_layouts_are_not_read(make_rows: Rows, make_run: MakeRun, key: str, value: object) -> None:
+def test_other_layouts_are_not_read(make_run: MakeRun, key: str, value: object) -> None:
     directory = make_run(make_rows(4)[["case", "outcome", "answered", "velocity_error_m_s"]])
     write_report(directory)
     content = json.loads((directory / "report.json").read_text())

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -26,9 +25,8 @@ from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, Case
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.wording import label
 from tests.reports.hda import synthetic_landing
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
 ATTITUDE = {
     "velocity_error_m_s": 5.2,
     "attitude_error_common_deg": 0.1,
@@ -81,11 +79,9 @@ def test_margins_equal_those_of_the_engine(changes: Mapping[str, Any]) -> None:
     assert min(expected) < 0.0 < max(expected)
 
 
-def test_violations_are_listed_by_margin_with_the_nearest_cases(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
-) -> None:
+def test_violations_are_listed_by_margin_with_the_nearest_cases(make_run: MakeRun) -> None:
     frame = make_rows(60, error_scale=4.0, n_crashed=1)
-    (entry,) = _make_finder(make_run, frame, velocity).requirement_cases()
+    (entry,) = _make_finder(make_run, frame, VELOCITY).requirement_cases()
     errors = frame["velocity_error_m_s"]
     violations = errors[errors > 5.0].sort_values(ascending=False)
     # the crashed case has no margin and precedes all others
@@ -100,16 +96,16 @@ def test_violations_are_listed_by_margin_with_the_nearest_cases(
     assert not entry.nearest[0].violates
 
 
-def test_equal_lists_are_not_repeated(make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]) -> None:
-    stricter = {**velocity, "id": "STRICT", "probability": 0.999}
+def test_equal_lists_are_not_repeated(make_run: MakeRun) -> None:
+    stricter = {**VELOCITY, "id": "STRICT", "probability": 0.999}
     first, second, third = _make_finder(
-        make_run, make_rows(60, error_scale=4.0), velocity, stricter, AVAILABLE
+        make_run, make_rows(60, error_scale=4.0), VELOCITY, stricter, AVAILABLE
     ).requirement_cases()
     assert (first.same_as, second.same_as, third.same_as) == ("", "DIMES-VEL", "")
     assert second.title.endswith("the same cases as DIMES-VEL")
 
 
-def test_violations_are_grouped_by_outcome_and_cause(make_rows: Rows, make_run: MakeRun) -> None:
+def test_violations_are_grouped_by_outcome_and_cause(make_run: MakeRun) -> None:
     frame = make_rows(80, answer_rate=0.5)
     (entry,) = _make_finder(make_run, frame, AVAILABLE).requirement_cases()
     counts = frame.loc[~frame["answered"], "outcome"].value_counts()
@@ -117,15 +113,13 @@ def test_violations_are_grouped_by_outcome_and_cause(make_rows: Rows, make_run: 
     assert [int(row[2]) for row in entry.groups.rows] == sorted(counts, reverse=True)
 
 
-def test_summary_has_results_percentiles_and_neighbours(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
-) -> None:
+def test_summary_has_results_percentiles_and_neighbours(make_run: MakeRun) -> None:
     frame = make_rows(60, error_scale=4.0)
     frame.loc[30, "off_nadir_max_deg"] = 50.0
     frame.loc[30, "outcome"] = "VALID"
     frame.loc[30, "answered"] = True
     frame.loc[30, "velocity_error_m_s"] = 7.5
-    finder = _make_finder(make_run, frame, velocity, AVAILABLE)
+    finder = _make_finder(make_run, frame, VELOCITY, AVAILABLE)
     summary = finder.summary(30)
     assert summary is not None
     assert [(status.requirement_id, status.word) for status in summary.statuses] == [
@@ -160,10 +154,10 @@ def test_conditions_of_a_landing_contain_no_results(make_run: MakeRun) -> None:
     assert set(evaluation.run.driver_columns("", 1000)) <= {name for name in frame if name not in results}
 
 
-def test_percentiles_exist_in_runs_of_few_cases(make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]) -> None:
+def test_percentiles_exist_in_runs_of_few_cases(make_run: MakeRun) -> None:
     frame = make_rows(8)
     frame["off_nadir_max_deg"] = [3.0, 1.0, 2.0, 7.0, 4.0, 5.0, 6.0, 8.0]
-    finder = _make_finder(make_run, frame, velocity)
+    finder = _make_finder(make_run, frame, VELOCITY)
     summaries = [finder.summary(case) for case in range(8)]
     texts = [
         next(driver.percentile_text for driver in summary.drivers if driver.name == label("off_nadir_max_deg"))
@@ -179,9 +173,7 @@ def test_percentiles_exist_in_runs_of_few_cases(make_rows: Rows, make_run: MakeR
     ]
 
 
-def test_similar_violations_have_the_nearest_conditions(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
-) -> None:
+def test_similar_violations_have_the_nearest_conditions(make_run: MakeRun) -> None:
     frame = make_rows(60)
     frame["velocity_error_m_s"] = 1.0
     frame["answered"] = True
@@ -190,15 +182,13 @@ def test_similar_violations_have_the_nearest_conditions(
         for driver in drivers:
             frame.loc[case, driver] = value
         frame.loc[case, "velocity_error_m_s"] = 9.0
-    summary = _make_finder(make_run, frame, velocity).summary(10)
+    summary = _make_finder(make_run, frame, VELOCITY).summary(10)
     assert summary is not None
     assert list(summary.similar) == [20, 40]
 
 
-def test_violations_precede_other_cases_of_the_gallery(
-    make_rows: Rows, make_run: MakeRun, velocity: dict[str, Any]
-) -> None:
-    evaluation = evaluate_run(make_run(make_rows(60, error_scale=4.0), [velocity]))
+def test_violations_precede_other_cases_of_the_gallery(make_run: MakeRun) -> None:
+    evaluation = evaluate_run(make_run(make_rows(60, error_scale=4.0), [VELOCITY]))
     run = replace(evaluation.run, showcases=tuple(range(60)))
     violations = CaseFinder(run, evaluation.verdicts).notable_cases(2)
     assert len(violations) == 2

@@ -5,24 +5,19 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from rich.console import Console
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
+from marsyard.reports.overall import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Status
-
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
 GRID = {"a": {"distribution": "grid", "values": [1, 2]}, "b": {"distribution": "uniform", "low": 0, "high": 1}}
 DESIGNS = [
@@ -41,11 +36,9 @@ def test_default_design_is_independent_draws(settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("configuration", "message"), DESIGNS)
-def test_designs_without_independent_draws_have_no_confidence(
-    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
-) -> None:
+def test_designs_without_independent_draws_have_no_confidence(configuration: dict[str, Any], message: str) -> None:
     frame, design = make_rows(2000), read_sampling_design(configuration)
-    requirements = [{**velocity, "probability": probability} for probability in (0.5, velocity["probability"])]
+    requirements = [{**VELOCITY, "probability": probability} for probability in (0.5, VELOCITY["probability"])]
     for verdict, reference in zip(
         evaluate_requirements(frame, requirements, design), evaluate_requirements(frame, requirements), strict=True
     ):
@@ -67,13 +60,11 @@ def test_designs_without_independent_draws_have_no_confidence(
 
 
 @pytest.mark.parametrize(("configuration", "message"), DESIGNS)
-def test_rate_decides_for_designs_without_independent_draws(
-    make_rows: Rows, velocity: dict[str, Any], configuration: dict[str, Any], message: str
-) -> None:
+def test_rate_decides_for_designs_without_independent_draws(configuration: dict[str, Any], message: str) -> None:
     """A rate of 0.98 in 1000 cases meets 0.98 but not 0.99; the verdict has no bounds."""
     frame, design = make_rows(1000), read_sampling_design(configuration)
     frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
-    requirements = [{**velocity, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
+    requirements = [{**VELOCITY, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
     met_verdict, failed_verdict = evaluate_requirements(frame, requirements, design)
     assert (met_verdict.status, failed_verdict.status) == (Status.MET_BY_RATE, Status.FAIL)
     assert (met_verdict.n, met_verdict.failures, met_verdict.estimate) == (1000, 20, 0.98)
@@ -92,26 +83,26 @@ def test_rate_decides_for_designs_without_independent_draws(
     assert not combine_verdicts(empty_population, frame, design).sentence.startswith("0 of")
 
 
-def test_design_without_requirements_has_no_verdict(make_rows: Rows) -> None:
+def test_design_without_requirements_has_no_verdict() -> None:
     frame = make_rows(5)
     assert combine_verdicts([], frame, SamplingDesign("sobol")).status is None
     assert compute_exit_code([], crashed=False) == 0
 
 
-def test_nominal_case_is_excluded_from_verdicts(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_nominal_case_is_excluded_from_verdicts() -> None:
     frame = make_rows(231)
     frame["velocity_error_m_s"] = 1.0
     frame["answered"] = True
     frame["terrain"] = range(231)
     frame.loc[0, "velocity_error_m_s"] = 9.0
-    (without_nominal,) = evaluate_requirements(frame, [velocity], SamplingDesign(nominal=True))
+    (without_nominal,) = evaluate_requirements(frame, [VELOCITY], SamplingDesign(nominal=True))
     assert (without_nominal.status, without_nominal.n, without_nominal.failures) == (Status.PASS, 230, 0)
-    (with_nominal,) = evaluate_requirements(frame, [velocity])
+    (with_nominal,) = evaluate_requirements(frame, [VELOCITY])
     assert (with_nominal.n, with_nominal.failures) == (231, 1)
 
 
 @pytest.mark.slow
-def test_page_and_json_describe_the_design(make_rows: Rows, make_run: MakeRun) -> None:
+def test_page_and_json_describe_the_design(make_run: MakeRun) -> None:
     frame = make_rows(60)
     frame.loc[0, "velocity_error_m_s"] = 77.0
     directory = make_run(frame)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +16,8 @@ from marsyard.reports.conditions import bin_conditions, conditions_section, terr
 from marsyard.reports.dimes.sections import estimate_effects, ignition_section, landing_section, sensitivity_section
 from marsyard.reports.section import Section, Subject
 from marsyard.reports.stored import StoredRun
+from tests.reports.synthetic_run import MakeRun, make_rows
 
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
 METRIC = "velocity_error_m_s"
 
 
@@ -62,7 +60,7 @@ def test_answer_rates_have_clopper_pearson_intervals() -> None:
     assert answer_fractions(make_subject(frame.drop(columns="answered"))) == {}
 
 
-def test_crashed_cases_of_unknown_overlap_count_as_failures(make_rows: Rows) -> None:
+def test_crashed_cases_of_unknown_overlap_count_as_failures() -> None:
     frame = make_rows(50, answer_rate=1.0, n_crashed=5)
     has_overlap: list[bool | None] = [True] * 45 + [None] * 5
     rates = answer_fractions(make_subject(frame.assign(feasible_overlap=pd.Series(has_overlap, dtype=object))))
@@ -94,7 +92,7 @@ def test_condition_bins_have_correct_error_statistics() -> None:
     assert np.quantile(valid[METRIC], 0.99) < site_bin["quantile_bound"] <= site_bin["largest"]
 
 
-def test_constant_conditions_are_omitted(make_rows: Rows) -> None:
+def test_constant_conditions_are_omitted() -> None:
     frame = make_rows(60).assign(sun_elevation_deg=40.0)
     assert "sun_elevation_deg" not in dict(bin_conditions(frame))
     assert conditions_section(make_subject(frame[["answered", METRIC]])) is None
@@ -121,7 +119,7 @@ def test_variance_between_terrains_is_estimated() -> None:
     assert terrain_variance(frame.drop(columns="terrain"), METRIC) is None
 
 
-def test_firing_section_needs_the_firing_error(make_rows: Rows) -> None:
+def test_firing_section_needs_the_firing_error() -> None:
     frame = make_rows(30)
     assert ignition_section(make_subject(frame)) is None
     section = ignition_section(make_subject(frame.assign(firing_velocity_error_m_s=0.5, firing_after_s=18.0)))
@@ -227,7 +225,7 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     assert landing_section(make_subject(frame[["touchdown_speed_corrected_m_s"]])) is None
 
 
-def test_page_and_json_contain_every_section(make_rows: Rows, make_run: MakeRun) -> None:
+def test_page_and_json_contain_every_section(make_run: MakeRun) -> None:
     rng = np.random.default_rng(4)
     frame = make_rows(120).assign(
         feasible_overlap=True,

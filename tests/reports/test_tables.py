@@ -1,13 +1,13 @@
-"""Tests of the tables of verdicts and statistics, of column names and of printed numbers."""
+"""Tests of tables, captions, names of columns, printed numbers and requirements in words."""
 
 from __future__ import annotations
 
 import io
 import math
+import re
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from xml.etree import ElementTree as Xml
 
 import numpy as np
 import pandas as pd
@@ -17,10 +17,16 @@ from rich.table import Table
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.blocks import correlation_text, estimate_effects
 from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.hda.sections import MAP_CONDITIONS, MAP_ERRORS, distance_grid
+from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.rates import fraction_of
+from marsyard.reports.sections import driver_figures, outcome_grid
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
+from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import (
+    NOTHING,
     axis_columns,
     category_column,
     driver_columns,
@@ -35,10 +41,9 @@ from marsyard.reports.wording import (
     requirement_text,
 )
 from marsyard.scenarios.systems import catalogue
+from tests.reports.synthetic_run import VELOCITY, make_rows
 
 REQUIREMENTS = sorted((Path(__file__).parents[2] / "scenarios").glob("*/requirements.toml"))
-
-Rows = Callable[..., pd.DataFrame]
 
 
 def _print_table(table: Table, width: int) -> str:
@@ -49,8 +54,8 @@ def _print_table(table: Table, width: int) -> str:
 
 
 @pytest.mark.parametrize("width", [80, 140])
-def test_verdict_table_is_complete_at_any_width(make_rows: Rows, velocity: dict[str, Any], width: int) -> None:
-    verdicts = evaluate_requirements(make_rows(24), [velocity, {**velocity, "id": "DIMES-AVAIL", "population": "all"}])
+def test_verdict_table_is_complete_at_any_width(width: int) -> None:
+    verdicts = evaluate_requirements(make_rows(24), [VELOCITY, {**VELOCITY, "id": "DIMES-AVAIL", "population": "all"}])
     text = _print_table(verdict_table(verdicts), width)
     assert max(len(line) for line in text.splitlines()) <= width
     for message in ("DIMES-VEL", "DIMES-AVAIL", "INSUFFICIENT", "4 terrains", "Clopper-Pearson"):
@@ -63,13 +68,13 @@ def test_verdict_table_reports_missing_requirements() -> None:
     assert "no requirement" in _print_table(verdict_table([]), 80)
 
 
-def test_texts_are_not_interpreted_as_markup(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdicts = evaluate_requirements(make_rows(5), [{**velocity, "id": "[red]R[/red]", "metric": "[/]"}])
+def test_texts_are_not_interpreted_as_markup() -> None:
+    verdicts = evaluate_requirements(make_rows(5), [{**VELOCITY, "id": "[red]R[/red]", "metric": "[/]"}])
     text = _print_table(verdict_table(verdicts), 140)
     assert "[red]R[/red]" in text
 
 
-def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
+def test_outcomes_are_ordered_and_counted() -> None:
     frame = make_rows(200, n_crashed=2)
     counts = outcome_counts(frame)
     assert counts[0][0] == "VALID"
@@ -78,7 +83,7 @@ def test_outcomes_are_ordered_and_counted(make_rows: Rows) -> None:
     assert outcome_counts(frame.drop(columns="outcome")) == []
 
 
-def test_statistics_table_has_errors_and_components(make_rows: Rows) -> None:
+def test_statistics_table_has_errors_and_components() -> None:
     grid = statistics_grid(make_rows(24), "velocity_error_m_s")
     assert list(grid.head) == ["", "velocity error (m/s)", "east velocity error (m/s)", "north velocity error (m/s)"]
     assert [row[0] for row in grid.rows if "interval" not in row[0] and "bounds" not in row[0]][:3] == [
@@ -94,29 +99,29 @@ def test_labels_are_derived_from_column_names() -> None:
     assert magnitude_label("velocity_error_m_s") == "|velocity error| (m/s)"
 
 
-def test_axis_columns_are_the_components_of_an_error(make_rows: Rows) -> None:
+def test_axis_columns_are_the_components_of_an_error() -> None:
     columns = list(make_rows(1).columns)
     assert axis_columns("velocity_error_m_s", columns) == ["velocity_error_x_m_s", "velocity_error_y_m_s"]
     assert axis_columns("score", columns) == []
 
 
-def test_driver_columns_exclude_errors_and_bookkeeping_columns(make_rows: Rows) -> None:
+def test_driver_columns_exclude_errors_and_bookkeeping_columns() -> None:
     drivers = driver_columns(make_rows(50), "velocity_error_m_s", max_columns=20)
     assert drivers[:3] == ["off_nadir_max_deg", "attitude_rate_max_deg_s", "altitude_1_m"]
     assert not {"case", "wall_time_s", "velocity_error_x_m_s", "terrain", "answered"} & set(drivers)
 
 
-def test_category_column_has_few_distinct_values(make_rows: Rows) -> None:
+def test_category_column_has_few_distinct_values() -> None:
     frame = make_rows(100)
     assert category_column(frame) == "terrain"
     assert category_column(frame.assign(site=["Gusev", "Meridiani"] * 50)) == "site"
     assert category_column(make_rows(100, terrains=50)) is None
 
 
-def test_primary_metric_is_an_existing_column(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_primary_metric_is_an_existing_column() -> None:
     frame = make_rows(3)
-    assert primary_metric(frame, [{**velocity, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
-    assert primary_metric(frame, [{**velocity, "metric": "no_such_column"}]) == "velocity_error_m_s"
+    assert primary_metric(frame, [{**VELOCITY, "metric": "off_nadir_max_deg"}]) == "off_nadir_max_deg"
+    assert primary_metric(frame, [{**VELOCITY, "metric": "no_such_column"}]) == "velocity_error_m_s"
     assert primary_metric(frame[["case", "outcome"]], []) is None
 
 
@@ -209,3 +214,58 @@ def test_criteria_of_the_catalogue_are_written_by_hand(campaign: str) -> None:
         population = population_text(requirement.population)
         assert population.startswith(("all cases", "cases ", "completed cases", "valid answers"))
         assert population.count(" with ") <= 1 + population.count(" and with "), text
+
+
+METRIC = "velocity_error_m_s"
+DRIVERS = ("off_nadir_max_deg", "sun_elevation_deg")
+
+
+def test_rank_correlations_have_intervals_and_need_enough_cases() -> None:
+    few_captions = [figure.caption for figure in driver_figures(make_rows(12, answer_rate=1.0), METRIC, 5.0, DRIVERS)]
+    assert few_captions
+    assert not [caption for caption in few_captions if "correlation" in caption]
+    captions = [figure.caption for figure in driver_figures(make_rows(60, answer_rate=1.0), METRIC, 5.0, DRIVERS)]
+    pattern = r"Rank correlation −?\d\.\d{3} \(−?\d\.\d{3} to −?\d\.\d{3} at 90 % confidence\)"
+    assert all(re.search(pattern, caption) for caption in captions)
+
+
+@pytest.mark.parametrize(("maps", "has_interval"), [(10, False), (40, True)])
+def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool) -> None:
+    rng = np.random.default_rng(1)
+    texture = rng.uniform(0.1, 1.0, maps)
+    frame = pd.DataFrame({"texture": texture, "rms_fraction": rng.uniform(0.0, 0.1, maps) / texture})
+    effect = estimate_effects(frame, MAP_CONDITIONS, MAP_ERRORS)[0]
+    assert effect["error"].startswith("elevation error")
+    assert (" to " in correlation_text(effect)) == has_interval
+    assert has_interval or correlation_text(effect) == NOTHING
+
+
+def test_bound_without_enough_cases_is_a_dash() -> None:
+    # a lower bound of the 5 % quantile at 90 % confidence needs 45 values: 0.95^45 = 0.0994
+    (row,) = distance_grid({"sites": np.array([1.0, 2.0, 3.0])}).rows
+    assert row[-1] == NOTHING
+
+
+def test_rounding_errors_are_printed_as_zero() -> None:
+    assert number(9.09e-13) == number(-9.09e-13) == "0.000"
+    assert number(2e-7) == "2.00e−07"
+
+
+def test_message_on_one_crashed_case_is_singular() -> None:
+    frame = make_rows(8, n_crashed=1)
+    suite = Xml.fromstring(junit_xml("one", [], combine_verdicts([], frame)))  # noqa: S314
+    assert [failure.get("message") for failure in suite.iter("failure")] == ["1 case crashed"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "meaning"),
+    [
+        ("descent", "a velocity is reported"),
+        ("localisation", "a position is reported"),
+        ("measured-velocity", "reported"),
+    ],
+)
+def test_outcome_has_the_meaning_of_its_system(scenario: str, meaning: str) -> None:
+    rows = outcome_grid(pd.DataFrame({"outcome": ["VALID"] * 3}), scenario).rows
+    assert len(rows) == 1
+    assert meaning in rows[0][3]  # column: meaning

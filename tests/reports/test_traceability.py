@@ -6,30 +6,23 @@ import csv
 import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as Xml
-
-import pandas as pd
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts
+from marsyard.reports.overall import combine_verdicts
 from marsyard.reports.traceability import COLUMNS, junit_xml, requirement_evidence, verification_csv
+from tests.reports.synthetic_run import VELOCITY, make_rows
 
-Rows = Callable[..., pd.DataFrame]
 #: Text that a spreadsheet would evaluate and XML cannot contain.
 HOSTILE = '=HYPERLINK("x")\x00<&>'
 
 
-def _make_undecided_requirement(velocity: dict[str, Any]) -> dict[str, Any]:
-    return {**velocity, "id": "UNDECIDED", "probability": 0.9999}
-
-
-def test_matrix_has_one_row_per_requirement(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_matrix_has_one_row_per_requirement() -> None:
     frame = make_rows(40)
-    requirement = {**velocity, "source": "the paper", "kind": "requirement"}
+    requirement = {**VELOCITY, "source": "the paper", "kind": "requirement"}
     verdicts = evaluate_requirements(
-        frame, [requirement, {**velocity, "id": HOSTILE, "statement": HOSTILE, "metric": "no_such_column"}]
+        frame, [requirement, {**VELOCITY, "id": HOSTILE, "statement": HOSTILE, "metric": "no_such_column"}]
     )
     first, second = csv.DictReader(io.StringIO(verification_csv(requirement_evidence("dimes", verdicts))))
     assert tuple(first) == COLUMNS
@@ -49,14 +42,14 @@ def _read_message(case: Xml.Element, result: str) -> str:
     return element.get("message", "")
 
 
-def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_junit_lists_failures_and_undecided_requirements() -> None:
     frame = make_rows(40, n_crashed=2, terrains=10_000)
     # 32 of 34 cases succeed (crashed cases are failures): the rate meets 94 %, its lower bound does not
-    by_rate = {**velocity, "id": "RATE", "probability": 0.94, "decide_by": "estimate"}
+    by_rate = {**VELOCITY, "id": "RATE", "probability": 0.94, "decide_by": "estimate"}
     requirements = [
-        {**velocity, "bound": 0.01, "id": "FAILS"},
-        _make_undecided_requirement(velocity),
-        {**velocity, "probability": 0.5},
+        {**VELOCITY, "bound": 0.01, "id": "FAILS"},
+        {**VELOCITY, "id": "UNDECIDED", "probability": 0.9999},
+        {**VELOCITY, "probability": 0.5},
         by_rate,
     ]
     verdicts = evaluate_requirements(frame, requirements)
@@ -70,14 +63,14 @@ def test_junit_lists_failures_and_undecided_requirements(make_rows: Rows, veloci
     assert _read_message(completion_case, "failure") == "2 cases crashed"
 
 
-def test_junit_states_that_no_case_gives_no_lower_bound(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_junit_states_that_no_case_gives_no_lower_bound() -> None:
     frame = make_rows(0)
-    verdicts = evaluate_requirements(frame, [velocity])
+    verdicts = evaluate_requirements(frame, [VELOCITY])
     suite = Xml.fromstring(junit_xml(HOSTILE, verdicts, combine_verdicts(verdicts, frame)))  # noqa: S314
     assert "0 of 0 failed; no lower bound, required 0.99" in _read_message(suite[0], "skipped")
 
 
-def test_report_writes_matrix_and_junit_files(make_rows: Rows, make_run: Callable[..., Path]) -> None:
+def test_report_writes_matrix_and_junit_files(make_run: Callable[..., Path]) -> None:
     directory = make_run(make_rows(24)[["case", "outcome", "answered", "velocity_error_m_s"]])
     write_report(directory)
     assert (directory / "verification.csv").read_text().startswith("requirement,statement,")

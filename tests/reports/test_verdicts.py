@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,26 +12,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.evaluation import combine_verdicts, compute_exit_code
+from marsyard.reports.overall import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.verdicts import Status
 from tests.reports.single_verdict import evaluate, make_cases
+from tests.reports.synthetic_run import VELOCITY, make_rows
 
-Rows = Callable[..., pd.DataFrame]
 
-
-def test_verdict_passes_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
+def test_verdict_passes_at_the_minimum_number_of_cases() -> None:
     # 99 % at 90 % confidence needs 230 cases without failure, 388 with one (binomial distribution)
-    assert evaluate(make_cases(230, 0), velocity).status is Status.PASS
-    assert evaluate(make_cases(388, 1), velocity).status is Status.PASS
-    undecided = evaluate(make_cases(229, 0), velocity)
+    assert evaluate(make_cases(230, 0), VELOCITY).status is Status.PASS
+    assert evaluate(make_cases(388, 1), VELOCITY).status is Status.PASS
+    undecided = evaluate(make_cases(229, 0), VELOCITY)
     # After a first look that cannot pass, the second look needs 297 cases without failure at the corrected risk.
     assert (undecided.status, undecided.further_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
-def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> None:
-    verdict = evaluate(make_cases(24, 0), velocity)
+def test_24_cases_without_failure_are_insufficient() -> None:
+    verdict = evaluate(make_cases(24, 0), VELOCITY)
     assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 24, 0)
     assert verdict.further_cases == 297 - 24
     # Clopper-Pearson bound without failure in 24 cases at 90 % confidence
@@ -40,8 +38,8 @@ def test_24_cases_without_failure_are_insufficient(velocity: dict[str, Any]) -> 
     assert (verdict.estimate, verdict.upper) == (1.0, 1.0)
 
 
-def test_verdict_fails_if_all_cases_fail(velocity: dict[str, Any]) -> None:
-    verdict = evaluate(make_cases(24, 24), velocity)
+def test_verdict_fails_if_all_cases_fail() -> None:
+    verdict = evaluate(make_cases(24, 24), VELOCITY)
     assert (verdict.status, verdict.estimate, verdict.lower) == (Status.FAIL, 0.0, 0.0)
     assert verdict.further_cases is None
 
@@ -70,24 +68,24 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
         assert too_few.status is Status.INSUFFICIENT
 
 
-def test_metric_equal_to_the_bound_succeeds(velocity: dict[str, Any]) -> None:
-    assert evaluate(make_cases(5, 5, error=5.0), velocity).failures == 0
-    assert evaluate(make_cases(5, 5, error=math.nextafter(5.0, 6.0)), velocity).failures == 5
+def test_metric_equal_to_the_bound_succeeds() -> None:
+    assert evaluate(make_cases(5, 5, error=5.0), VELOCITY).failures == 0
+    assert evaluate(make_cases(5, 5, error=math.nextafter(5.0, 6.0)), VELOCITY).failures == 5
 
 
-def test_signed_metrics_count_by_magnitude(velocity: dict[str, Any]) -> None:
-    assert evaluate(make_cases(5, 2, error=-6.0), velocity).failures == 2
+def test_signed_metrics_count_by_magnitude() -> None:
+    assert evaluate(make_cases(5, 2, error=-6.0), VELOCITY).failures == 2
 
 
 @pytest.mark.parametrize("error", [math.nan, math.inf, -math.inf])
-def test_non_finite_metric_fails(velocity: dict[str, Any], error: float) -> None:
-    assert evaluate(make_cases(5, 2, error=error), velocity).failures == 2
+def test_non_finite_metric_fails(error: float) -> None:
+    assert evaluate(make_cases(5, 2, error=error), VELOCITY).failures == 2
 
 
-def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> None:
+def test_populations_select_cases() -> None:
     frame = make_rows(100, answer_rate=0.8, n_crashed=3)
     n_answered, n_crashed = int(frame["answered"].sum()), 3
-    verdicts = {name: evaluate(frame, velocity, population=name) for name in ("all", "completed", "valid")}
+    verdicts = {name: evaluate(frame, VELOCITY, population=name) for name in ("all", "completed", "valid")}
     assert [verdict.n for verdict in verdicts.values()] == [100, 100 - n_crashed, n_answered]
     n_beyond = int((frame["velocity_error_m_s"] > 5.0).sum())
     # a case without an answer fails if it belongs to the population
@@ -95,16 +93,16 @@ def test_populations_select_cases(make_rows: Rows, velocity: dict[str, Any]) -> 
     assert failures == [100 - n_answered + n_beyond, 100 - n_crashed - n_answered + n_beyond, n_beyond]
 
 
-def test_empty_population_is_insufficient(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    verdict = evaluate(make_rows(24, answer_rate=0.0), velocity)
+def test_empty_population_is_insufficient() -> None:
+    verdict = evaluate(make_rows(24, answer_rate=0.0), VELOCITY)
     assert (verdict.status, verdict.n, verdict.further_cases) == (Status.INSUFFICIENT, 0, 297)
     assert math.isnan(verdict.estimate)
     assert "No case" in verdict.note
 
 
-def test_empty_table_is_insufficient(velocity: dict[str, Any]) -> None:
-    assert evaluate(pd.DataFrame(), velocity, population="all").status is Status.INSUFFICIENT
-    assert evaluate(make_cases(0, 0), velocity).n == 0
+def test_empty_table_is_insufficient() -> None:
+    assert evaluate(pd.DataFrame(), VELOCITY, population="all").status is Status.INSUFFICIENT
+    assert evaluate(make_cases(0, 0), VELOCITY).n == 0
 
 
 @pytest.mark.parametrize(
@@ -118,10 +116,8 @@ def test_empty_table_is_insufficient(velocity: dict[str, Any]) -> None:
         ({"bound": [5]}, "bound"),
     ],
 )
-def test_invalid_requirements_are_insufficient_with_a_note(
-    velocity: dict[str, Any], changes: dict[str, Any], message: str
-) -> None:
-    verdict = evaluate(make_cases(500, 0), velocity, **changes)
+def test_invalid_requirements_are_insufficient_with_a_note(changes: dict[str, Any], message: str) -> None:
+    verdict = evaluate(make_cases(500, 0), VELOCITY, **changes)
     assert verdict.status is Status.INSUFFICIENT
     assert message in verdict.note
 
@@ -204,14 +200,14 @@ def test_crashed_cases_outside_the_population_prevent_a_pass(population: str) ->
     assert evaluate(outside_population, requirement, population="valid and is_near").status is Status.PASS
 
 
-def test_estimate_decides_with_shared_terrains(velocity: dict[str, Any]) -> None:
-    verdict = evaluate(make_cases(400, 0).assign(terrain=np.arange(400) % 8), velocity, decide_by="estimate")
+def test_estimate_decides_with_shared_terrains() -> None:
+    verdict = evaluate(make_cases(400, 0).assign(terrain=np.arange(400) % 8), VELOCITY, decide_by="estimate")
     assert (verdict.status, verdict.plain_status) == (Status.MET_BY_RATE, None)
     assert "8 terrains" in verdict.note
 
 
-def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any]) -> None:
-    verdict = evaluate(make_cases(120, 1), velocity, decide_by="estimate")
+def test_estimate_verdict_reports_the_confidence_verdict() -> None:
+    verdict = evaluate(make_cases(120, 1), VELOCITY, decide_by="estimate")
     assert (verdict.status, verdict.confident_status) == (Status.MET_BY_RATE, Status.INSUFFICIENT)
     assert "at 90 % confidence the verdict would be INSUFFICIENT" in verdict.note
     summary = combine_verdicts([verdict], make_cases(120, 1))
@@ -220,9 +216,9 @@ def test_estimate_verdict_reports_the_confidence_verdict(velocity: dict[str, Any
     assert verdict.statement.endswith("(evaluated by observed rate).")
 
 
-def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
+def test_verdict_by_rate_is_not_pass() -> None:
     """8 cases without failure have a rate of 100 %, but a consumer's risk of 97.6 % at a required rate of 99.7 %."""
-    requirement_99_7 = {**velocity, "probability": 0.997, "decide_by": "estimate"}
+    requirement_99_7 = {**VELOCITY, "probability": 0.997, "decide_by": "estimate"}
     eight_cases = evaluate(make_cases(8, 0), requirement_99_7)
     # a failure rate of 0.003 allows one failure in 1 / 0.003 = 334 cases
     assert (eight_cases.status, eight_cases.further_cases) == (Status.INSUFFICIENT, 334 - 8)
@@ -235,89 +231,87 @@ def test_verdict_by_rate_is_not_pass(velocity: dict[str, Any]) -> None:
     by_rate = evaluate(make_cases(334, 1), requirement_99_7)
     assert compute_exit_code([by_rate], crashed=False) == 3
     assert compute_exit_code([evaluate(make_cases(334, 1), requirement_99_7, accept_rate=True)], crashed=False) == 0
-    passing = evaluate(make_cases(230, 0), velocity)
+    passing = evaluate(make_cases(230, 0), VELOCITY)
     assert combine_verdicts([passing, by_rate], make_cases(334, 1)).word == "MET BY RATE"
     assert combine_verdicts([passing, by_rate, eight_cases], make_cases(334, 1)).word == "INSUFFICIENT"
 
 
 @pytest.mark.parametrize(("probability", "min_cases"), [(0.5, 2), (0.9, 10), (0.92, 13), (0.95, 20), (0.99, 100)])
-def test_minimum_cases_of_a_rate_allow_one_failure(
-    velocity: dict[str, Any], probability: float, min_cases: int
-) -> None:
-    requirement = {**velocity, "probability": probability, "decide_by": "estimate"}
+def test_minimum_cases_of_a_rate_allow_one_failure(probability: float, min_cases: int) -> None:
+    requirement = {**VELOCITY, "probability": probability, "decide_by": "estimate"}
     assert evaluate(make_cases(min_cases, 1), requirement).status is Status.MET_BY_RATE
     assert evaluate(make_cases(min_cases - 1, 1), requirement).status is Status.FAIL
     assert evaluate(make_cases(min_cases - 1, 0), requirement).status is Status.INSUFFICIENT
 
 
-def test_appended_cases_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
+def test_appended_cases_share_the_risk_of_two_evaluations() -> None:
     """388 cases with one failure pass in a single evaluation, but not in a second evaluation after one at 230 cases."""
     design = read_sampling_design({"cases": 230, "appended": [158]})
     frame = make_cases(388, 1)
-    (first,) = evaluate_requirements(frame[:230], [velocity], design)
-    (later,) = evaluate_requirements(frame, [velocity], design)
-    assert evaluate(frame, velocity).status is Status.PASS
+    (first,) = evaluate_requirements(frame[:230], [VELOCITY], design)
+    (later,) = evaluate_requirements(frame, [VELOCITY], design)
+    assert evaluate(frame, VELOCITY).status is Status.PASS
     assert (first.status, first.bounds_confidence) == (Status.INSUFFICIENT, 0.9)
     assert (later.status, later.bounds_confidence > 0.99) == (Status.INSUFFICIENT, True)
     assert "evaluated more than once" in later.note
     # with one failure, the second look needs 1049 cases at the corrected risk
     assert first.further_cases == 1049 - 230
-    (sufficient,) = evaluate_requirements(make_cases(1049, 1), [velocity], design)
+    (sufficient,) = evaluate_requirements(make_cases(1049, 1), [VELOCITY], design)
     assert (sufficient.status, sufficient.n) == (Status.PASS, 1049)
     # 388 cases with 60 failures fail also in the second evaluation
-    assert evaluate_requirements(make_cases(388, 60), [velocity], design)[0].status is Status.FAIL
+    assert evaluate_requirements(make_cases(388, 60), [VELOCITY], design)[0].status is Status.FAIL
 
 
-def test_appended_terrains_share_the_risk_of_two_evaluations(velocity: dict[str, Any]) -> None:
+def test_appended_terrains_share_the_risk_of_two_evaluations() -> None:
     design = SamplingDesign(first_look=460)
     frame = make_cases(776, 0).assign(terrain=np.arange(776) // 2)
     frame.loc[0, "velocity_error_m_s"] = 6.0
-    (first,) = evaluate_requirements(frame[:460], [velocity], design)
-    (later,) = evaluate_requirements(frame, [velocity], design)
+    (first,) = evaluate_requirements(frame[:460], [VELOCITY], design)
+    (later,) = evaluate_requirements(frame, [VELOCITY], design)
     # the first look at 230 terrains can use a risk of 9.9 %; little is left for later looks
     assert first.status is Status.INSUFFICIENT
     assert first.further_cases is not None
     assert first.further_cases > 800
-    assert evaluate(frame, velocity).status is Status.PASS
+    assert evaluate(frame, VELOCITY).status is Status.PASS
     assert later.status is Status.INSUFFICIENT
 
 
-def test_consumer_risk_is_exact_at_the_minimum_number_of_cases(velocity: dict[str, Any]) -> None:
+def test_consumer_risk_is_exact_at_the_minimum_number_of_cases() -> None:
     # 0.99^230 = 0.0991 is below 10 %
-    assert evaluate(make_cases(230, 0), velocity).consumer_risk == pytest.approx(0.99**230)
+    assert evaluate(make_cases(230, 0), VELOCITY).consumer_risk == pytest.approx(0.99**230)
     # ten cases on each of 230 terrains count as 230 cases
-    verdict = evaluate(make_cases(2300, 0).assign(terrain=np.arange(2300) // 10), velocity)
+    verdict = evaluate(make_cases(2300, 0).assign(terrain=np.arange(2300) // 10), VELOCITY)
     assert verdict.consumer_risk == pytest.approx(0.99**230)
 
 
 @pytest.mark.parametrize("changes", [{"metric": "velocity_error_m_s"}, {"metric": "site_safe", "bound": None}])
-def test_campaign_without_a_finished_case_fails(velocity: dict[str, Any], changes: dict[str, Any]) -> None:
+def test_campaign_without_a_finished_case_fails(changes: dict[str, Any]) -> None:
     """The columns of metric and population are missing if every case crashed; that is no reason for INSUFFICIENT."""
     frame = make_cases(30, 0).assign(outcome="CRASHED", answered=False).drop(columns="velocity_error_m_s")
-    verdict = evaluate(frame, velocity | changes, population="selectable")
+    verdict = evaluate(frame, {**VELOCITY, **changes}, population="selectable")
     assert (verdict.status, verdict.failures) == (Status.FAIL, 30)
 
 
-def test_missing_answered_column_is_noted(velocity: dict[str, Any]) -> None:
-    assert "answered" in evaluate(make_cases(5, 0).drop(columns="answered"), velocity).note
+def test_missing_answered_column_is_noted() -> None:
+    assert "answered" in evaluate(make_cases(5, 0).drop(columns="answered"), VELOCITY).note
 
 
-def test_text_metric_fails_all_cases(velocity: dict[str, Any]) -> None:
-    assert evaluate(make_cases(5, 0).assign(velocity_error_m_s="good"), velocity).failures == 5
+def test_text_metric_fails_all_cases() -> None:
+    assert evaluate(make_cases(5, 0).assign(velocity_error_m_s="good"), VELOCITY).failures == 5
 
 
-def test_evaluation_does_not_change_its_inputs(make_rows: Rows, velocity: dict[str, Any]) -> None:
-    frame, requirement = make_rows(50), dict(velocity)
+def test_evaluation_does_not_change_its_inputs() -> None:
+    frame, requirement = make_rows(50), dict(VELOCITY)
     frame_before = frame.copy()
     evaluate_requirements(frame, [requirement])
     pd.testing.assert_frame_equal(frame, frame_before)
-    assert requirement == velocity
+    assert requirement == VELOCITY
 
 
-def test_overall_verdict_is_the_worst_verdict(velocity: dict[str, Any]) -> None:
+def test_overall_verdict_is_the_worst_verdict() -> None:
     frame = make_cases(230, 0)
-    passing, failing = evaluate(frame, velocity), evaluate(frame, velocity, bound=0.5)
-    undecided = evaluate(frame, velocity, probability=0.999)
+    passing, failing = evaluate(frame, VELOCITY), evaluate(frame, VELOCITY, bound=0.5)
+    undecided = evaluate(frame, VELOCITY, probability=0.999)
     assert combine_verdicts([passing], frame).word == "PASS"
     assert combine_verdicts([passing, undecided], frame).word == "INSUFFICIENT"
     assert combine_verdicts([passing, undecided, failing], frame).word == "FAIL"
@@ -325,10 +319,10 @@ def test_overall_verdict_is_the_worst_verdict(velocity: dict[str, Any]) -> None:
     assert "1 of 3 requirements not met, 1 undecided" in combine_verdicts([passing, undecided, failing], frame).sentence
 
 
-def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
+def test_exit_code_follows_the_worst_verdict() -> None:
     frame = make_cases(230, 0)
-    passing, failing = evaluate(frame, velocity), evaluate(frame, velocity, bound=0.5)
-    undecided = evaluate(frame, velocity, probability=0.999)
+    passing, failing = evaluate(frame, VELOCITY), evaluate(frame, VELOCITY, bound=0.5)
+    undecided = evaluate(frame, VELOCITY, probability=0.999)
     assert compute_exit_code([], crashed=False) == 0
     assert compute_exit_code([passing], crashed=False) == 0
     assert compute_exit_code([passing, undecided], crashed=False) == 3
@@ -337,16 +331,16 @@ def test_exit_code_follows_the_worst_verdict(velocity: dict[str, Any]) -> None:
     assert compute_exit_code([], crashed=True) == 1
 
 
-def test_crashed_cases_are_counted_in_the_summary(make_rows: Rows) -> None:
+def test_crashed_cases_are_counted_in_the_summary() -> None:
     summary = combine_verdicts([], make_rows(24, n_crashed=2))
     assert summary.crashed == 2
     assert "2 cases crashed" in summary.sentence
 
 
-def test_population_defined_by_truth_is_named_and_compared_with_all_cases(velocity: dict[str, Any]) -> None:
+def test_population_defined_by_truth_is_named_and_compared_with_all_cases() -> None:
     frame = make_cases(20, 2)
     frame["lit"] = np.arange(20) >= 10
-    requirement = {**velocity, "population": "lit", "statement": "The error is small."}
+    requirement = {**VELOCITY, "population": "lit", "statement": "The error is small."}
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"})
     assert verdict.statement == "Given truth (lit): The error is small."
     assert verdict.all_cases is not None
@@ -363,16 +357,16 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases(veloci
     assert (over_all_cases.all_cases, over_all_cases.statement) == (None, "The error is small.")
 
 
-def test_configured_conditions_also_restrict_the_result_of_all_cases(velocity: dict[str, Any]) -> None:
+def test_configured_conditions_also_restrict_the_result_of_all_cases() -> None:
     frame = make_cases(20, 2)
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
-    requirement = {**velocity, "population": "lit and navcam"}
+    requirement = {**VELOCITY, "population": "lit and navcam"}
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"}, configured=("nav*",))
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
     assert verdict.all_cases.text.startswith("For comparison: if all 10 cases with the navcam counted, ")
     # the population is the configuration itself
     (configured_population,) = evaluate_requirements(
-        frame, [{**velocity, "population": "navcam"}], configured=("nav*",)
+        frame, [{**VELOCITY, "population": "navcam"}], configured=("nav*",)
     )
     assert configured_population.all_cases is None

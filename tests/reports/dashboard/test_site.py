@@ -7,11 +7,9 @@ import io
 import json
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 from markupsafe import escape
 
@@ -28,14 +26,12 @@ from marsyard.reports.dashboard.entries import (
     requirement_rows,
     sparkline,
 )
-from marsyard.reports.dashboard.excerpts import read_excerpts
-from marsyard.reports.dashboard.site import write_site
+from marsyard.reports.dashboard.site import read_excerpts, write_site
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sections import script_hash
 from marsyard.reports.verdicts import Status, Verdict
+from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
-Rows = Callable[..., pd.DataFrame]
-MakeRun = Callable[..., Path]
 MIN_COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
 #: Text that would run a script or leave the folder of the site if it were not escaped.
 HOSTILE = "<script>alert('x')</script><img src=x onerror=alert(1)>\"'../../{{ 7*7 }}"
@@ -46,7 +42,7 @@ def _write_index(tmp_path: Path) -> str:
     return (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
 
 
-def test_index_lists_all_requirements_and_campaigns(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_index_lists_all_requirements_and_campaigns(make_run: MakeRun, tmp_path: Path) -> None:
     for day in (1, 2, 3):
         make_run(make_rows(24, seed=day)[MIN_COLUMNS], name=f"run-{day}", started_utc=f"2026-01-0{day}T00:00:00Z")
     text = _write_index(tmp_path)
@@ -66,7 +62,7 @@ def test_index_lists_all_requirements_and_campaigns(make_rows: Rows, make_run: M
     assert (verdicts["DIMES-VEL"], verdicts["HDA-POS"]) == ("INSUFFICIENT", "NO CAMPAIGN")
 
 
-def test_finished_campaigns_precede_interrupted_ones(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_finished_campaigns_precede_interrupted_ones(make_run: MakeRun, tmp_path: Path) -> None:
     paths = []
     for day, (name, state) in enumerate([("a", "finished"), ("b", "finished"), ("c", "interrupted")], start=1):
         record_changes = {"started_utc": f"2026-01-0{day}T00:00:00Z", "state": state}
@@ -84,9 +80,7 @@ def test_finished_campaigns_precede_interrupted_ones(make_rows: Rows, make_run: 
 
 
 @pytest.mark.slow
-def test_links_have_targets_in_the_site(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any]
-) -> None:
+def test_links_have_targets_in_the_site(make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any]) -> None:
     make_run(make_rows(24)[MIN_COLUMNS], products=dimes_products)
     _write_index(tmp_path)
     site = tmp_path / "site"
@@ -101,7 +95,7 @@ def test_links_have_targets_in_the_site(
 
 
 def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A campaign costs neither an evaluation nor a figure: both are parts of the report that this user has written."""
     directory = make_run(make_rows(24, error_scale=4.0)[MIN_COLUMNS], products=dimes_products)
@@ -128,7 +122,7 @@ def test_pages_of_an_own_report_repeat_it_without_evaluating_or_drawing(
 
 
 def test_reports_of_another_layout_are_written_again(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     write_report(directory)
@@ -148,7 +142,7 @@ def test_values_of_a_campaign_cannot_end_a_part_of_its_report() -> None:
     assert excerpts.cases == {2: value}
 
 
-def test_security_policy_contains_the_hash_of_the_script(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_security_policy_contains_the_hash_of_the_script(make_run: MakeRun, tmp_path: Path) -> None:
     make_run(make_rows(6)[MIN_COLUMNS])
     text = _write_index(tmp_path)
     (script,) = re.findall(r"<script>(.*?)</script>", text, re.DOTALL)
@@ -156,12 +150,10 @@ def test_security_policy_contains_the_hash_of_the_script(make_rows: Rows, make_r
     assert "default-src 'none'" in text
 
 
-def test_texts_are_escaped_and_files_stay_in_the_site(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, velocity: dict[str, Any]
-) -> None:
+def test_texts_are_escaped_and_files_stay_in_the_site(make_run: MakeRun, tmp_path: Path) -> None:
     frame = make_rows(12, n_crashed=1)[[*MIN_COLUMNS, "error"]].assign(error=HOSTILE)
     parameters = {"site": HOSTILE, "algorithm": HOSTILE}
-    directory = make_run(frame, [{**velocity, "id": HOSTILE, "statement": HOSTILE}], name="hostile", git_commit=HOSTILE)
+    directory = make_run(frame, [{**VELOCITY, "id": HOSTILE, "statement": HOSTILE}], name="hostile", git_commit=HOSTILE)
     record = (directory / "campaign.json").read_text()
     hostile_record = {**json.loads(record), "name": HOSTILE, "state": HOSTILE, "started_utc": HOSTILE}
     hostile_record["configuration"]["parameters"] = parameters
@@ -181,16 +173,14 @@ def test_folder_names_have_only_letters_digits_and_hyphens(tmp_path: Path) -> No
     assert make_slug(tmp_path / "a", "x") != make_slug(tmp_path / "b", "x")
 
 
-def test_overlapping_search_folders_list_each_campaign_once(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_overlapping_search_folders_list_each_campaign_once(make_run: MakeRun, tmp_path: Path) -> None:
     first = make_run(make_rows(6)[MIN_COLUMNS], name="a/b")
     make_run(make_rows(6)[MIN_COLUMNS], name="c")
     assert find_campaigns([tmp_path, first, tmp_path / "a"]) == [first, tmp_path / "c"]
     assert find_campaigns([tmp_path / "nowhere"]) == []
 
 
-def test_unreadable_campaign_is_reported_and_others_are_shown(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path
-) -> None:
+def test_unreadable_campaign_is_reported_and_others_are_shown(make_run: MakeRun, tmp_path: Path) -> None:
     make_run(make_rows(6)[MIN_COLUMNS], name="readable")
     damaged_run = make_run(make_rows(6)[MIN_COLUMNS], name="damaged")
     (damaged_run / "cases.parquet").write_bytes(b"not a table")
@@ -200,7 +190,7 @@ def test_unreadable_campaign_is_reported_and_others_are_shown(
     assert "damaged" in site.index.read_text(encoding="utf-8")
 
 
-def test_pages_of_unchanged_campaigns_are_not_rewritten(make_rows: Rows, make_run: MakeRun, tmp_path: Path) -> None:
+def test_pages_of_unchanged_campaigns_are_not_rewritten(make_run: MakeRun, tmp_path: Path) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS])
     _write_index(tmp_path)
     page = next((tmp_path / "site" / "c").glob("*/index.html"))
@@ -214,7 +204,7 @@ def test_pages_of_unchanged_campaigns_are_not_rewritten(make_rows: Rows, make_ru
 
 
 def test_reports_of_others_are_written_again(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_run: MakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A page with a script, or data with another verdict, never reach the site; the campaign's folder is unchanged."""
     directory = make_run(make_rows(24)[MIN_COLUMNS], name="elsewhere")
@@ -241,7 +231,7 @@ def test_reports_of_others_are_written_again(
 
 @pytest.mark.parametrize("name", ["report.html", "campaign.json", "cases/3/products.npz", "cases/7"])
 def test_folders_with_links_are_refused(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], name: str
+    make_run: MakeRun, tmp_path: Path, dimes_products: dict[str, Any], name: str
 ) -> None:
     directory = make_run(make_rows(6)[MIN_COLUMNS], name="linked", products=dimes_products)
     secret = tmp_path / "secret"
@@ -282,13 +272,11 @@ def test_index_without_campaigns_is_written(tmp_path: Path) -> None:
     assert "0 stored campaigns" in _write_index(tmp_path)
 
 
-def test_failed_requirements_precede_others(
-    make_rows: Rows, make_run: MakeRun, tmp_path: Path, velocity: dict[str, Any]
-) -> None:
+def test_failed_requirements_precede_others(make_run: MakeRun, tmp_path: Path) -> None:
     requirements = [
-        {**velocity, "id": "MET", "probability": 0.1},
-        {**velocity, "id": "UNDECIDED", "probability": 0.9999},
-        {**velocity, "id": "FAILED", "bound": 0.1},
+        {**VELOCITY, "id": "MET", "probability": 0.1},
+        {**VELOCITY, "id": "UNDECIDED", "probability": 0.9999},
+        {**VELOCITY, "id": "FAILED", "bound": 0.1},
     ]
     make_run(make_rows(40, terrains=100_000), requirements)
     entries, _ = read_entries(find_campaigns([tmp_path]), tmp_path / "pages")

@@ -43,7 +43,7 @@ def test_all_images_and_estimates_are_drawn(products: dict[str, Any]) -> None:
 
 
 def test_case_view_has_one_row_per_image(products: dict[str, Any], tmp_path: Path) -> None:
-    case_view = view_stream(products, "case3")
+    case_view = view_stream(products)
     assert [row.succeeded for row in case_view.rows] == [False, True, True, True]
     assert case_view.rows[0].values[0] == "1"
     assert set(case_view.rows[0].values[1:]) == {""}

@@ -121,16 +121,16 @@ def test_true_terrain_is_aligned_with_the_map(hda_products: dict[str, Any]) -> N
 def test_figure_without_safe_site_has_no_site_marker(hda_products: dict[str, Any]) -> None:
     image_axes = draw_site({**hda_products, "site": np.array(())}).axes[0]
     assert [line.get_marker() for line in image_axes.lines] == ["x"]
-    captions = [figure.caption for figure in view({**hda_products, "site": np.array(())}, "case1").figures]
+    captions = [figure.caption for figure in view({**hda_products, "site": np.array(())}).figures]
     assert captions[-1] == "Fig. 7: safe landing map. Black X: a-priori site."
 
 
 def test_map_without_known_cells_is_described(hda_products: dict[str, Any]) -> None:
     products = {**hda_products, "safety": np.ones_like(hda_products["safety"])}
-    case_view = view(products, "case1")
+    case_view = view(products)
     assert "unknown everywhere" in case_view.figures[3].caption
     assert ["Safe landing map", "safe 0.0 %, hazard 0.0 %, unknown 100.0 %"] in [row.values for row in case_view.rows]
-    assert not any("unknown everywhere" in figure.caption for figure in view(hda_products, "case1").figures)
+    assert not any("unknown everywhere" in figure.caption for figure in view(hda_products).figures)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_map_without_known_cells_is_described(hda_products: dict[str, Any]) -> N
 def test_missing_stages_have_no_figure(hda_products: dict[str, Any], missing: tuple[str, ...], n_figures: int) -> None:
     products = {name: value for name, value in hda_products.items() if name not in missing}
     assert len(available_figures(products)) == n_figures
-    case_view = view(products, "case7")
+    case_view = view(products)
     # the page omits Fig. 1 of the landing paper; without other figures it shows the images
     assert len(case_view.figures) == max(1, n_figures - 1)
     assert is_hda_case(products)
@@ -176,6 +176,6 @@ def test_maps_with_unknown_cells_are_drawn(hda_products: dict[str, Any]) -> None
     elevation[3:6, 4:9] = np.nan
     unknown = {name: np.where(np.isnan(elevation), np.nan, hda_products[name]) for name in ("roughness", "slope")}
     pixels = np.where(np.isnan(elevation)[..., None], np.nan, hda_products["map_pixels"])
-    case_view = view({**hda_products, **unknown, "elevation": elevation, "map_pixels": pixels}, "case1")
+    case_view = view({**hda_products, **unknown, "elevation": elevation, "map_pixels": pixels})
     # all figures except Fig. 1, which the page omits
     assert len(case_view.figures) == 5

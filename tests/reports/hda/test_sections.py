@@ -153,7 +153,7 @@ def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:
     assert [row[1] for row in blocks[0].grid.rows] == 2 * ["1 to 1.5", "1.5 to 2", "2 to 3", "> 3"]
     # 400 of 1000 footprints are classified as safe, 2 of them are unsafe; 600 are truly safe
     rightly_safe = blocks[-1].data["rates"]["truly safe footprints that are classified as safe"]
-    assert (rightly_safe["hits"], rightly_safe["total"]) == (3980, 6000)
+    assert (rightly_safe.hits, rightly_safe.total) == (3980, 6000)
     assert blocks[0].figures
     hits = [str(name) for name in frame if str(name).endswith(("_safe", "_unflagged"))]
     assert not create_class_blocks(frame.assign(**dict.fromkeys(hits, 0)))[0].figures
@@ -165,11 +165,8 @@ def test_rates_are_reported_per_roughness_threshold() -> None:
     assert section is not None
     low, high = section.data["thresholds"]
     assert (low["max_roughness_m"], high["max_roughness_m"]) == (0.1, 0.2)
-    assert (low["false_alarms"]["fraction"], high["false_alarms"]["fraction"]) == (
-        pytest.approx(0.2),
-        pytest.approx(0.05),
-    )
-    assert low["missed"]["fraction"] == pytest.approx(8 / 400)
+    assert (low["false_alarms"].fraction, high["false_alarms"].fraction) == (pytest.approx(0.2), pytest.approx(0.05))
+    assert low["missed"].fraction == pytest.approx(8 / 400)
     assert threshold_section(_make_subject(landing_frame(40))) is None
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports.measured.presentation import MEASURED, agreement_section, read_matched_pairs
-from marsyard.reports.presentation import find_case_kind
+from marsyard.reports.presentation import find_case_kind, write_case_figures
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import StoredRun
 
@@ -60,10 +60,10 @@ def test_no_section_without_recorded_cases() -> None:
 
 
 def test_case_without_matches_is_shown(tmp_path: Path) -> None:
-    view = MEASURED.cases[0].view(make_products(0), "k")
+    view = MEASURED.cases[0].view(make_products(0), False)
     assert view.rows[0].succeeded is False
     assert "0 matches" in view.figures[0].caption
-    (path,) = MEASURED.cases[0].write(tmp_path, make_products(40))
+    (path,) = write_case_figures(tmp_path, make_products(40))
     assert path.stat().st_size > 5000
 
 

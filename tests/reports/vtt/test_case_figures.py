@@ -7,9 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from marsyard.reports.presentation import write_case_figures
 from marsyard.reports.vtt.case_figures import (
@@ -22,25 +20,22 @@ from marsyard.reports.vtt.case_figures import (
     read_stops,
 )
 from marsyard.reports.vtt.presentation import view
+from tests.reports.drawn_marks import find_boxes
 from tests.reports.vtt.tracking_rows import make_products
-
-
-def _find_squares(figure: Figure, colour: str) -> list[Rectangle]:
-    rectangles = [patch for axes in figure.axes for patch in axes.patches if isinstance(patch, Rectangle)]
-    return [patch for patch in rectangles if patch.get_edgecolor() == to_rgba(colour)]
 
 
 def test_squares_mark_target_and_search_window() -> None:
     figure = draw_stops(make_products())
-    left_square, right_square = _find_squares(figure, TARGET)[:2]
+    # the axes are the left subframes and enlarged matches of three stops, then the right subframes
+    left_square, right_square = find_boxes(figure.axes[0], TARGET)[0], find_boxes(figure.axes[6], TARGET)[0]
     # match at (480, 370), subframe origin at (400, 300), template of 21 pixels about the pixel centre
-    assert left_square.get_xy() == (80.0 - 10.5, 70.0 - 10.5)
-    assert (left_square.get_width(), left_square.get_height()) == (21.0, 21.0)
-    assert right_square.get_xy() == (70.0 - 10.5, 69.0 - 10.5)
-    assert len(_find_squares(figure, TARGET)) == 4  # no square at the stop that lost the target
-    window = _find_squares(figure, WINDOW)[0]
-    assert (window.get_xy(), window.get_width()) == ((9.5, 9.5), 141.0)
-    assert window.get_linestyle() != left_square.get_linestyle()  # distinct without colour
+    assert left_square.corner.tolist() == [80.0 - 10.5, 70.0 - 10.5]
+    assert left_square.size.tolist() == [21.0, 21.0]
+    assert right_square.corner.tolist() == [70.0 - 10.5, 69.0 - 10.5]
+    assert len(find_boxes(figure, TARGET)) == 4  # no square at the stop that lost the target
+    window = find_boxes(figure, WINDOW)[0]
+    assert (*window.corner, window.size[0]) == (9.5, 9.5, 141.0)
+    assert window.is_dashed != left_square.is_dashed  # distinct without colour
 
 
 def test_template_around_the_match_is_enlarged() -> None:
@@ -91,13 +86,13 @@ def test_right_subframe_is_cut_to_the_width_of_the_left_one() -> None:
     right_px = [700.0, 310.0]
     matches = np.array([[480.0, 370.0], right_px])
     figure = draw_stops(make_products() | {"stop_1_right": counts, "stop_1_matches": matches})
-    right = figure.axes[2]
+    right = figure.axes[6]
     assert np.asarray(right.get_images()[0].get_array()).shape[:2] == (51, 161)
     # the match at column 320 of the subframe is at the centre of the 161 columns from column 239
-    (square,) = [patch for patch in right.patches if isinstance(patch, Rectangle)]
-    assert square.get_xy() == (320.0 - 239.0 - 10.5, 8.0 - 10.5)
-    assert "strip" in view(make_products() | {"stop_1_right": counts}, "case1").figures[0].caption
-    assert "strip" not in view(make_products(), "case1").figures[0].caption
+    (square,) = find_boxes(right, TARGET)
+    assert square.corner.tolist() == [320.0 - 239.0 - 10.5, 8.0 - 10.5]
+    assert "strip" in view(make_products() | {"stop_1_right": counts}).figures[0].caption
+    assert "strip" not in view(make_products()).figures[0].caption
 
 
 def test_selected_stops_include_first_and_last() -> None:
@@ -143,7 +138,7 @@ def test_missing_products_are_tolerated(changes: dict[str, Any]) -> None:
     case_products = make_products() | changes
     assert draw_stops(case_products).axes
     assert draw_path(case_products).axes
-    assert len(view(case_products, "case1").rows) == 3
+    assert len(view(case_products).rows) == 3
 
 
 def test_incomplete_products_are_not_a_tracking_case() -> None:
@@ -159,10 +154,10 @@ def test_incomplete_products_are_not_a_tracking_case() -> None:
 
 
 def test_case_view_has_one_row_per_stop() -> None:
-    case_view = view(make_products(), "case7")
+    case_view = view(make_products())
     assert [row.succeeded for row in case_view.rows] == [True, True, False]
     assert case_view.head == ["Stop", "State", "Range (m)", "Mast azimuth (deg)", "NCC score"]
     assert list(case_view.rows[1].values)[:3] == ["2", "normal", "6.00"]
     # the state is shown only if it varies
-    normal_view = view(make_products() | {"states": ["NORMAL"] * 3}, "case7")
+    normal_view = view(make_products() | {"states": ["NORMAL"] * 3})
     assert normal_view.head[:2] == ["Stop", "Range (m)"]

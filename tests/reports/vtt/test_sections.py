@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from marsyard.reports.presentation import presentations
-from marsyard.reports.vtt.goal import goal_section, losses_grid, summarize_cameras
+from marsyard.reports.vtt.goal import goal_section, losses_grid, measured_accuracy, summarize_cameras, table_1_section
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.vtt.sections import (
     CHECKOUT_1,
@@ -22,7 +22,6 @@ from marsyard.reports.vtt.sections import (
     terrains_section,
     updates_section,
 )
-from marsyard.reports.vtt.table_1 import measured_accuracy, table_1_section
 from tests.reports.vtt.tracking_rows import make_rows, make_subject, read_table, set_values
 
 

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from marsyard.reports.campaign import write_report
-from marsyard.reports.dimes.sections import FIG_11, field_cells, field_test_section
+from marsyard.reports.fieldtest.presentation import FIG_11, field_cells, field_test_section
 from marsyard.reports.section import Subject
 from marsyard.reports.stored import read_run
+from tests.reports.synthetic_run import MakeRun, make_rows
 
 VELOCITY = {"id": "V", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.99, "confidence": 0.9}
-MakeRun = Callable[..., Path]
-MakeRows = Callable[..., pd.DataFrame]
 
 
 @pytest.fixture
-def field_frame(make_rows: MakeRows) -> pd.DataFrame:
+def field_frame() -> pd.DataFrame:
     """Return 20 image triples in each of three cells (category and run), with 20, 10 and 0 answers.
 
     The paper has values of two of the cells.
@@ -71,6 +67,6 @@ def test_stored_table_has_the_misprints_of_the_paper() -> None:
     ] == [("same direction", "Pisgah Run 3")]
 
 
-def test_other_campaigns_have_no_field_test_section(make_run: MakeRun, make_rows: MakeRows) -> None:
+def test_other_campaigns_have_no_field_test_section(make_run: MakeRun) -> None:
     run = read_run(make_run(make_rows(30), requirements=[VELOCITY]))
     assert field_test_section(Subject(run, "velocity_error_m_s", 5.0)) is None
