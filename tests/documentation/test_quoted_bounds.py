@@ -1,7 +1,5 @@
 """Tests that the confidence bounds on documentation pages agree with the counts on the same page."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -82,7 +80,6 @@ def test_groups_of_hazardous_flights_sum_to_all_flights() -> None:
     match = re.search(
         r"The ([\d,]+) flights fall into three groups .*?: (\d+) have .*?, (\d+) have .*?, and (\d+) have", page
     )
-    assert match is not None
     flights, *groups = (int(count.replace(",", "")) for count in match.groups())
     records = [json.loads(line) for line in CONFIRMATIONS.read_text(encoding="utf-8").splitlines()]
     (cases,) = {

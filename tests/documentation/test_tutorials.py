@@ -1,7 +1,5 @@
 """Tests that the commands of each tutorial succeed in an empty folder, in the order of the page."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -15,11 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 from marsyard.cli.app import app
-
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 
 DOCS = Path(__file__).parents[2] / "docs"
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.md"))

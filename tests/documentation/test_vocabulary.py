@@ -3,8 +3,6 @@
 The tables below map each rejected word to its standard term. docs/glossary.md defines the accepted terms.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import re

@@ -1,7 +1,5 @@
 """A git repository with a campaign, an algorithm and a record of confirmations, for the tests of confirmations."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

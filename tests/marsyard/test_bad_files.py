@@ -1,7 +1,5 @@
 """Tests of invalid input files: the command reports the file and its fault, and exits with status 2."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from pathlib import Path

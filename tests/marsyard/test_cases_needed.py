@@ -1,7 +1,5 @@
 """End-to-end test of the advice of an undecided campaign: the printed command decides it."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import sys
@@ -13,10 +11,6 @@ import pytest
 from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, write_campaign
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 Command = Callable[..., tuple[int, str]]
 #: 99 % at 90 % confidence: 230 answers without a failure at one look, 297 if 24 answers were evaluated before.
 REQUIREMENT = """

@@ -3,8 +3,6 @@
 Exit status: 0 requirements met, 1 requirement or case failed, 2 error, 3 no verdict.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -22,12 +20,6 @@ import pytest
 
 from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS, write_campaign
-
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    # warnings of Matplotlib in the figures of reports
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 
 
 @dataclass(frozen=True)
@@ -114,7 +106,6 @@ def test_stages_are_saved_as_separate_files(finished_run: Path, marsyard: Comman
     files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
     assert files == ["01-image.png", "02-title.json", "03-nested/01-0/01-x.npy"]
     image = cv2.imread(str(stages / "01-image.png"), cv2.IMREAD_UNCHANGED)
-    assert image is not None
     assert image.dtype == np.uint16
     assert image.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert f"stages: 3 files in {stages}" in result.out

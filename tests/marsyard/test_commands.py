@@ -1,7 +1,5 @@
 """Tests that all commands have a help text, and that commands which only print have a JSON option."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import typer

@@ -4,8 +4,6 @@ Each attempt starts with a repository whose committed record contains a confirma
 commands of which the cases alone would meet the requirement.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -27,10 +25,6 @@ from tests.marsyard.confirmation_project import (
     make_command,
 )
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 CONFIRM = ("run", "fake.toml", "--confirm", "--jobs", 1, "--out")
 #: Exit status and status of the requirement of each command of an attempt.
 Expected = list[tuple[int, str]]

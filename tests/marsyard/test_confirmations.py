@@ -4,8 +4,6 @@ A confirmation (`marsyard run --confirm`) evaluates frozen content on a seed tha
 confirmations is committed to git; `test_confirmation_attacks.py` contains attempts to obtain PASS without evidence.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -32,10 +30,6 @@ from tests.marsyard.confirmation_project import (
     read_statuses,
 )
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 SHIPPED_RECORD = Path(__file__).parents[2] / "benchmarks" / "results" / RECORD
 FAILING_CASES = "FAKE_FAILING_CASES"
 

@@ -1,7 +1,5 @@
 """Tests of custom algorithms on the command line: conformance checks, exported cases and scores."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -10,11 +8,6 @@ from typer.testing import CliRunner
 
 from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import read_case_rows
-
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 
 #: Estimator that never returns for a saturated image (counts above 4000) and aborts for a dark image.
 HOSTILE = """

@@ -1,7 +1,5 @@
 """Tests of data sets for machine learning: tar files of samples (shards), truth of each pixel, reproducible files."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile

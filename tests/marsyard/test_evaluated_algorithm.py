@@ -1,7 +1,5 @@
 """Tests that records and reports name the evaluated algorithm and the command that repeats the campaign."""
 
-from __future__ import annotations
-
 import csv
 import html
 import io
@@ -21,11 +19,6 @@ from typer.testing import CliRunner
 from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
 from tests.campaigns.fake_campaign import read_case_rows
-
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 
 ALGORITHM = """
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome

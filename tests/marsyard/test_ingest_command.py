@@ -1,7 +1,5 @@
 """Tests of `marsyard ingest`: campaigns from recorded images; invalid input leaves no files."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path

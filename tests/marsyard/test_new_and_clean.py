@@ -1,7 +1,5 @@
 """Tests of `marsyard new` and `marsyard clean`, and of the JSON output of lists."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import tomllib

@@ -1,7 +1,5 @@
 """Tests of `marsyard nightly`: plans, regressions, interrupted runs and seeds."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 import sys
@@ -17,10 +15,6 @@ from marsyard.cli import nightly_plan
 from marsyard.cli.nightly_plan import PLAN_FILE, hash_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 Nightly = Callable[..., tuple[int, str]]
 
 

@@ -1,7 +1,5 @@
 """Tests that the commands which read a campaign's folder execute nothing that the folder names."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil
@@ -15,10 +13,6 @@ import pytest
 from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 Command = Callable[..., tuple[int, str]]
 #: A module that leaves a file when it is imported, or an object of it is constructed.
 TRAP = """

@@ -1,7 +1,5 @@
 """Tests of `marsyard render`: consistent image, camera and truth files; invalid options."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable
@@ -42,7 +40,6 @@ def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
     """Check that image, camera model, metadata and truth files agree; pixel values are multiples of `multiple`."""
     columns, rows = size
     image = cv2.imread(f"{prefix}.png", cv2.IMREAD_UNCHANGED)
-    assert image is not None
     assert image.dtype == np.uint16
     assert image.shape == (rows, columns)
     assert (image % multiple == 0).all()

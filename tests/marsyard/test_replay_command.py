@@ -1,7 +1,5 @@
 """Tests of `marsyard replay`: stored products are replaced only by complete new ones."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """Tests of the options of `marsyard replay` that export a case in space and time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -62,7 +60,6 @@ def test_replay_exports_the_case(stored_run: Path, tmp_path: Path) -> None:
     assert (bag / "metadata.yaml").is_file()
     assert (tmp_path / "out" / "space.png").is_file()
     stored = Timeline.from_products(load_products(tmp_path / "out"))
-    assert stored is not None
     assert [*stored.paths] == ["true", "estimated"]
 
 

@@ -3,8 +3,6 @@
 Exit status: 0 requirements met, 1 failed, 2 error, 3 no verdict.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
@@ -34,10 +32,6 @@ from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, write_campaign
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 Command = Callable[..., tuple[int, str, str]]
 MakeRun = Callable[..., Path]
 COLUMNS = ["case", "outcome", "answered", "velocity_error_m_s"]
@@ -57,8 +51,6 @@ def make_run(tmp_path: Path) -> MakeRun:
     """Return a function that writes a synthetic run of tests/reports/conftest.py."""
     path = Path(__file__).resolve().parents[1] / "reports" / "conftest.py"
     spec = importlib.util.spec_from_file_location("synthetic_runs", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
 

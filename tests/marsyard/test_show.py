@@ -1,7 +1,5 @@
 """Tests of `marsyard show`: dispersions, draws as table, figure and JSON, and invalid campaign files."""
 
-from __future__ import annotations
-
 import copy
 import io
 import json

@@ -1,7 +1,5 @@
 """Tests of the dashboard server: invalid paths and requests for other hosts are rejected."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 import struct

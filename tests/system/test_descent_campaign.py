@@ -11,11 +11,6 @@ from typer.testing import CliRunner, Result
 
 from marsyard.cli.app import app
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
-
 #: Exit code of a campaign with too few cases for a verdict, and of invalid input.
 EXIT_INSUFFICIENT, EXIT_INVALID_INPUT = 3, 2
 #: The smoke campaign on small terrain with fewer dispersions.

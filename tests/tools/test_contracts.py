@@ -1,7 +1,5 @@
 """Test of the import contracts: algorithms may import only the listed modules of the simulation."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

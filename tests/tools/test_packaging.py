@@ -1,7 +1,5 @@
 """Tests of the wheel: it installs one package, `marsyard`, which works next to modules named `sim` or `reports`."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

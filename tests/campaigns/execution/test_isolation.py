@@ -3,8 +3,6 @@
 A worker process runs a task once for each item; in campaigns the items are the case numbers.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import random
@@ -31,8 +29,6 @@ from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import make_unfinished_row
 from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 #: Maximum duration of runs that could wait forever, in seconds.
 MAX_DURATION_S = 60.0
@@ -167,7 +163,6 @@ def test_signal_to_supervisor_ends_only_the_case(signal_number: int, tmp_path: P
 
 def overwrite_board(item: int) -> int:
     """Write the integer 1 into all fields of the status board (shared memory: item of the worker)."""
-    assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:] = struct.pack("=q", 1) * (len(board) // 8)
     time.sleep(3600)

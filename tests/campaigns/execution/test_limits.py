@@ -3,8 +3,6 @@
 A worker process runs a task once for each item; in campaigns the items are the case numbers.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import struct
@@ -27,8 +25,6 @@ from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.monitoring import BatchClock
 from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import LocalExecutor
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
 def run_items(
@@ -149,7 +145,6 @@ def test_suspended_parent_ends_no_case(tmp_path: Path, with_workers: bool) -> No
 
 def write_board(item: int | None) -> None:
     """Write an item, and in a layout with a start time one far in the future, to the status board."""
-    assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:8] = struct.pack("=q", -1 if item is None else item)
     board[8:] = struct.pack("=d", time.monotonic() + 1e6)[: len(board) - 8]

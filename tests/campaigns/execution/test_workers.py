@@ -1,7 +1,5 @@
 """Tests of the local executor: limits, worker crashes, batches of items and memory accounting."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import mmap
@@ -30,8 +28,6 @@ from marsyard.campaigns.execution.worker_process import (
     run_batch,
 )
 from marsyard.campaigns.execution.workers import LocalExecutor
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
 def run_items(

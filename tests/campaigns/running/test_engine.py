@@ -16,8 +16,6 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
 from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, read_case_rows, run
 
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
 
 def test_campaign_with_failing_cases_finishes(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch

@@ -12,7 +12,7 @@ from marsyard.reports.verdicts import Status
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run, write_campaign
 from tests.campaigns.hostile_scenario import FAULTS
 
-pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")]
+pytestmark = pytest.mark.slow
 
 TOP_LEVEL_KEYS = """
 name = "hostile"

@@ -19,8 +19,6 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
 from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run
 
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
 
 def _start_campaign(path: Path, directory: Path, **environment: str) -> subprocess.Popen[bytes]:
     """Run a campaign of 500 cases in a process; return the process as soon as rows are stored."""
@@ -148,7 +146,6 @@ with stop_on_signals():
         stderr=subprocess.PIPE,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    assert process.stdout is not None
     for word in (b"ready", b"stopping"):
         assert process.stdout.readline().strip() == word
         process.send_signal(signal.SIGINT)

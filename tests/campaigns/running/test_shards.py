@@ -21,8 +21,6 @@ from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, read_case_rows, write_campaign
 
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
 
 def _run_shards(path: Path, folder: Path, count: int, overrides: Sequence[str] = ()) -> list[Path]:
     directories = []

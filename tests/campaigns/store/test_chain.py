@@ -16,8 +16,6 @@ from marsyard.campaigns.store.rows import Row, RowStore, create_store
 from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
 
 @pytest.fixture
 def store_path(tmp_path: Path) -> Path:

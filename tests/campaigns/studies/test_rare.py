@@ -80,7 +80,6 @@ def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: 
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
     sizes = ["--samples", "50", "--replicates", "2", "--set", "sleep_s=0.03"]

@@ -95,7 +95,6 @@ def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> 
     assert result.cases <= 200
 
 
-@pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 @pytest.mark.slow
 def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"

@@ -191,7 +191,6 @@ def test_sunlight_is_attenuated_by_the_optical_depth(renderer: Renderer, descent
 def test_rendered_transmittance_equals_truth(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
     scene = _make_scene(_make_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
     frame = _render_from_above(renderer, scene, descent_camera(128), time_s=12.0)
-    assert scene.clouds is not None
     transmittance = scene.clouds.transmittance(frame.points_world(), SUN, 12.0)
     sky_light = scene.clouds.parameters.sky_light(SUN)
     expected = ALBEDO * (SUN.direction[2] * transmittance + sky_light)

@@ -242,7 +242,6 @@ def test_colours_become_luminance(tmp_path: Path, dtype: str, alpha: bool) -> No
     source = make_source(tmp_path, np.array(bands).astype(dtype), colorinterp=names)
     check_source(source)
     _, ortho = read_rasters(source)
-    assert ortho is not None
     luminances = 0.299 * 200 + 0.587 * 30 + 0.114 * 5, 0.299 * 10 + 0.587 * 20 + 0.114 * 250
     np.testing.assert_allclose(ortho.values[0, [0, -1]], luminances)
     assert np.count_nonzero(np.isnan(ortho.values)) == (4 * 2 * COLUMNS if alpha else 0)

@@ -249,8 +249,6 @@ def test_tails_in_the_bank_do_not_move_rocks(tmp_path: Path, monkeypatch: pytest
     assert tail_heights.min() == 0.0
     assert tail_heights.max() > 0.02
     rocks, rocks_of_plain = (bank.rocks(0, bank.terrain(0)) for bank in (tail_bank, plain_bank))
-    assert rocks is not None
-    assert rocks_of_plain is not None
     np.testing.assert_array_equal(rocks.position_m[:, :2], rocks_of_plain.position_m[:, :2])
     # Rocks stand on the surface with ridges.
     x, y, z = rocks.position_m.T
