@@ -9,10 +9,9 @@ import pytest
 import rasterio
 from rasterio.crs import CRS
 from rasterio.transform import Affine
-from typer.testing import CliRunner
 
-from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
+from tests.command import run_command
 from tests.scenarios.measured.folders import read_rows, write_text_rows, write_velocity_folder
 
 MARS_METRES = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
@@ -119,7 +118,7 @@ def test_campaign_with_invalid_file_is_rejected(
     write(tmp_path / name)
     campaign = tmp_path / "campaign.toml"
     campaign.write_text(f'name = "bad"\nscenario = "descent"\ncases = 1\n{table.format(tmp_path / name)}\n')
-    run_and_expect_error(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, message)
+    run_and_expect_error(["run", campaign, "--out", tmp_path / "run"], tmp_path / name, message)
     assert not (tmp_path / "run").exists()
 
 
@@ -134,7 +133,7 @@ def test_campaign_with_invalid_file_is_rejected(
 def test_invalid_image_is_rejected(tmp_path: Path, write: WriteFile, message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
-    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
+    run_and_expect_error(["ingest", folder, "--out", tmp_path / "out"], folder / "drop-1.png", message)
     assert not (tmp_path / "out").exists()
 
 
@@ -150,14 +149,11 @@ def test_invalid_image_is_rejected(tmp_path: Path, write: WriteFile, message: st
 def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_text_rows(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
-    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "images.csv", message)
+    run_and_expect_error(["ingest", folder, "--out", tmp_path / "out"], folder / "images.csv", message)
 
 
-def run_and_expect_error(arguments: list[str], path: Path, message: str) -> None:
+def run_and_expect_error(arguments: list[object], path: Path, message: str) -> None:
     """Run a command; assert that it exits with status 2 and an error message that names the file."""
-    result = CliRunner().invoke(app, arguments)
-    assert (result.exit_code, type(result.exception)) == (2, SystemExit)
-    output = result.output
-    assert output.startswith("error: ")
-    assert str(path) in output
+    status, output = run_command(*arguments)
+    assert (status, output[:7], str(path) in output) == (2, "error: ", True), output
     assert message in output

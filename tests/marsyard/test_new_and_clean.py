@@ -16,6 +16,7 @@ from marsyard.cli.outcome import evidence_limits
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.verdicts import Status
+from tests.command import run_command
 
 #: Fields of EuRoC's sensor.yaml for the first camera.
 EUROC = """resolution: [752, 480]
@@ -30,11 +31,6 @@ distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
 def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-def run_command(*arguments: str) -> tuple[int, str]:
-    result = CliRunner().invoke(app, list(arguments))
-    return result.exit_code, result.output
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from marsyard.scenarios.timeline import Timeline, timeline_products
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.campaigns.fake_scenario import FakeParameters, FakeScenario
-from tests.marsyard.test_replay_command import run_command
+from tests.command import run_command
 from tests.reports.timeline.timeline_example import make_timeline
 
 

@@ -1,14 +1,10 @@
 """Tests of `marsyard show`: dispersions, draws as table, figure and JSON, and invalid campaign files."""
 
 import copy
-import io
 import json
 import re
-import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.cli import app as cli
+from tests.command import marsyard
 
 CAMPAIGN = """
 name = "fake"
@@ -59,27 +55,6 @@ confidence = 0.9
 [retain]
 showcase = "worst"
 """
-
-
-@dataclass(frozen=True)
-class CommandResult:
-    status: int
-    out: str
-    err: str
-
-
-def marsyard(*arguments: object) -> CommandResult:
-    """Run a command in this process."""
-    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
-    sys.argv = ["marsyard", *map(str, arguments)]
-    try:
-        with redirect_stdout(out), redirect_stderr(err):
-            cli.main()
-    except SystemExit as error:
-        return CommandResult(int(error.code or 0), out.getvalue(), err.getvalue())
-    finally:
-        sys.argv = argv
-    raise AssertionError("the command did not exit")
 
 
 @pytest.fixture

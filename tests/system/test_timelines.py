@@ -47,6 +47,7 @@ def test_timeline_of_a_case(name: str, tmp_path: Path) -> None:
         recorded = campaign.scenario.run(parameters, campaign.streams(0))
     assert _compared_row(recorded) == pytest.approx(_compared_row(plain), nan_ok=True)
     timeline = Timeline.from_products(recorded.products)
+    assert timeline is not None
     assert Timeline.from_products(plain.products) is None
     assert contents <= {*timeline.surfaces, *timeline.points, *timeline.ellipsoids, *timeline.series}
     assert "true" in timeline.paths

@@ -6,17 +6,16 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import find_campaign, load_campaign
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
-from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.systems import catalogue
 from tests.campaigns.fake_campaign import write_campaign
+from tests.command import run_command
 
 #: Bounds in the units of the metrics (m/s, m, s); None: the metric is true or false.
 BOUNDS = {
@@ -174,9 +173,8 @@ def test_misspelt_columns_are_reported_before_terrain_is_built(
         load_campaign(str(path))
     assert f"requirements[0].{key}" in str(error.value)
     assert hint in str(error.value)
-    result = CliRunner().invoke(app, ["run", str(path), "-n", "1", "--jobs", "1", "--out", str(tmp_path / "run")])
-    assert result.exit_code == 2
-    assert hint in result.output
+    status, output = run_command("run", path, "-n", 1, "--jobs", 1, "--out", tmp_path / "run")
+    assert (status, hint in output) == (2, True)
     assert prepared_inputs == []
     assert not (tmp_path / "run").exists()
 

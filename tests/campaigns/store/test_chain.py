@@ -3,18 +3,17 @@
 import hashlib
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import chain
 from marsyard.campaigns.store.rows import Row, RowStore, create_store
-from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
+from tests.command import run_command
 
 
 @pytest.fixture
@@ -161,11 +160,6 @@ def campaign(failing_campaign: Path, tmp_path: Path) -> Path:
     return shutil.copytree(failing_campaign, tmp_path / "run")
 
 
-def invoke(words: Iterable[str | Path]) -> tuple[int, str]:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    return result.exit_code, " ".join(result.output.split())
-
-
 Words = Callable[[Path], Sequence[str | Path]]
 COMMANDS: dict[str, Words] = {
     "report": lambda folder: ("report", folder),
@@ -180,9 +174,8 @@ COMMANDS: dict[str, Words] = {
 def test_commands_refuse_changed_rows(campaign: Path, command: str) -> None:
     execute(campaign / "cases.sqlite", "UPDATE cases SET outcome = 'VALID' WHERE case_number = 3")
     content = (campaign / "campaign.json").read_bytes()
-    status, output = invoke(COMMANDS[command](campaign))
-    assert status == 2
-    assert "the row of case 3 was changed after it was stored" in output
+    status, output = run_command(*COMMANDS[command](campaign))
+    assert (status, "the row of case 3 was changed after it was stored" in output) == (2, True), output
     assert (campaign / "campaign.json").read_bytes() == content
 
 
@@ -191,28 +184,26 @@ def test_commands_refuse_a_rewritten_chain(campaign: Path, command: str) -> None
     """A program without the key of the user can compute the hashes, but not the signature."""
     rewrite_chain(campaign / "cases.sqlite")
     verify(campaign / "cases.sqlite")
-    status, output = invoke(COMMANDS[command](campaign))
-    assert status == 2
-    assert "was written by another user or program" in output
+    status, output = run_command(*COMMANDS[command](campaign))
+    assert (status, "was written by another user or program" in output) == (2, True), output
 
 
 def test_trusted_rows_are_accepted(campaign: Path) -> None:
     rewrite_chain(campaign / "cases.sqlite")
-    assert invoke(("report", campaign))[0] == 2
+    assert run_command("report", campaign)[0] == 2
     for words in (("report", campaign, "--trust"), ("report", campaign)):
-        status, output = invoke(words)
-        assert status == 1, output
-        assert "verdict: FAIL" in output
+        status, output = run_command(*words)
+        assert (status, "verdict: FAIL" in output) == (1, True), output
 
 
 def test_folder_of_another_user_is_read(campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The chain of another user's rows is verified, but not the signature."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
-    assert invoke(("compare", campaign, campaign))[0] == 0
+    assert run_command("compare", campaign, campaign)[0] == 0
     assert not (tmp_path / "another user").exists()
-    assert invoke(("report", campaign))[0] == 1
+    assert run_command("report", campaign)[0] == 1
     execute(campaign / "cases.sqlite", "DELETE FROM cases WHERE case_number = 3")
-    status, output = invoke(("report", campaign))
+    status, output = run_command("report", campaign)
     assert (status, "the row of case 3 was removed" in output) == (2, True)
 
 
@@ -221,10 +212,9 @@ def test_changed_table_is_refused_and_written_again(campaign: Path) -> None:
     content = path.read_bytes()
     pq.write_table(pq.read_table(path).slice(1), path)
     for words in (("report", campaign), ("compare", campaign, campaign)):
-        status, output = invoke(words)
-        assert status == 2
-        assert "cases.parquet was changed" in output
-    assert invoke(("resume", campaign, "--jobs", "1"))[0] == 1
+        status, output = run_command(*words)
+        assert (status, "cases.parquet was changed" in output) == (2, True), output
+    assert run_command("resume", campaign, "--jobs", "1")[0] == 1
     assert path.read_bytes() == content
 
 
@@ -236,15 +226,14 @@ def test_table_without_a_signature_is_refused(campaign: Path) -> None:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         connection.execute("UPDATE seals SET digest = ? WHERE name = 'table'", (digest,))
     connection.close()
-    status, output = invoke(("report", campaign))
+    status, output = run_command("report", campaign)
     assert (status, "cases.parquet was changed" in output) == (2, True)
 
 
 def test_rows_without_a_chain_are_reported_as_not_verified(campaign: Path) -> None:
     (campaign / "cases.sqlite").unlink()
-    status, output = invoke(("report", campaign))
-    assert status == 1
-    assert "rows: not verified, since" in output
+    status, output = run_command("report", campaign)
+    assert (status, "rows: not verified, since" in output) == (1, True), output
 
 
 def test_chain_continues_over_resume_and_append(tmp_path: Path, watch: RecordingWatch) -> None:
@@ -253,7 +242,7 @@ def test_chain_continues_over_resume_and_append(tmp_path: Path, watch: Recording
     with RowStore(directory / "cases.sqlite") as store:
         first = store._last_entry()
     for words in (("resume", directory, "--retry", "all", "--jobs", "1"), ("append", directory, "3", "--jobs", "1")):
-        assert invoke(words)[0] == 1
+        assert run_command(*words)[0] == 1
     with RowStore(directory / "cases.sqlite") as store:
         store.verify()
         # 12 cases, one repeated case and 3 appended cases
