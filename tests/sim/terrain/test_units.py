@@ -24,6 +24,7 @@ from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
 from marsyard.sim.terrain.rocks.tails import WindTails
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
+from tests.sim.scenes import flat_ground
 
 #: Types of units: fraction of the area, albedo, and factors of roughness, texture amplitude and rock density.
 KINDS: list[dict[str, Any]] = [
@@ -194,18 +195,12 @@ SPACING_M, SIDE, ALBEDO = 0.02, 256, 0.25
 DIAMETER_M, HEIGHT_M, CENTRE_M = 0.4, 0.2, 2.5
 
 
-def _make_flat_surface() -> Surface:
-    samples = np.zeros((SIDE, SIDE, 2), dtype=np.float32)
-    samples[..., 1] = ALBEDO
-    return Surface.from_samples(samples, SPACING_M)
-
-
 def _make_surface_with_tail(tails: WindTails, diameter_m: float = DIAMETER_M) -> Surface:
     rock = PlacedRock(name="rock", east_m=CENTRE_M, north_m=CENTRE_M, diameter_m=diameter_m, height_m=HEIGHT_M)
     rocks = RockField.draw(
-        _make_flat_surface(), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1)
+        flat_ground(SIDE, SPACING_M, ALBEDO), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1)
     )
-    return tails.apply(_make_flat_surface(), rocks, np.random.default_rng(2))
+    return tails.apply(flat_ground(SIDE, SPACING_M, ALBEDO), rocks, np.random.default_rng(2))
 
 
 def test_ridge_has_the_height_length_and_direction_of_its_parameters() -> None:
