@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.scenarios.systems import catalogue
-from tests.campaigns.fake_campaign import CampaignFile
+from tests.campaigns.fake_campaign import CampaignFile, to_toml
 
 #: Module of the fake scenarios.
 FAKE = "tests.campaigns.fake_scenario"
@@ -209,17 +209,6 @@ low high choice values truncate norm gamma id
 _random_words = st.sampled_from(_WORDS.split())
 
 
-def _to_toml(value: object) -> str:
-    """Format a value as TOML; all characters of texts are escaped."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(entry)}" for key, entry in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_to_toml, value)) + "]"
-    if isinstance(value, str):
-        return '"' + "".join(f"\\u{ord(character):04x}" for character in value) + '"'
-    return str(value).lower()
-
-
 _random_values = st.recursive(
     st.booleans() | st.integers(-(10**6), 10**6) | st.floats() | _random_words,
     lambda elements: st.lists(elements, max_size=3) | st.dictionaries(_random_words, elements, max_size=4),
@@ -231,7 +220,7 @@ _random_values = st.recursive(
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_files_are_loaded_or_their_keys_reported(tmp_path: Path, changes: dict[str, object]) -> None:
     base: dict[str, object] = {"name": "fake", "scenario": "tests.campaigns.fake_scenario:FakeScenario", "cases": 3}
-    text = "\n".join(f"{_to_toml(key)} = {_to_toml(value)}" for key, value in {**base, **changes}.items())
+    text = "\n".join(f"{to_toml(key)} = {to_toml(value)}" for key, value in {**base, **changes}.items())
     path = tmp_path / "random.toml"
     path.write_text(text)
     tomllib.loads(text)
@@ -271,7 +260,7 @@ def test_invalid_value_is_reported_by_its_key(
     tables[table].pop(key) if is_removed else tables[table].update({key: value})
     top_level_keys = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
     lines = [
-        f"{name} = {_to_toml([entries] if name == 'requirements' else entries)}" for name, entries in tables.items()
+        f"{name} = {to_toml([entries] if name == 'requirements' else entries)}" for name, entries in tables.items()
     ]
     path = tmp_path / "invalid.toml"
     path.write_text(top_level_keys + "\n".join(lines))

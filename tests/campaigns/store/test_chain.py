@@ -42,18 +42,21 @@ def verify(path: Path) -> None:
         store.verify()
 
 
-MOVE = "UPDATE cases SET case_number = {} WHERE case_number = {}"
+FORMER_ROW = (
+    "UPDATE cases SET position = 3, outcome = 'VALID', row = '[2, \"VALID\", true, 0.2857142857142857]' "
+    "WHERE case_number = 2"
+)
+REMOVE_LAST = ["DELETE FROM cases WHERE case_number = 7", "DELETE FROM chain WHERE position >= 8"]
+MOVE = "UPDATE {0} SET {1} = {2} WHERE {1} = {3}"
+EXCHANGE = [MOVE.format("cases", "case_number", new, old) for new, old in ((99, 1), (1, 3), (3, 99))]
 #: SQL statements that change a store, and the beginning of the message.
 CHANGES = {
-    "value": (
-        ["UPDATE cases SET row = replace(row, '0.7142857', '0.1') WHERE case_number = 5"],
-        "the row of case 5 was ch",
-    ),
+    "value": (["UPDATE cases SET row = replace(row, '714', '1') WHERE case_number = 5"], "the row of case 5 was ch"),
     "outcome": (["UPDATE cases SET outcome = 'CRASHED' WHERE case_number = 4"], "the row of case 4 was changed"),
     "column": (["UPDATE layouts SET names = replace(names, 'text', 'note')"], "the row of case 6 was changed"),
     "layout": (["UPDATE cases SET layout = 77 WHERE case_number = 3"], "the row of case 3 was changed"),
     "not UTF-8": (
-        ["UPDATE cases SET row = CAST(x'ff22' AS TEXT) WHERE case_number = 3"],
+        ["UPDATE cases SET row = CAST(x'ff' AS TEXT) WHERE case_number = 3"],
         "the row of case 3 was changed",
     ),
     "removed": (["DELETE FROM cases WHERE case_number = 3"], "the row of case 3 was removed"),
@@ -61,48 +64,25 @@ CHANGES = {
         ["DELETE FROM cases WHERE case_number = 3", "DELETE FROM chain WHERE case_number = 3"],
         "the chain of hashes breaks at case 4",
     ),
-    "last removed": (
-        ["DELETE FROM cases WHERE case_number = 7", "DELETE FROM chain WHERE position >= 8"],
-        "the row of case 2 was removed or replaced",
-    ),
-    "last removed, former row restored": (
-        [
-            "DELETE FROM cases WHERE case_number = 7",
-            "DELETE FROM chain WHERE position >= 8",
-            "UPDATE cases SET position = 3, outcome = 'VALID', row = '[2, \"VALID\", true, 0.2857142857142857]' "
-            "WHERE case_number = 2",
-        ],
-        "rows after that of case 6 were removed",
-    ),
-    "former row": (
-        [
-            "UPDATE cases SET position = 3, outcome = 'VALID', row = '[2, \"VALID\", true, 0.2857142857142857]' "
-            "WHERE case_number = 2"
-        ],
-        "the row of case 2 was removed or replaced",
-    ),
+    "last removed": (REMOVE_LAST, "the row of case 2 was removed or replaced"),
+    "last removed, former row restored": ([*REMOVE_LAST, FORMER_ROW], "rows after that of case 6 were removed"),
+    "former row": ([FORMER_ROW], "the row of case 2 was removed or replaced"),
     "all removed": (["DELETE FROM cases", "DELETE FROM chain"], "rows were removed"),
     "added": (
         ["INSERT INTO cases SELECT 9, 99, outcome, layout, row FROM cases WHERE case_number = 1"],
         "the row of case 9 was added",
     ),
-    "exchanged": ([MOVE.format(99, 1), MOVE.format(1, 3), MOVE.format(3, 99)], "the row of case 1 was removed"),
+    "exchanged": (EXCHANGE, "the row of case 1 was removed"),
     "exchanged with positions": (
         [
-            MOVE.format(99, 1),
-            MOVE.format(1, 3),
-            MOVE.format(3, 99),
+            *EXCHANGE,
             "UPDATE cases SET position = 2 WHERE case_number = 1",
             "UPDATE cases SET position = 4 WHERE case_number = 3",
         ],
         "the row of case 1 was changed",
     ),
     "reordered": (
-        [
-            "UPDATE chain SET position = 99 WHERE position = 4",
-            "UPDATE chain SET position = 4 WHERE position = 5",
-            "UPDATE chain SET position = 5 WHERE position = 99",
-        ],
+        [MOVE.format("chain", "position", new, old) for new, old in ((99, 4), (4, 5), (5, 99))],
         "the chain of hashes breaks at case 4",
     ),
     "type": (["UPDATE kinds SET kind = 'str' WHERE name = 'x'"], "the chain of hashes breaks at case 0"),
@@ -126,6 +106,7 @@ def test_failed_transaction_leaves_a_complete_chain(store_path: Path) -> None:
         new_columns: Row = {"case": 9, "outcome": "VALID", "answered": True, "new": "x"}
         with pytest.raises(KeyError):
             store.add([new_columns, {"case": 10}])
+        assert (store.row(9), store.count()) == (None, 8)
         store.verify()
         store.add([new_columns])
         store.verify()
