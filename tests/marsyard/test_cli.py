@@ -182,6 +182,9 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["run", "{file}", "--jobs", "0"], "--jobs 0: at least one worker process is needed"),
         (["run", "{file}", "--set", "altitude_m=-2"], "parameters.altitude_m: input should be greater than 0, got -2"),
         (["run", "{file}", "--set", "altitud_m=2"], "unknown key (did you mean 'altitude_m'?)"),
+        (["run", "dimes-smoke", "--set", "descent.altitud_first_m=1500"], "(did you mean 'altitude_first_m'?)"),
+        (["run", "dimes-smoke", "--set", "descent.altitude_first_m=-5"], "descent.altitude_first_m: "),
+        (["run", "dimes-smoke", "--set", "render.backend=vulkan"], "osmesa"),
         (["run", "{file}", "--out", "{run}"], "contains a campaign"),
         (["run", "{file}", "--out", "{file}/run"], "cannot be written: Not a directory"),
         (["run", "{file}", "--out", "/proc/run"], "cannot be written"),
@@ -190,10 +193,7 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["run", "{file}", "--dry-run", "--jobs", "-1"], "at least one worker process is needed"),
         (["resume", "{folder}"], "does not contain a campaign"),
         (["resume", "{folder}/none"], "none: no such folder"),
-        (
-            ["resume", "{run}", "--retry", "crased"],
-            "unknown outcome 'crased' (did you mean 'crashed'?); allowed: all, ",
-        ),
+        (["resume", "{run}", "--retry", "crased"], "unknown outcome 'crased' (did you mean 'crashed'?); allowed: all"),
         (["resume", "{run}", "--case-time", "-1"], "--case-time -1.0: input should be greater than 0"),
         (["append", "{run}", "0"], "Invalid value for 'N'"),
         (["append", "{folder}", "3"], "does not contain a campaign"),
@@ -205,6 +205,7 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["report", "{folder}"], "does not contain a campaign"),
         (["replay", "{run}", "6"], "has no case 6; allowed: 0 to 5"),
         (["replay", "{run}", "x"], "Invalid value for 'CASE'"),
+        (["replay", "{run}", "--", "-1"], "Invalid value for 'CASE'"),
         (["replay", "{folder}", "0"], "does not contain a campaign"),
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
     ],
@@ -215,10 +216,6 @@ def test_invalid_arguments_are_rejected(finished_run: Path, tmp_path: Path, argu
     assert (result.status, result.out, "Traceback" in result.err) == (2, "", False)
     assert " ".join(message.split()) in result.text
     assert not (tmp_path / "runs").exists()
-
-
-def test_negative_case_numbers_are_rejected(finished_run: Path) -> None:
-    assert marsyard("replay", finished_run, "--", "-1").status == 2
 
 
 def test_internal_error_has_status_2(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -99,8 +99,11 @@ def test_folder_from_elsewhere_runs_with_trusted_code_only(tmp_path: Path, monke
     """Another user's folder is refused; with --trust it runs if its code is the recorded one."""
     estimator = "class Estimator:\n    def estimate(self, measurements): raise AssertionError\n"
     (tmp_path / "trusted_estimator.py").write_text(estimator)
-    options = ("-n", "1", "--out", "run", "--set", "terrain.samples=512")
-    assert marsyard("run", "dimes-smoke", "--algorithm", "trusted_estimator:Estimator", *options)[0] == 1
+    (tmp_path / "fake.toml").write_text(
+        'name = "fake"\nscenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"\ncases = 1\n'
+    )
+    words = ("run", "fake.toml", "--algorithm", "trusted_estimator:Estimator", "--out", "run")
+    assert marsyard(*words).status == 1
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
     assert "was created or changed elsewhere" in marsyard("replay", "run", "0").text
     (tmp_path / "trusted_estimator.py").write_text(f"{estimator}# changed\n")

@@ -40,10 +40,7 @@ def test_images_do_not_depend_on_threads(renderer: Renderer, terrain: Surface, m
     rock = PlacedRock(name="rock", east_m=380.0, north_m=205.0, diameter_m=30.0, shape=3, yaw_deg=20.0)
     field = RockField.draw(terrain, RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1))
     rocks = rocks_near(field, 380.0, 205.0, 60.0, 200.0, albedo=0.15)
-    layers: dict[str, Any] = {
-        "ground_texture": Texture(3.0, (0.03,) * 6),
-        "object_texture": Texture(0.5, (0.05,) * 3),
-    }
+    layers: dict[str, Any] = {"ground_texture": Texture(3.0, (0.03,) * 6), "object_texture": Texture(0.5, (0.05,) * 3)}
     scene = Scene(terrain, (380.0, 200.0), Sun(direction(2.0, 0.6)), Photometry(), rocks, **layers)
     rays = PixelRays.from_camera(descent_camera().crop(400, 400, (161, 161)))
     pose = rigid(Rotation.from_euler("x", 4.0, degrees=True), np.array([380.0, 200.0, 400.0]))
