@@ -11,13 +11,12 @@ from scipy.stats import norm
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, ConfigurationError
 from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.decision import Basis, RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
 from marsyard.reports.evaluation import evaluate_run
-from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read_case_rows
+from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
 from tests.command import run_command
@@ -148,10 +147,7 @@ def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaig
 def test_finished_study_is_protected(finished_study: Path) -> None:
     """Commands of campaigns, another program, and results without a counting bound, which an earlier version wrote."""
     executor, watch = ExecutorConfig(1), RecordingWatch()
-    for command in (
-        lambda: resume_campaign(finished_study, executor, watch),
-        lambda: append_cases(finished_study, 10, executor, watch),
-    ):
+    for command in continuing_commands(finished_study, watch):
         with pytest.raises(CampaignError, match="contains a study"):
             command()
     stored = record.read(finished_study)

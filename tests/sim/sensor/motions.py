@@ -76,7 +76,13 @@ class Swaying:
 
 
 def assert_derivatives(
-    motion_at: Callable[[np.ndarray], Motion], times_s: np.ndarray, step_s: float, gravity_m_s2: float, **atol: float
+    motion_at: Callable[[np.ndarray], Motion],
+    times_s: np.ndarray,
+    step_s: float,
+    gravity_m_s2: float,
+    *,
+    force_rtol: float = 1e-7,
+    **atol: float,
 ) -> None:
     """Compare velocities, specific forces and body rates with central differences; `atol` by the first word of each.
 
@@ -87,6 +93,6 @@ def assert_derivatives(
     np.testing.assert_allclose(motion.velocities_m_s, velocity, atol=atol["velocity"])
     acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step_s)
     force = motion.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, gravity_m_s2]))
-    np.testing.assert_allclose(motion.specific_forces_m_s2, force, atol=atol["force"])
+    np.testing.assert_allclose(motion.specific_forces_m_s2, force, rtol=force_rtol, atol=atol["force"])
     rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step_s)
     np.testing.assert_allclose(motion.body_rates_rad_s, rate, atol=atol["rate"])
