@@ -17,6 +17,8 @@ from tests.scenarios.measured.folders import read_rows, write_text_rows, write_v
 MARS_METRES = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 MARS_DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
 NO_DATA = -32767.0
+#: Begin of a PDS3 label.
+PDS3 = b"PDS_VERSION_ID = PDS3\r\n"
 
 #: Function that writes a file to a path.
 WriteFile = Callable[[Path], object]
@@ -71,40 +73,20 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
 @pytest.mark.parametrize(
     ("table", "name", "write", "message"),
     [
-        (
-            TERRAIN,
-            "projection.tif",
-            lambda path: write_dtm(path, crs=MARS_DEGREES),
-            "is in degrees; project it to metres",
-        ),
+        (TERRAIN, "degrees.tif", lambda path: write_dtm(path, crs=MARS_DEGREES), "is in degrees; project it to metres"),
         (TERRAIN, "nodata.tif", lambda path: write_dtm(path, nodata=None), "has no nodata value"),
         (TERRAIN, "units.tif", lambda path: write_dtm(path, unit="ft"), "its heights are in 'ft'; allowed: metres"),
         (TERRAIN, "huge.tif", lambda path: write_dtm(path, side=16384), "16384 x 16384 values; allowed: at most 5461"),
         (TERRAIN, "empty.tif", write_empty, "is empty (0 bytes)"),
         (FLIGHT, "nan.csv", lambda path: write_flight(path, 9, 2, np.nan), "pose 10: y_m is not finite"),
-        (
-            FLIGHT,
-            "back.csv",
-            lambda path: write_flight(path, 9, 0, -9.0),
-            "pose 10: time goes from -2.000000 to -9.000000",
-        ),
-        (
-            FLIGHT,
-            "length.csv",
-            lambda path: write_flight(path, 9, 7, 2.0),
-            "pose 10: the quaternion's length is 2; allowed",
-        ),
+        (FLIGHT, "back.csv", lambda path: write_flight(path, 9, 0, -9.0), "10: time goes from -2.000000 to -9.000000"),
+        (FLIGHT, "length.csv", lambda path: write_flight(path, 9, 7, 2.0), "10: the quaternion's length is 2; allowed"),
         (FLIGHT, "up.csv", lambda path: write_flight(path, 9, 4, 1.0), "at image 1 the camera looks up, 90.0 deg"),
         (FLIGHT, "huge.csv", write_gigabyte, "larger than 512 MiB"),
         (FLIGHT, "empty.csv", write_empty, "has 0 poses; allowed: at least 4"),
         (CAMERA, "empty.yaml", write_empty, "is empty (0 bytes)"),
         (CAMERA, "huge.yaml", lambda path: write_gigabyte(path, b"image_width: 640\n"), "is larger than 8 MiB"),
-        (
-            CAMERA,
-            "huge.IMG",
-            lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"),
-            "END: missing in the first",
-        ),
+        (CAMERA, "huge.IMG", lambda path: write_gigabyte(path, PDS3), "END: missing in the first"),
         (MESH, "empty.stl", write_empty, "contains no triangle"),
         (MESH, "huge.stl", write_gigabyte, "is larger than 256 MiB"),
         (DETECTOR, "empty_sheet.toml", write_empty, "pixel_pitch_um: Field required"),
@@ -126,7 +108,7 @@ def test_campaign_with_invalid_file_is_rejected(
     ("write", "message"),
     [
         (lambda path: write_gigabyte(path, b"P5 32768 32768 255\n"), "has too many pixels; allowed: at most 178956970"),
-        (lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
+        (lambda path: write_gigabyte(path, PDS3), "END: missing in the first"),
         (write_empty, "is empty (0 bytes)"),
     ],
 )

@@ -9,16 +9,8 @@ from marsyard.cli.app import app
 
 #: Commands that only print, and commands that write files. Each command is in one of the two sets.
 PRINTING = {
-    "list",
-    "show",
-    "clean",
-    "conformance",
-    "confirmations",
-    "doctor",
-    "compare",
-    "terrain list",
-    "terrain stats",
-}
+    "list", "show", "clean", "conformance", "confirmations", "doctor", "compare", "terrain list", "terrain stats",
+}  # fmt: skip
 WRITING = {
     "run", "resume", "append", "merge", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset",
     "new", "ingest", "export", "score", "compile", "rare", "search", "budget",

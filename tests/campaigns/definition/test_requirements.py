@@ -29,10 +29,7 @@ BOUNDS = {
 def test_shipped_requirements_have_a_source() -> None:
     shipped = shipped_requirements()
     assert {requirement_id: requirement.bound for requirement_id, requirement in shipped.items()} == BOUNDS
-    assert all(
-        requirement.kind and requirement.source and requirement.statement and requirement.campaigns
-        for requirement in shipped.values()
-    )
+    assert all(entry.kind and entry.source and entry.statement and entry.campaigns for entry in shipped.values())
 
 
 def test_campaigns_of_requirements_exist() -> None:
@@ -116,16 +113,11 @@ def test_requirement_texts_do_not_contain_algorithm_names() -> None:
     algorithm_name = re.compile(r"\b(DIMES|VTT|HDA|NCC)\b(?! paper)")
     for name, path in catalogue().items():
         campaign = tomllib.loads(path.read_text(encoding="utf-8"))
-        texts = [
-            campaign["description"],
-            *(requirement.get("statement", "") for requirement in campaign.get("requirements", ())),
-        ]
+        statements = [requirement.get("statement", "") for requirement in campaign.get("requirements", ())]
+        texts = [campaign["description"], *statements]
         assert not [text for text in texts if algorithm_name.search(text)], name
-    assert not [
-        requirement.statement
-        for requirement in shipped_requirements().values()
-        if algorithm_name.search(requirement.statement)
-    ]
+    shipped = [requirement.statement for requirement in shipped_requirements().values()]
+    assert not [statement for statement in shipped if algorithm_name.search(statement)]
 
 
 #: A user's score function: its results are additional columns of a case.

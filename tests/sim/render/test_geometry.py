@@ -228,9 +228,8 @@ def test_mesh_resolution_does_not_change_the_image(renderer: Renderer, terrain: 
 
 def test_sky_is_above_the_horizon(renderer: Renderer, terrain: Surface) -> None:
     level_pose = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
-    frame = renderer.render(
-        Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(descent_camera(128)), level_pose
-    )
+    scene = Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY)
+    frame = renderer.render(scene, PixelRays.from_camera(descent_camera(128)), level_pose)
     upper, lower = frame.range_m[:60], frame.range_m[-40:]
     assert np.isinf(upper).all()
     assert np.isfinite(lower).all()
@@ -245,15 +244,12 @@ def test_objects_out_of_view_do_not_change_the_image(renderer: Renderer, terrain
     faces = np.array([[0, 1, 2]], dtype=np.int32)
     object_above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
     sun = Sun(direction(0.3, np.radians(5.0)))
-    rays = PixelRays.from_camera(descent_camera(256))
-    with_object, without_objects = (
-        renderer.render(
-            Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True),
-            rays,
-            rigid(ATTITUDE, position),
-        )
+    rays, pose = PixelRays.from_camera(descent_camera(256)), rigid(ATTITUDE, position)
+    scenes = (
+        Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True)
         for objects in (object_above, Objects.none())
     )
+    with_object, without_objects = (renderer.render(scene, rays, pose) for scene in scenes)
     assert (with_object.body == -1).all()
     np.testing.assert_array_equal(with_object.range_m, without_objects.range_m)
     np.testing.assert_array_equal(with_object.radiance, without_objects.radiance)
@@ -261,10 +257,9 @@ def test_objects_out_of_view_do_not_change_the_image(renderer: Renderer, terrain
 
 def test_camera_below_ground_fails(renderer: Renderer, terrain: Surface) -> None:
     pose = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
+    scene = Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY)
     with pytest.raises(RenderingError, match="below the ground"):
-        renderer.render(
-            Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(descent_camera(64)), pose
-        )
+        renderer.render(scene, PixelRays.from_camera(descent_camera(64)), pose)
 
 
 def test_image_does_not_depend_on_earlier_images(renderer: Renderer, terrain: Surface) -> None:

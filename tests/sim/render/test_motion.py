@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.estimators import PATCH, SmoothImage, symmetric_shifts
@@ -35,12 +36,10 @@ def test_known_shift_is_estimated() -> None:
     shift = np.array([0.37, -0.22])
     first, second = SmoothImage(render_bumps(np.zeros(2))), SmoothImage(0.8 * render_bumps(shift) + 0.1)
     shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
-    np.testing.assert_allclose(shifts.motion_px, np.broadcast_to(shift, shifts.motion_px.shape), atol=2e-3)
+    assert_allclose(shifts.motion_px, np.broadcast_to(shift, shifts.motion_px.shape), atol=2e-3)
     # If all pixels of a patch have the same motion, the expected shift is that motion.
     uniform_motion = np.broadcast_to(shift, (len(shifts.motion_px), PATCH, PATCH, 2))
-    np.testing.assert_allclose(
-        shifts.expected(uniform_motion), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9
-    )
+    assert_allclose(shifts.expected(uniform_motion), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9)
 
 
 def test_descent_image_motion_matches_the_camera(renderer: Renderer, terrain: Surface) -> None:

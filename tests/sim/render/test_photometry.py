@@ -91,10 +91,8 @@ FLAT = flat_ground(256)
 def _render_ground(
     renderer: Renderer, camera: CameraModel, surface: Surface, sun: Sun, law: Photometry, pose: RigidTransform = NADIR
 ) -> np.ndarray:
-    radiance: np.ndarray = renderer.render(
-        Scene(surface, (0.0, 0.0), sun, law), PixelRays.from_camera(camera), pose
-    ).radiance
-    return radiance
+    scene = Scene(surface, (0.0, 0.0), sun, law)
+    return np.asarray(renderer.render(scene, PixelRays.from_camera(camera), pose).radiance)
 
 
 def test_lambert_plane_follows_the_cosine_law(renderer: Renderer) -> None:
@@ -130,9 +128,8 @@ def test_slopes_facing_the_sun_are_brighter(renderer: Renderer) -> None:
     camera = descent_camera(256)
     # The ground faces the eastern sun where its height decreases with x.
     east_sun = Sun(direction(np.radians(90.0), np.radians(40.0)))
-    frame = renderer.render(
-        Scene(make_ground(heights, 8.0), (0.0, 0.0), east_sun, law), PixelRays.from_camera(camera), NADIR
-    )
+    scene = Scene(make_ground(heights, 8.0), (0.0, 0.0), east_sun, law)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), NADIR)
     is_facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
     is_facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
     assert frame.radiance[is_facing_east].min() > frame.radiance[is_facing_west].max()

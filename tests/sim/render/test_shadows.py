@@ -73,9 +73,8 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
     sun = Sun(direction(np.radians(200.0), np.radians(35.0)))
     scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_half_width_m=100.0, edge_rays=1)
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
-    frame = renderer.render(
-        scene, PixelRays.from_camera(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye)
-    )
+    pose = rigid(Rotation.from_euler("x", 15.0, degrees=True), eye)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
     agreement, shaded_fraction = _compare_with_ray_cast(frame, scene, 3000, 0.02)
     assert shaded_fraction > 0.02
     assert agreement >= MIN_AGREEMENT
@@ -94,9 +93,8 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer) -> None
     skyline = np.arctan2(crest, ground[:, None] - profile).max(axis=1)
     edge = float(np.interp(elevation, skyline[::-1], ground[::-1]))
     pose = rigid(Rotation.identity(), np.array([edge, 64.0, 8.0]))
-    frame = renderer.render(
-        Scene(surface, (edge, 64.0), sun, LAMBERT), PixelRays.from_camera(descent_camera(256)), pose
-    )
+    scene = Scene(surface, (edge, 64.0), sun, LAMBERT)
+    frame = renderer.render(scene, PixelRays.from_camera(descent_camera(256)), pose)
     x_m = frame.points_world()[..., 0].ravel()
     offset = np.clip((elevation - np.interp(x_m, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi
@@ -108,9 +106,8 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer) -> None
 
 def _random_bodies(rng: np.random.Generator, centres: np.ndarray, sizes: np.ndarray) -> Objects:
     """Create one body of seven random triangles at each centre."""
-    triangles = (
-        centres[:, None, None] + sizes[:, None, None, None] * rng.normal(size=(len(centres), 7, 3, 3))
-    ).reshape(-1, 3)
+    offsets = sizes[:, None, None, None] * rng.normal(size=(len(centres), 7, 3, 3))
+    triangles = (centres[:, None, None] + offsets).reshape(-1, 3)
     faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
     body_ids = np.repeat(np.arange(len(centres), dtype=np.int32), 7)
     return Objects.of_mesh(triangles, np.zeros_like(triangles), faces, body_ids, ALBEDO)

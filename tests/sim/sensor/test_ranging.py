@@ -25,11 +25,7 @@ from tests.sim.sensor.motions import Swaying
 
 #: A carrier-phase (RTK) receiver with a nearby base station, resolved integer ambiguities and errors of 2 cm.
 RTK = GpsParameters(
-    horizontal_noise_m=0.01,
-    vertical_noise_m=0.015,
-    horizontal_wander_m=0.01,
-    vertical_wander_m=0.02,
-    correlation_s=120.0,
+    horizontal_noise_m=0.01, vertical_noise_m=0.015, horizontal_wander_m=0.01, vertical_wander_m=0.02, correlation_s=120
 )
 DESCENT = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))
 #: Samples per side of a surface, their spacing and the coordinate of its centre, m.
@@ -252,13 +248,9 @@ def test_boresight_error_has_the_specified_deviation() -> None:
 def test_side_lobes_receive_the_ground_at_nadir() -> None:
     """A beam of 60 deg width, tilted by 50 deg, ends 20 deg from nadir. The side lobes include the nadir."""
     tilted_motion = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
-    times = np.arange(100) * 0.1
+    times, exact = np.arange(100) * 0.1, {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0}
     main_lobe, with_side_lobes = (
-        RadarAltimeter.draw(
-            RadarParameters(scale_error=0.0, noise=0.0, count_m=0.0, sidelobe_fraction=fraction),
-            FLAT,
-            np.random.default_rng(0),
-        )
+        _make_radar(np.random.default_rng(0), **exact, sidelobe_fraction=fraction)
         .measure(tilted_motion, times, np.random.default_rng(1))
         .values
         for fraction in (0.0, 0.3)

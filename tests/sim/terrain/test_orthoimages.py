@@ -184,13 +184,7 @@ def test_missing_pixels_are_limited(tmp_path: Path, columns: int) -> None:
 
 @pytest.mark.parametrize(
     ("dtype", "scale", "offset"),
-    [
-        ("uint8", 2.0, 0.0),
-        ("uint8", 1.0, -10.0),
-        ("int16", 0.01, 70.0),
-        ("uint16", 0.005, 10.0),
-        ("uint16", -0.01, 130.0),
-    ],
+    [("uint8", 2, 0), ("uint8", 1, -10), ("int16", 0.01, 70), ("uint16", 0.005, 10), ("uint16", -0.01, 130)],
 )
 def test_scale_and_offset_apply(tmp_path: Path, expected: np.ndarray, dtype: str, scale: float, offset: float) -> None:
     stored = np.rint((BRIGHTNESS * (2.0 if scale == 2.0 else 1.0) - offset) / scale)[None]

@@ -101,15 +101,8 @@ def test_sum_of_split_field_equals_the_field() -> None:
 
 def test_crater_sizes_follow_saturation_and_production() -> None:
     """Cumulative numbers vary as D**-1.83 below the knee (saturation) and as D**-3.2 above it (production)."""
-    parameters = _make_parameters(
-        samples=4096,
-        spacing_m=3.0,
-        craters_per_km2=600.0,
-        crater_diameter_min_m=8.0,
-        crater_diameter_max_m=2000.0,
-        crater_exponent=1.83,
-        crater_knee_m=60.0,
-    )
+    sizes = {"crater_diameter_min_m": 8.0, "crater_diameter_max_m": 2000.0, "crater_exponent": 1.83}
+    parameters = _make_parameters(samples=4096, spacing_m=3.0, craters_per_km2=600.0, crater_knee_m=60.0, **sizes)
     diameters = 2.0 * draw_craters(parameters, np.random.default_rng(5))[:, 2]
     assert np.all(np.diff(diameters) <= 0.0)
     counts = {size: np.count_nonzero(diameters > size) for size in (8.0, 16.0, 32.0, 64.0, 128.0)}
