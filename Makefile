@@ -20,7 +20,7 @@ test: setup ## Run all checks and tests
 	@tools/compile_and_lint.sh
 	@tools/test.sh $(PYTEST_ARGS)
 
-lint: setup ## Run the static checks: ruff, mypy, import-linter, codespell
+lint: setup ## Run the static checks: ruff, mypy, import-linter, codespell, rejected words
 	@tools/lint.sh
 
 format: setup ## Format the sources, and correct what ruff can correct

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The static checks: all of them, or those named (lint format types imports spelling). pre-commit and `make lint` run the same.
+# The static checks: all of them, or those named (lint format types imports spelling words). pre-commit and `make lint`
+# run the same.
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 bin=.venv/bin
@@ -13,7 +14,11 @@ check() {
         types) "$bin/mypy" ;;
         imports) "$bin/lint-imports" --no-logo ;;
         spelling) "$bin/codespell" ;;
-        *) echo "lint: no check named $1 (lint, format, types, imports)" >&2; return 2 ;;
+        # words that docs/glossary.md replaces; git grep succeeds if it finds one
+        words)
+            git grep --untracked -nPif tools/rejected_words.txt -- '*.py' 'docs/*.md' README.md
+            [ $? -eq 1 ] || { echo "lint: replace these words (tools/rejected_words.txt)" >&2; return 1; } ;;
+        *) echo "lint: no check named $1 (lint, format, types, imports, spelling, words)" >&2; return 2 ;;
     esac
 }
 
@@ -23,7 +28,7 @@ for name in "${@:-}"; do
     check "$name" || failed+=("$name")
 done
 if [ $# -eq 0 ]; then
-    for name in lint format types imports spelling; do
+    for name in lint format types imports spelling words; do
         echo "== $name"
         check "$name" || failed+=("$name")
     done

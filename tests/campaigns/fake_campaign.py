@@ -92,6 +92,17 @@ def read_case_rows(directory: Path) -> list[dict[str, Any]]:
     return read_rows(directory / "cases.parquet")
 
 
+def to_toml(value: object) -> str:
+    """Format a value as TOML on one line; each character of a text is escaped."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{to_toml(str(key))} = {to_toml(entry)}" for key, entry in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(to_toml, value)) + "]"
+    if isinstance(value, str):
+        return '"' + "".join(f"\\U{ord(character):08x}" for character in value) + '"'
+    return str(value).lower()
+
+
 def campaign_fixture(text: str) -> Any:
     """Return a fixture that writes a campaign file with this text and returns its path."""
 

@@ -1,6 +1,7 @@
 """A scenario for the tests of isolation: cases damage their worker process or return invalid rows."""
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -8,28 +9,6 @@ from pydantic import BaseModel, ConfigDict
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs
-
-#: Case n has the fault with index n modulo the number of faults.
-FAULTS = (
-    "no fault",
-    "text in a metric",
-    "text in a population",
-    "int of 400 digits",
-    "int of 5000 digits",
-    "closes files",
-    "closes standard output",
-    "error without a message",
-    "surrogate characters",
-    "raises",
-    "exits",
-    "list in a column",
-)
-
-
-class HostileParameters(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    height_m: float = 0.0
 
 
 class SilentError(Exception):
@@ -39,34 +18,40 @@ class SilentError(Exception):
         raise RuntimeError("no message")
 
 
+def _raise(error: Exception) -> None:
+    raise error
+
+
+#: Faults: change of the row or of the process, and the recorded error, which is empty if the row is valid. Case n has
+#: the fault with index n modulo the number of faults.
+FAULTS: list[tuple[Callable[[dict[str, Any]], object], str]] = [
+    (lambda row: None, ""),
+    (lambda row: row.update(velocity_error_m_s="small"), "contains 'small'; error needs a number"),
+    (lambda row: row.update(is_low="yes"), "column is_low contains 'yes'; error needs true or false"),
+    (lambda row: row.update(number=10**400), "column number contains an integer of 1329 bits"),
+    (lambda row: row.update(velocity_error_m_s=10**5000), "velocity_error_m_s contains an integer of 16610 bits"),
+    (lambda row: os.closerange(3, 256), "the case closed or replaced the worker's file descriptors"),
+    (lambda row: os.close(1), ""),
+    (lambda row: _raise(SilentError()), "SilentError (its message cannot be formatted)"),
+    (lambda row: row.update({"outcome": "VALID \udc80", "text \udc80": "\udc80"}), ""),
+    (lambda row: _raise(ValueError("the algorithm raised")), "ValueError: the algorithm raised"),
+    (lambda row: os._exit(3), "the worker process died: EXIT (3)"),
+    (lambda row: row.update(text=["a"]), "column text contains a list"),
+]
+
+
+class HostileParameters(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    height_m: float = 0.0
+
+
 class HostileScenario(ScenarioWithoutInputs):
     name = "hostile"
     parameters_type = HostileParameters
 
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        fault = FAULTS[streams.case % len(FAULTS)]
         row: dict[str, Any] = {"velocity_error_m_s": 1.0, "met": True, "number": 1, "text": "a", "is_low": True}
-        outcome = "VALID"
-        if fault == "text in a metric":
-            row["velocity_error_m_s"] = "small"
-        elif fault == "text in a population":
-            row["is_low"] = "yes"
-        elif fault == "int of 400 digits":
-            row["number"] = 10**400
-        elif fault == "int of 5000 digits":
-            row["velocity_error_m_s"] = 10**5000
-        elif fault == "closes files":
-            os.closerange(3, 256)
-        elif fault == "closes standard output":
-            os.close(1)
-        elif fault == "error without a message":
-            raise SilentError
-        elif fault == "surrogate characters":
-            outcome, row["text \udc80"] = "VALID \udc80", "\udc80"
-        elif fault == "raises":
-            raise ValueError("the algorithm raised")
-        elif fault == "exits":
-            os._exit(3)
-        elif fault == "list in a column":
-            row["text"] = ["a"]
-        return CaseResult(outcome, True, row)
+        row["outcome"] = "VALID"
+        FAULTS[streams.case % len(FAULTS)][0](row)
+        return CaseResult(row.pop("outcome"), True, row)

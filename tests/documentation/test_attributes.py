@@ -1,7 +1,5 @@
 """Tests that the documentation shows attributes separately if one description covers several names."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

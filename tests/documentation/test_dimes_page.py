@@ -1,7 +1,5 @@
 """Tests that the tables of the page on DIMES agree with the algorithm and with the calibration of the field test."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

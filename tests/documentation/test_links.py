@@ -1,7 +1,5 @@
 """Test that links between the Markdown pages lead to existing files and headings; `test_site` checks the built site."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

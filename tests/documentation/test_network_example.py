@@ -1,7 +1,5 @@
 """Tests of the example with a neural network; `test_tutorials` trains it on rendered images and runs its campaigns."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Tests that the notebooks run, and are stored without output."""
 
-from __future__ import annotations
-
 import ast
 import json
 from pathlib import Path

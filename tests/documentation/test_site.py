@@ -1,7 +1,5 @@
 """Tests of the documentation site: it builds without warnings and has no broken links."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Iterator

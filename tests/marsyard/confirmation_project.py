@@ -1,19 +1,16 @@
 """A git repository with a campaign, an algorithm and a record of confirmations, for the tests of confirmations."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from marsyard.campaigns.definition.evidence import Evidence
-from marsyard.cli import app as cli
+from tests.command import Output, marsyard
 
 #: The lower bound of 10 cases without failure is 0.1^(1/10) = 79 % at 90 % confidence: PASS.
 CAMPAIGN = """
@@ -46,32 +43,15 @@ note = "the scale was adjusted to these cases"
 #: Variable of the fake scenario, and its value with which all cases fail: a bad result by chance.
 BAD_LUCK = ("FAKE_ERROR_SCALE", "1e9")
 RECORD = "confirmations.jsonl"
-Command = Callable[..., "Output"]
+Command = Callable[..., Output]
 
 
-@dataclass(frozen=True)
-class Output:
-    """Exit status and texts of a command."""
-
-    status: int
-    out: str
-    err: str
-
-    @property
-    def is_unqualified_pass(self) -> bool:
-        """Whether the exit status is 0, or the headline or a requirement is PASS without a qualification."""
-        lines = [line.strip() for line in self.out.splitlines()]
-        rows = [line.split() for line in lines if line.startswith("VELOCITY")]
-        return (
-            self.status == 0
-            or "verdict: PASS" in lines
-            or any("PASS" in row[1:2] and "(" not in row[2] for row in rows)
-        )
-
-    @property
-    def text(self) -> str:
-        """Standard output without line breaks."""
-        return " ".join(self.out.split())
+def is_unqualified_pass(output: Output) -> bool:
+    """Whether the exit status is 0, or the headline or a requirement is PASS without a qualification."""
+    lines = [line.strip() for line in output.out.splitlines()]
+    rows = [line.split() for line in lines if line.startswith("VELOCITY")]
+    is_pass = any("PASS" in row[1:2] and "(" not in row[2] for row in rows)
+    return output.status == 0 or "verdict: PASS" in lines or is_pass
 
 
 def git(folder: Path, *arguments: str) -> None:
@@ -95,7 +75,7 @@ def create_project(folder: Path) -> None:
     commit_all(folder)
 
 
-def make_command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
+def make_command(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     """Return a function that runs the command line in a folder."""
     monkeypatch.chdir(folder)
     monkeypatch.syspath_prepend(str(folder))
@@ -103,11 +83,7 @@ def make_command(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPa
     def run_command(*arguments: object) -> Output:
         for name in ("estimator", "renamed"):  # imported from the folder of another test
             sys.modules.pop(name, None)
-        monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        captured = capfd.readouterr()
-        return Output(int(error_info.value.code or 0), captured.out, captured.err)
+        return marsyard(*arguments)
 
     return run_command
 

@@ -1,7 +1,5 @@
 """Tests of the notebook interface: exported names, types and example scripts."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Tests of invalid input files: the command reports the file and its fault, and exits with status 2."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -11,15 +9,16 @@ import pytest
 import rasterio
 from rasterio.crs import CRS
 from rasterio.transform import Affine
-from typer.testing import CliRunner
 
-from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
+from tests.command import run_command
 from tests.scenarios.measured.folders import read_rows, write_text_rows, write_velocity_folder
 
 MARS_METRES = CRS.from_string("+proj=eqc +lat_ts=0 +lon_0=0 +R=3396190 +units=m +no_defs")
 MARS_DEGREES = CRS.from_string("+proj=longlat +R=3396190 +no_defs")
 NO_DATA = -32767.0
+#: Begin of a PDS3 label.
+PDS3 = b"PDS_VERSION_ID = PDS3\r\n"
 
 #: Function that writes a file to a path.
 WriteFile = Callable[[Path], object]
@@ -74,40 +73,20 @@ DETECTOR = '[parameters.detector]\nfile = "{}"'
 @pytest.mark.parametrize(
     ("table", "name", "write", "message"),
     [
-        (
-            TERRAIN,
-            "projection.tif",
-            lambda path: write_dtm(path, crs=MARS_DEGREES),
-            "is in degrees; project it to metres",
-        ),
+        (TERRAIN, "degrees.tif", lambda path: write_dtm(path, crs=MARS_DEGREES), "is in degrees; project it to metres"),
         (TERRAIN, "nodata.tif", lambda path: write_dtm(path, nodata=None), "has no nodata value"),
         (TERRAIN, "units.tif", lambda path: write_dtm(path, unit="ft"), "its heights are in 'ft'; allowed: metres"),
         (TERRAIN, "huge.tif", lambda path: write_dtm(path, side=16384), "16384 x 16384 values; allowed: at most 5461"),
         (TERRAIN, "empty.tif", write_empty, "is empty (0 bytes)"),
         (FLIGHT, "nan.csv", lambda path: write_flight(path, 9, 2, np.nan), "pose 10: y_m is not finite"),
-        (
-            FLIGHT,
-            "back.csv",
-            lambda path: write_flight(path, 9, 0, -9.0),
-            "pose 10: time goes from -2.000000 to -9.000000",
-        ),
-        (
-            FLIGHT,
-            "length.csv",
-            lambda path: write_flight(path, 9, 7, 2.0),
-            "pose 10: the quaternion's length is 2; allowed",
-        ),
+        (FLIGHT, "back.csv", lambda path: write_flight(path, 9, 0, -9.0), "10: time goes from -2.000000 to -9.000000"),
+        (FLIGHT, "length.csv", lambda path: write_flight(path, 9, 7, 2.0), "10: the quaternion's length is 2; allowed"),
         (FLIGHT, "up.csv", lambda path: write_flight(path, 9, 4, 1.0), "at image 1 the camera looks up, 90.0 deg"),
         (FLIGHT, "huge.csv", write_gigabyte, "larger than 512 MiB"),
         (FLIGHT, "empty.csv", write_empty, "has 0 poses; allowed: at least 4"),
         (CAMERA, "empty.yaml", write_empty, "is empty (0 bytes)"),
         (CAMERA, "huge.yaml", lambda path: write_gigabyte(path, b"image_width: 640\n"), "is larger than 8 MiB"),
-        (
-            CAMERA,
-            "huge.IMG",
-            lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"),
-            "END: missing in the first",
-        ),
+        (CAMERA, "huge.IMG", lambda path: write_gigabyte(path, PDS3), "END: missing in the first"),
         (MESH, "empty.stl", write_empty, "contains no triangle"),
         (MESH, "huge.stl", write_gigabyte, "is larger than 256 MiB"),
         (DETECTOR, "empty_sheet.toml", write_empty, "pixel_pitch_um: Field required"),
@@ -121,7 +100,7 @@ def test_campaign_with_invalid_file_is_rejected(
     write(tmp_path / name)
     campaign = tmp_path / "campaign.toml"
     campaign.write_text(f'name = "bad"\nscenario = "descent"\ncases = 1\n{table.format(tmp_path / name)}\n')
-    run_and_expect_error(["run", str(campaign), "--out", str(tmp_path / "run")], tmp_path / name, message)
+    run_and_expect_error(["run", campaign, "--out", tmp_path / "run"], tmp_path / name, message)
     assert not (tmp_path / "run").exists()
 
 
@@ -129,14 +108,14 @@ def test_campaign_with_invalid_file_is_rejected(
     ("write", "message"),
     [
         (lambda path: write_gigabyte(path, b"P5 32768 32768 255\n"), "has too many pixels; allowed: at most 178956970"),
-        (lambda path: write_gigabyte(path, b"PDS_VERSION_ID = PDS3\r\n"), "END: missing in the first"),
+        (lambda path: write_gigabyte(path, PDS3), "END: missing in the first"),
         (write_empty, "is empty (0 bytes)"),
     ],
 )
 def test_invalid_image_is_rejected(tmp_path: Path, write: WriteFile, message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write(folder / "drop-1.png")
-    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "drop-1.png", message)
+    run_and_expect_error(["ingest", folder, "--out", tmp_path / "out"], folder / "drop-1.png", message)
     assert not (tmp_path / "out").exists()
 
 
@@ -152,14 +131,11 @@ def test_invalid_image_is_rejected(tmp_path: Path, write: WriteFile, message: st
 def test_invalid_table_is_rejected(tmp_path: Path, cells: dict[str, str], message: str) -> None:
     folder = write_velocity_folder(tmp_path / "in", {"drop": inputs.descent()}, {})
     write_text_rows(folder, [row | cells if index == 1 else row for index, row in enumerate(read_rows(folder))])
-    run_and_expect_error(["ingest", str(folder), "--out", str(tmp_path / "out")], folder / "images.csv", message)
+    run_and_expect_error(["ingest", folder, "--out", tmp_path / "out"], folder / "images.csv", message)
 
 
-def run_and_expect_error(arguments: list[str], path: Path, message: str) -> None:
+def run_and_expect_error(arguments: list[object], path: Path, message: str) -> None:
     """Run a command; assert that it exits with status 2 and an error message that names the file."""
-    result = CliRunner().invoke(app, arguments)
-    assert (result.exit_code, type(result.exception)) == (2, SystemExit)
-    output = result.output
-    assert output.startswith("error: ")
-    assert str(path) in output
+    status, output = run_command(*arguments)
+    assert (status, output[:7], str(path) in output) == (2, "error: ", True), output
     assert message in output

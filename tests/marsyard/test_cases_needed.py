@@ -1,23 +1,14 @@
 """End-to-end test of the advice of an undecided campaign: the printed command decides it."""
 
-from __future__ import annotations
-
 import re
 import shlex
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, write_campaign
+from tests.command import marsyard
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
-Command = Callable[..., tuple[int, str]]
 #: 99 % at 90 % confidence: 230 answers without a failure at one look, 297 if 24 answers were evaluated before.
 REQUIREMENT = """
 [[requirements]]
@@ -32,18 +23,12 @@ population = "POPULATION"
 DISPERSIONS = '[dispersions]\nterrain = {distribution = "in-turn", low = 0, high = 99999}'
 
 
+pytestmark = pytest.mark.usefixtures("_working_folder")
+
+
 @pytest.fixture
-def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Return a function that runs the command line in an empty folder: exit code and standard output."""
+def _working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-
-    def run_command(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["marsyard", *arguments])
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        return int(error_info.value.code or 0), capfd.readouterr().out
-
-    return run_command
 
 
 def write_small_campaign(folder: Path, population: str, unanswered: range, dispersions: str = DISPERSIONS) -> Path:
@@ -65,43 +50,43 @@ def write_small_campaign(folder: Path, population: str, unanswered: range, dispe
     ],
 )
 def test_printed_command_decides_the_campaign(
-    marsyard: Command, tmp_path: Path, population: str, unanswered: range, needed: int, appended: int
+    tmp_path: Path, population: str, unanswered: range, needed: int, appended: int
 ) -> None:
     path = write_small_campaign(tmp_path, population, unanswered)
-    status, output = marsyard("run", str(path), "--out", "run", "--jobs", "2")
+    status, output, _ = marsyard("run", path, "--out", "run", "--jobs", 2)
     assert status == 3
     assert f"24 cases are too few to decide the requirement. {needed} additional cases" in output
     (command,) = re.findall(r"^to decide: (.+)$", output, re.MULTILINE)
     assert command == f"marsyard append run {appended}"
-    status, output = marsyard(*shlex.split(command)[1:])
+    status, output, _ = marsyard(*shlex.split(command)[1:])
     assert (status, "verdict: PASS" in output, "to decide:" in output) == (0, True, False), output
 
 
 @pytest.mark.slow
-def test_new_campaign_of_the_stated_size_is_decided(marsyard: Command, tmp_path: Path) -> None:
+def test_new_campaign_of_the_stated_size_is_decided(tmp_path: Path) -> None:
     """The campaign with 230 cases has one look and needs fewer cases than the extended one."""
     path = write_small_campaign(tmp_path, "all", range(0))
-    _, output = marsyard("run", str(path), "--out", "run", "--jobs", "2")
+    _, output, _ = marsyard("run", path, "--out", "run", "--jobs", 2)
     (cases,) = re.findall(r"A new campaign with another seed needs only \d+ cases \(-n (\d+)\)", output)
     assert cases == "230"
     assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
 
 
 @pytest.mark.slow
-def test_new_campaign_has_a_terrain_for_each_case(marsyard: Command, tmp_path: Path) -> None:
+def test_new_campaign_has_a_terrain_for_each_case(tmp_path: Path) -> None:
     """Cases on shared terrains need more: a new campaign without shared terrains is named, and is decided."""
     shared = DISPERSIONS.replace("99999", "11")
-    _, output = marsyard("run", str(write_small_campaign(tmp_path, "all", range(0), shared)), "--out", "run")
+    _, output, _ = marsyard("run", write_small_campaign(tmp_path, "all", range(0), shared), "--out", "run")
     (cases,) = re.findall(r"with another seed, and a terrain for each case, needs only \d+ cases \(-n (\d+)\)", output)
     assert cases == "230"
     path = write_small_campaign(tmp_path, "all", range(0))
     assert marsyard("run", str(path), "-n", cases, "--seed", "6", "--out", "new", "--jobs", "2")[0] == 0
 
 
-def test_campaign_with_a_failure_is_not_repeated(marsyard: Command, tmp_path: Path) -> None:
+def test_campaign_with_a_failure_is_not_repeated(tmp_path: Path) -> None:
     """After a failure, only additional cases are advised: a new campaign would discard the failure."""
     path = write_small_campaign(tmp_path, "all", range(5, 6))
-    status, output = marsyard("run", str(path), "--out", "run", "--jobs", "2")
+    status, output, _ = marsyard("run", path, "--out", "run", "--jobs", 2)
     assert status == 3
     assert "A new campaign" not in output
     # one failure, first look at 24 cases: 573 cases (docs/explanation/statistics.md)

@@ -3,16 +3,12 @@
 Exit status: 0 requirements met, 1 requirement or case failed, 2 error, 3 no verdict.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -20,38 +16,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS, write_campaign
-
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    # warnings of Matplotlib in the figures of reports
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
-
-
-@dataclass(frozen=True)
-class CommandResult:
-    status: int
-    out: str
-    err: str
-
-
-Command = Callable[..., CommandResult]
-
-
-@pytest.fixture
-def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Return a function that runs a command in this process."""
-
-    def run_command(*arguments: object) -> CommandResult:
-        monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        captured = capfd.readouterr()
-        return CommandResult(int(error_info.value.code or 0), captured.out, captured.err)
-
-    return run_command
+from tests.command import marsyard
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +47,7 @@ def test_run_prints_table_verdict_and_report(finished_run: Path) -> None:
     assert "\x1b" not in out + progress
 
 
-def test_report_evaluates_stored_rows(finished_run: Path, marsyard: Command) -> None:
+def test_report_evaluates_stored_rows(finished_run: Path) -> None:
     (finished_run / "report.html").unlink()
     result = marsyard("report", finished_run)
     assert (result.status, result.err) == (3, "")
@@ -89,7 +55,7 @@ def test_report_evaluates_stored_rows(finished_run: Path, marsyard: Command) -> 
     assert (finished_run / "report.html").exists()
 
 
-def test_replay_compares_with_the_stored_row(finished_run: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_replay_compares_with_the_stored_row(finished_run: Path, tmp_path: Path) -> None:
     result = marsyard("replay", finished_run, 2, "--out", tmp_path / "products")
     assert (result.status, result.err) == (0, "")
     assert "case 2: SILENT" in result.out
@@ -97,7 +63,7 @@ def test_replay_compares_with_the_stored_row(finished_run: Path, marsyard: Comma
     assert (tmp_path / "products" / "products.npz").exists()
 
 
-def test_replay_fails_if_the_row_differs(finished_run: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_replay_fails_if_the_row_differs(finished_run: Path, tmp_path: Path) -> None:
     (tmp_path / "campaign.json").write_bytes((finished_run / "campaign.json").read_bytes())
     frame = pd.read_parquet(finished_run / "cases.parquet")
     frame["altitude_m"] += 1.0 * (frame.index == 1)
@@ -107,14 +73,13 @@ def test_replay_fails_if_the_row_differs(finished_run: Path, marsyard: Command, 
     assert "the row differs from the stored one in: altitude_m" in result.out
 
 
-def test_stages_are_saved_as_separate_files(finished_run: Path, marsyard: Command, tmp_path: Path) -> None:
+def test_stages_are_saved_as_separate_files(finished_run: Path, tmp_path: Path) -> None:
     result = marsyard("replay", finished_run, 0, "--save-stages", "--out", tmp_path / "case")
     assert (result.status, result.err) == (0, "")
     stages = tmp_path / "case" / "stages"
     files = sorted(str(path.relative_to(stages)) for path in stages.rglob("*.*"))
     assert files == ["01-image.png", "02-title.json", "03-nested/01-0/01-x.npy"]
     image = cv2.imread(str(stages / "01-image.png"), cv2.IMREAD_UNCHANGED)
-    assert image is not None
     assert image.dtype == np.uint16
     assert image.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert f"stages: 3 files in {stages}" in result.out
@@ -134,7 +99,7 @@ def _kill_after_first_rows(path: Path, directory: Path, cases: int) -> None:
 
 
 @pytest.mark.slow
-def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Command) -> None:
+def test_killed_campaign_is_reported_and_resumed(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, "sleep_s = 0.1", dispersions="", requirement=REQUIREMENT)
     _kill_after_first_rows(path, tmp_path / "run", 40)
     record_before = (tmp_path / "run" / "campaign.json").read_bytes()
@@ -159,7 +124,7 @@ def test_killed_campaign_is_reported_and_resumed(tmp_path: Path, marsyard: Comma
     assert "takes at least 230 cases without a failure; the campaign has 60" in append_result.out
 
 
-def test_dry_run_only_estimates(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dry_run_only_estimates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = marsyard("run", write_campaign(tmp_path, "sleep_s = 0.05"), "--dry-run", "-n", 100_000, "--jobs", 2)
     assert (result.status, result.err) == (0, "")
@@ -189,7 +154,7 @@ def _crashing_case_setting(case: int) -> str:
     ],
 )
 def test_exit_status_follows_verdict_and_crashes(
-    tmp_path: Path, marsyard: Command, parameters: str, requirement: str, status: int, verdict: str
+    tmp_path: Path, parameters: str, requirement: str, status: int, verdict: str
 ) -> None:
     path = write_campaign(tmp_path, parameters, dispersions="", requirement=requirement)
     result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
@@ -198,7 +163,7 @@ def test_exit_status_follows_verdict_and_crashes(
     assert (report_result.status, f"verdict: {verdict}" in report_result.out) == (status, True)
 
 
-def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Command) -> None:
+def test_configuration_error_precedes_failed_cases(tmp_path: Path) -> None:
     invalid_requirement = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
     path = write_campaign(tmp_path, _crashing_case_setting(0), dispersions="", requirement=invalid_requirement)
     result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")
@@ -217,6 +182,9 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Com
         (["run", "{file}", "--jobs", "0"], "--jobs 0: at least one worker process is needed"),
         (["run", "{file}", "--set", "altitude_m=-2"], "parameters.altitude_m: input should be greater than 0, got -2"),
         (["run", "{file}", "--set", "altitud_m=2"], "unknown key (did you mean 'altitude_m'?)"),
+        (["run", "dimes-smoke", "--set", "descent.altitud_first_m=1500"], "(did you mean 'altitude_first_m'?)"),
+        (["run", "dimes-smoke", "--set", "descent.altitude_first_m=-5"], "descent.altitude_first_m: "),
+        (["run", "dimes-smoke", "--set", "render.backend=vulkan"], "osmesa"),
         (["run", "{file}", "--out", "{run}"], "contains a campaign"),
         (["run", "{file}", "--out", "{file}/run"], "cannot be written: Not a directory"),
         (["run", "{file}", "--out", "/proc/run"], "cannot be written"),
@@ -225,10 +193,7 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Com
         (["run", "{file}", "--dry-run", "--jobs", "-1"], "at least one worker process is needed"),
         (["resume", "{folder}"], "does not contain a campaign"),
         (["resume", "{folder}/none"], "none: no such folder"),
-        (
-            ["resume", "{run}", "--retry", "crased"],
-            "unknown outcome 'crased' (did you mean 'crashed'?); allowed: all, ",
-        ),
+        (["resume", "{run}", "--retry", "crased"], "unknown outcome 'crased' (did you mean 'crashed'?); allowed: all"),
         (["resume", "{run}", "--case-time", "-1"], "--case-time -1.0: input should be greater than 0"),
         (["append", "{run}", "0"], "Invalid value for 'N'"),
         (["append", "{folder}", "3"], "does not contain a campaign"),
@@ -240,29 +205,20 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path, marsyard: Com
         (["report", "{folder}"], "does not contain a campaign"),
         (["replay", "{run}", "6"], "has no case 6; allowed: 0 to 5"),
         (["replay", "{run}", "x"], "Invalid value for 'CASE'"),
+        (["replay", "{run}", "--", "-1"], "Invalid value for 'CASE'"),
         (["replay", "{folder}", "0"], "does not contain a campaign"),
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
     ],
 )
-def test_invalid_arguments_are_rejected(
-    finished_run: Path, tmp_path: Path, marsyard: Command, arguments: list[str], message: str
-) -> None:
+def test_invalid_arguments_are_rejected(finished_run: Path, tmp_path: Path, arguments: list[str], message: str) -> None:
     file = write_campaign(tmp_path)
     result = marsyard(*(argument.format(file=file, run=finished_run, folder=tmp_path) for argument in arguments))
-    # Typer prints usage errors in a box with line breaks
-    text = re.sub(r"[\s│]+", " ", result.err)
-    assert result.status == 2
-    assert re.sub(r"\s+", " ", message) in text
-    assert "Traceback" not in result.err
-    assert result.out == ""
+    assert (result.status, result.out, "Traceback" in result.err) == (2, "", False)
+    assert " ".join(message.split()) in result.text
     assert not (tmp_path / "runs").exists()
 
 
-def test_negative_case_numbers_are_rejected(finished_run: Path, marsyard: Command) -> None:
-    assert marsyard("replay", finished_run, "--", "-1").status == 2
-
-
-def test_internal_error_has_status_2(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_internal_error_has_status_2(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("marsyard.scenarios.systems.catalogue", lambda: 1 / 0)
     result = marsyard("list")
     assert result.status == 2
@@ -270,7 +226,7 @@ def test_internal_error_has_status_2(marsyard: Command, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_default_output_folder_is_runs(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_default_output_folder_is_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     path = write_campaign(tmp_path, dispersions="", requirement="")
     for _ in range(2):
@@ -280,7 +236,7 @@ def test_default_output_folder_is_runs(tmp_path: Path, marsyard: Command, monkey
     assert all(re.fullmatch(r"fake-\d{8}T\d{6}Z(-2)?", name) for name in folders)
 
 
-def test_list_and_show_print_campaigns(tmp_path: Path, marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_list_and_show_print_campaigns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "120")  # wide enough for unbroken texts
     list_result = marsyard("list")
     assert (list_result.status, list_result.err) == (0, "")
@@ -291,13 +247,13 @@ def test_list_and_show_print_campaigns(tmp_path: Path, marsyard: Command, monkey
         assert text in show_result.out
 
 
-def test_names_in_brackets_are_not_markup(tmp_path: Path, marsyard: Command) -> None:
+def test_names_in_brackets_are_not_markup(tmp_path: Path) -> None:
     top_level_keys = TOP_LEVEL_KEYS.replace("a campaign without terrain", "[red]bold[/red] [oops")
     result = marsyard("show", write_campaign(tmp_path, top_level_keys=top_level_keys))
     assert "[red]bold[/red] [oops" in result.out
 
 
-def test_version_and_doctor_print_their_output(marsyard: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_version_and_doctor_print_their_output(monkeypatch: pytest.MonkeyPatch) -> None:
     assert re.fullmatch(r"marsyard \d+\.\d+\.\d+\n", marsyard("--version").out)
     monkeypatch.setattr("marsyard.doctor.run", lambda console, as_json: console.print("checked") or 1)
     result = marsyard("doctor")

@@ -1,7 +1,5 @@
 """Tests that all commands have a help text, and that commands which only print have a JSON option."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import typer
@@ -11,16 +9,8 @@ from marsyard.cli.app import app
 
 #: Commands that only print, and commands that write files. Each command is in one of the two sets.
 PRINTING = {
-    "list",
-    "show",
-    "clean",
-    "conformance",
-    "confirmations",
-    "doctor",
-    "compare",
-    "terrain list",
-    "terrain stats",
-}
+    "list", "show", "clean", "conformance", "confirmations", "doctor", "compare", "terrain list", "terrain stats",
+}  # fmt: skip
 WRITING = {
     "run", "resume", "append", "merge", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset",
     "new", "ingest", "export", "score", "compile", "rare", "search", "budget",

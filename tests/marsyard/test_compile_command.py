@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.cli.app import app
 from marsyard.scenarios.systems import scenario_names, systems
 from marsyard.sim.kernel_cache import mark_ready
+from tests.command import run_command
 
 
 def test_every_system_has_a_compile_case() -> None:
@@ -21,10 +20,7 @@ def test_every_system_has_a_compile_case() -> None:
 
 def test_compiled_systems_are_skipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    for scenario in ("descent", "rover", "landing", "localisation"):
-        mark_ready(scenario)
-    result = CliRunner().invoke(app, ["compile"])
-    assert (result.exit_code, result.output) == (
-        0,
-        "".join(f"{name}: already compiled\n" for name in ("descent", "landing", "localisation", "rover")),
-    )
+    names = ("descent", "landing", "localisation", "rover")
+    for name in names:
+        mark_ready(name)
+    assert run_command("compile") == (0, "".join(f"{name}: already compiled\n" for name in names))

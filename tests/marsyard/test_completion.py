@@ -1,7 +1,5 @@
 """Tests of shell completion and of `marsyard --install-completion`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

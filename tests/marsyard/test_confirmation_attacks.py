@@ -4,8 +4,6 @@ Each attempt starts with a repository whose committed record contains a confirma
 commands of which the cases alone would meet the requirement.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,24 +11,21 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.store.confirmations import read_confirmations
+from tests.command import Output
 from tests.marsyard.confirmation_project import (
     BAD_LUCK,
     CALIBRATION,
     CAMPAIGN,
     RECORD,
     Command,
-    Output,
     commit_all,
     copy_project,
     create_project,
     git,
+    is_unqualified_pass,
     make_command,
 )
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 CONFIRM = ("run", "fake.toml", "--confirm", "--jobs", 1, "--out")
 #: Exit status and status of the requirement of each command of an attempt.
 Expected = list[tuple[int, str]]
@@ -44,13 +39,13 @@ def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def project(failed: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(failed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Copy the repository with the failed confirmation `run-failed`, whose record is committed."""
     if not (failed / "run-failed" / "report.html").exists():
         create_project(failed)
         with monkeypatch.context() as context:
             context.setenv(*BAD_LUCK)
-            output = make_command(capfd, context, failed)(*CONFIRM, "run-failed")
+            output = make_command(context, failed)(*CONFIRM, "run-failed")
         assert (output.status, "verdict: FAIL" in output.out) == (1, True)
         commit_all(failed)
     copy_project(failed, tmp_path)
@@ -197,15 +192,10 @@ QUICK = {"repeat", "delete_the_record", "reuse_a_seed", "edit_the_record"}
     ],
 )
 def test_attempt_gives_no_unqualified_pass(
-    project: Path,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    attempt: Attempt,
-    expected: Expected,
-    text: str,
+    project: Path, monkeypatch: pytest.MonkeyPatch, attempt: Attempt, expected: Expected, text: str
 ) -> None:
-    outputs = attempt(make_command(capfd, monkeypatch, project), project)
-    assert not any(output.is_unqualified_pass for output in outputs), [output.out for output in outputs]
+    outputs = attempt(make_command(monkeypatch, project), project)
+    assert not any(map(is_unqualified_pass, outputs)), [output.out for output in outputs]
     statuses = [status for _, status in expected if status]
     assert [output.status for output in outputs] == [status for status, _ in expected], outputs
     assert any(text in output.text for output in outputs), outputs
@@ -213,16 +203,14 @@ def test_attempt_gives_no_unqualified_pass(
         assert f"verdict: {status}" in output.text
 
 
-def test_cases_of_the_attempts_alone_would_pass(
-    project: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_cases_of_the_attempts_alone_would_pass(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The repository of the attempts gives PASS for an algorithm without earlier claims about its campaign."""
     (project / "estimator.py").write_text("class Estimator:\n    version = 2\n")
     (project / "fake.toml").write_text(CAMPAIGN.replace('"fake"', '"new"').replace("error_scale", "scale"))
     text = (project / "fake.toml").read_text().replace("[dispersions]", "error_scale = 0.25\n[dispersions]")
     (project / "fake.toml").write_text(text)
-    output = make_command(capfd, monkeypatch, project)(*CONFIRM, project / "run-new")
-    assert (output.status, output.is_unqualified_pass, "verdict: PASS" in output.out) == (0, True, True)
+    output = make_command(monkeypatch, project)(*CONFIRM, project / "run-new")
+    assert (output.status, is_unqualified_pass(output), "verdict: PASS" in output.out) == (0, True, True)
     report = json.loads((project / "run-new" / "report.json").read_text())
     assert (report["verdict"], report["exit_code"]) == ("PASS", 0)
     assert "Other claims: 1" in report["evidence"]["text"]

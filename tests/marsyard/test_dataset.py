@@ -1,7 +1,5 @@
 """Tests of data sets for machine learning: tar files of samples (shards), truth of each pixel, reproducible files."""
 
-from __future__ import annotations
-
 import io
 import json
 import tarfile
@@ -12,14 +10,13 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.cli.app import app
 from marsyard.dataset import _prepare_terrains
 from marsyard.scenarios.descent.exposure import World
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.sim.camera import read_cahvor
+from tests.command import run_command
 
 CAMPAIGN = """name = "samples"
 scenario = "landing"
@@ -46,15 +43,12 @@ diameter_m = 1.0
 
 def run_dataset(folder: Path, *arguments: str) -> tuple[int, str]:
     (folder / "samples.toml").write_text(CAMPAIGN)
-    result = CliRunner().invoke(
-        app, ["dataset", str(folder / "samples.toml"), "--out", str(folder / "set"), "--shard", "1", *arguments]
-    )
-    return result.exit_code, result.output
+    return run_command("dataset", folder / "samples.toml", "--out", folder / "set", "--shard", 1, *arguments)
 
 
 def read_shard(path: Path) -> dict[str, bytes]:
     with tarfile.open(path) as shard:
-        return {member.name: shard.extractfile(member).read() for member in shard.getmembers()}  # type: ignore[union-attr]
+        return {member.name: shard.extractfile(member).read() for member in shard.getmembers()}
 
 
 def test_only_terrains_of_several_cases_are_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,10 +122,8 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     settings = ["terrain.samples=512", "location.bank=8"]
     arguments = [argument for setting in settings for argument in ("--set", setting)]
     out = tmp_path / "set"
-    result = CliRunner().invoke(
-        app, ["dataset", "dimes-smoke", "-n", "1", "--jobs", "1", "--out", str(out), *arguments]
-    )
-    assert result.exit_code == 0, result.output
+    status, output = run_command("dataset", "dimes-smoke", "-n", 1, "--jobs", 1, "--out", out, *arguments)
+    assert status == 0, output
     files = read_shard(out / "shard-000000.tar")
     kinds = {name.partition(".")[2] for name in files}
     assert kinds == {"image.png", "range.npy", "normal.npy", "rocks.png", "cahvor", "json"}
@@ -157,9 +149,8 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
 
 
 def test_scenarios_without_samples_are_rejected(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["dataset", "vtt-montecarlo", "--out", str(tmp_path / "set")])
-    assert result.exit_code == 2
-    assert "provides no training samples; allowed: descent, landing" in result.output
+    status, output = run_command("dataset", "vtt-montecarlo", "--out", tmp_path / "set")
+    assert (status, "provides no training samples; allowed: descent, landing" in output) == (2, True)
 
 
 @pytest.mark.parametrize("arguments", [("--shard", "0"), ("--jobs", "0")])

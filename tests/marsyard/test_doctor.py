@@ -1,7 +1,5 @@
 """Tests of `marsyard doctor`: checks of the installation, their verdicts and remedies."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import io

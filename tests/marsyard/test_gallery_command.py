@@ -1,9 +1,6 @@
 """Tests of `marsyard gallery`: images, page and contact sheet."""
 
-from __future__ import annotations
-
 import re
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -11,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from marsyard.cli import app as cli
 from marsyard.cli import gallery as gallery_command
 from marsyard.cli.gallery import (
     PAGE,
@@ -26,6 +22,7 @@ from marsyard.cli.gallery import (
 from marsyard.cli.images import ImageRequest
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
+from tests.command import marsyard
 
 
 class _PageParser(HTMLParser):
@@ -124,16 +121,11 @@ def test_uniform_images_can_be_displayed(image: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("name", [PAGE, SHEET])
-def test_existing_gallery_is_kept(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_existing_gallery_is_kept(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / name).write_text("existing text")
     monkeypatch.setattr(gallery_command, "VIEWS", ())
-    monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path)])
-    with pytest.raises(SystemExit) as error_info:
-        cli.main()
-    assert error_info.value.code == 2
-    assert f"{tmp_path / name}: the file exists" in capfd.readouterr().err
+    status, _, error = marsyard("gallery", "--out", tmp_path)
+    assert (status, f"{tmp_path / name}: the file exists" in error) == (2, True)
     assert (tmp_path / name).read_text() == "existing text"
 
 
@@ -145,15 +137,9 @@ def test_gallery_shows_a_terrain_model(shared_data: Path, tmp_path: Path, monkey
     text = page.read_text()
     assert f"terrain model {tile}" in text
     image = cv2.imread(str(page.parent / f"01-{tile.name}-mer-descent-flown.jpg"), cv2.IMREAD_GRAYSCALE)
-    assert image is not None
     assert image.std() > 5.0
 
 
-def test_unknown_terrain_file_format_is_rejected(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["marsyard", "gallery", "--out", str(tmp_path), "--terrain", "relief.txt"])
-    with pytest.raises(SystemExit) as error_info:
-        cli.main()
-    assert error_info.value.code == 2
-    assert "--terrain relief.txt is not a DTM file; allowed: .npz, .tif, .tiff" in capfd.readouterr().err
+def test_unknown_terrain_file_format_is_rejected(tmp_path: Path) -> None:
+    status, _, error = marsyard("gallery", "--out", tmp_path, "--terrain", "relief.txt")
+    assert (status, "--terrain relief.txt is not a DTM file; allowed: .npz, .tif, .tiff" in error) == (2, True)

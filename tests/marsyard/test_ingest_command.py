@@ -1,7 +1,5 @@
 """Tests of `marsyard ingest`: campaigns from recorded images; invalid input leaves no files."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from pathlib import Path
@@ -9,19 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.cli.app import app
 from marsyard.scenarios.conformance import inputs
+from tests.command import run_command
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder
-
-
-def run_command(*arguments: str) -> tuple[int, str]:
-    result = CliRunner().invoke(app, list(arguments))
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, result.output
 
 
 @pytest.mark.slow

@@ -1,7 +1,5 @@
 """Tests of `marsyard nightly`: plans, regressions, interrupted runs and seeds."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 import sys
@@ -12,20 +10,16 @@ import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
-from marsyard.cli import app as cli
 from marsyard.cli import nightly_plan
 from marsyard.cli.nightly_plan import PLAN_FILE, hash_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
+from tests.command import marsyard
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 Nightly = Callable[..., tuple[int, str]]
 
 
 @pytest.fixture
-def nightly(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Nightly:
+def nightly(tmp_path: Path) -> Nightly:
     """Return a function that runs a plan of one campaign and returns exit status and report (nightly.md)."""
     (tmp_path / "plan.toml").write_text('[[campaigns]]\ncampaign = "fake.toml"\ncases = 60\n')
 
@@ -33,12 +27,8 @@ def nightly(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, 
         parameter_lines = "\n".join(f"{name} = {value}" for name, value in parameters.items())
         requirement = REQUIREMENT.replace("0.99", "0.5").replace("5.0", "3.0")
         write_campaign(tmp_path, parameter_lines, requirement=requirement, dispersions=DISPERSIONS)
-        command = ["marsyard", "nightly", str(tmp_path / "plan.toml"), "--out", str(tmp_path / "out"), "--jobs", "1"]
-        monkeypatch.setattr(sys, "argv", command)
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        capfd.readouterr()
-        return int(error_info.value.code or 0), (tmp_path / "out" / "nightly.md").read_text()
+        status = marsyard("nightly", tmp_path / "plan.toml", "--out", tmp_path / "out", "--jobs", 1).status
+        return status, (tmp_path / "out" / "nightly.md").read_text()
 
     return run
 

@@ -1,7 +1,5 @@
 """Tests of progress output: rates and remaining time."""
 
-from __future__ import annotations
-
 import io
 
 import pytest

@@ -1,25 +1,18 @@
 """Tests that the commands which read a campaign's folder execute nothing that the folder names."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from marsyard.cli import app as cli
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
+from tests.command import marsyard
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
-Command = Callable[..., tuple[int, str]]
 #: A module that leaves a file when it is imported, or an object of it is constructed.
 TRAP = """
 from pathlib import Path
@@ -45,21 +38,14 @@ class Trap:
         return exec, ("open('executed', 'w').write('unpickled')",)
 
 
+pytestmark = pytest.mark.usefixtures("_own_folder")
+
+
 @pytest.fixture
-def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Command:
-    """Return a function that runs the command line in a folder of its own: exit code and output."""
+def _own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-
-    def run_command(*words: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["marsyard", *words])
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        captured = capfd.readouterr()
-        return int(error_info.value.code or 0), captured.out + captured.err
-
-    return run_command
 
 
 @pytest.fixture
@@ -82,7 +68,7 @@ def folders(tmp_path: Path) -> dict[str, Path]:
     return folders
 
 
-def test_reading_commands_execute_nothing(marsyard: Command, folders: Mapping[str, Path], tmp_path: Path) -> None:
+def test_reading_commands_execute_nothing(folders: Mapping[str, Path], tmp_path: Path) -> None:
     names = [folder.name for folder in folders.values()]
     for words in (
         *(("report", name, "--csv") for name in names),
@@ -90,8 +76,7 @@ def test_reading_commands_execute_nothing(marsyard: Command, folders: Mapping[st
         ("dashboard", ".", "--out", "site"),
         ("merge", *names, "--out", "merged"),
     ):
-        _, output = marsyard(*words)
-        assert "Traceback" not in output, output
+        assert "Traceback" not in marsyard(*words).text, words
         assert not (tmp_path / "executed").exists(), words
     assert all((folder / "report.html").exists() for folder in folders.values())
     assert (tmp_path / "site" / "index.html").exists()
@@ -99,29 +84,30 @@ def test_reading_commands_execute_nothing(marsyard: Command, folders: Mapping[st
 
 @pytest.mark.parametrize("scenario", ["trap:Scenario", "descent", "rover"])
 def test_running_commands_refuse_code_from_elsewhere(
-    marsyard: Command, folders: Mapping[str, Path], tmp_path: Path, scenario: str
+    folders: Mapping[str, Path], tmp_path: Path, scenario: str
 ) -> None:
     folder = folders[scenario]
     stored = (folder / "campaign.json").read_bytes()
     for command in (("replay", "0"), ("resume",), ("append", "2"), ("report", "--gallery")):
-        status, output = marsyard(command[0], folder.name, *command[1:])
-        assert (status, "was created or changed elsewhere" in output) == (2, True), output
+        output = marsyard(command[0], folder.name, *command[1:])
+        assert (output.status, "was created or changed elsewhere" in output.text) == (2, True), output
         assert (folder / "campaign.json").read_bytes() == stored
         assert not (tmp_path / "executed").exists(), command
 
 
-def test_folder_from_elsewhere_runs_with_trusted_code_only(
-    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_folder_from_elsewhere_runs_with_trusted_code_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another user's folder is refused; with --trust it runs if its code is the recorded one."""
     estimator = "class Estimator:\n    def estimate(self, measurements): raise AssertionError\n"
     (tmp_path / "trusted_estimator.py").write_text(estimator)
-    options = ("-n", "1", "--out", "run", "--set", "terrain.samples=512")
-    assert marsyard("run", "dimes-smoke", "--algorithm", "trusted_estimator:Estimator", *options)[0] == 1
+    (tmp_path / "fake.toml").write_text(
+        'name = "fake"\nscenario = "tests.campaigns.fake_velocity:FakeVelocityScenario"\ncases = 1\n'
+    )
+    words = ("run", "fake.toml", "--algorithm", "trusted_estimator:Estimator", "--out", "run")
+    assert marsyard(*words).status == 1
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another user"))
-    assert "was created or changed elsewhere" in marsyard("replay", "run", "0")[1]
+    assert "was created or changed elsewhere" in marsyard("replay", "run", "0").text
     (tmp_path / "trusted_estimator.py").write_text(f"{estimator}# changed\n")
-    status, output = marsyard("replay", "run", "0", "--trust")
-    assert (status, "trusted_estimator:Estimator" in output) == (2, True)
+    output = marsyard("replay", "run", "0", "--trust")
+    assert (output.status, "trusted_estimator:Estimator" in output.text) == (2, True)
     (tmp_path / "trusted_estimator.py").write_text(estimator)
-    assert "the row equals the stored one" in marsyard("replay", "run", "0", "--trust")[1]
+    assert "the row equals the stored one" in marsyard("replay", "run", "0", "--trust").text

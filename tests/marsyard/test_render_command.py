@@ -1,10 +1,6 @@
 """Tests of `marsyard render`: consistent image, camera and truth files; invalid options."""
 
-from __future__ import annotations
-
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -12,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.cli import app as cli
 from marsyard.cli import images
 from marsyard.cli.images import SUFFIXES
 from marsyard.sim.camera import read_cahvor
@@ -21,21 +16,7 @@ from marsyard.sim.render import Objects, Sun, scene
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.casters import Casters
 from marsyard.sim.render.scene import casters_towards
-
-Command = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture
-def marsyard(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Return a function that runs a command in this process and returns exit status and error output."""
-
-    def run_command(*arguments: object) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["marsyard", *map(str, arguments)])
-        with pytest.raises(SystemExit) as error_info:
-            cli.main()
-        return int(error_info.value.code or 0), capfd.readouterr().err
-
-    return run_command
+from tests.command import marsyard
 
 
 def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
@@ -71,9 +52,9 @@ def _check_image(prefix: Path, size: tuple[int, int], multiple: int) -> None:
 
 
 @pytest.mark.slow
-def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Path) -> None:
+def test_detector_image_from_above_is_consistent(tmp_path: Path) -> None:
     prefix = tmp_path / "hover"
-    status, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
+    status, _, message = marsyard("render", "heli-hazardous", "--camera", "xc-55", "--out", prefix, "--azimuth", 30)
     assert status == 0, message
     _check_image(prefix, (640, 480), multiple=256)  # 8-bit counts in a 16-bit file
     metadata = json.loads(Path(f"{prefix}.json").read_text())
@@ -82,10 +63,10 @@ def test_detector_image_from_above_is_consistent(marsyard: Command, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_stereo_pair_of_radiance_is_consistent(marsyard: Command, tmp_path: Path) -> None:
+def test_stereo_pair_of_radiance_is_consistent(tmp_path: Path) -> None:
     prefix = tmp_path / "pair"
     options = ("--radiance", "--sun-elevation", 25, "--east", 12, "--north", -7)
-    status, message = marsyard("render", "heli-hazardous", "--camera", "research-navcam", "--out", prefix, *options)
+    status, _, message = marsyard("render", "heli-hazardous", "--camera", "research-navcam", "--out", prefix, *options)
     assert status == 0, message
     for eye in ("left", "right"):
         _check_image(tmp_path / f"pair-{eye}", (1024, 768), multiple=1)
@@ -115,9 +96,9 @@ def test_stereo_pair_of_radiance_is_consistent(marsyard: Command, tmp_path: Path
     ],
 )
 def test_invalid_options_are_rejected(
-    marsyard: Command, tmp_path: Path, site: str, camera: str, options: tuple[str, ...], message: str
+    tmp_path: Path, site: str, camera: str, options: tuple[str, ...], message: str
 ) -> None:
-    status, error = marsyard("render", site, "--camera", camera, "--out", tmp_path / "x", *options)
+    status, _, error = marsyard("render", site, "--camera", camera, "--out", tmp_path / "x", *options)
     assert status == 2
     assert error.startswith("error: ")
     assert error.count("\n") == 1
@@ -125,30 +106,30 @@ def test_invalid_options_are_rejected(
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_folder_is_reported(marsyard: Command, tmp_path: Path) -> None:
-    status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "no" / "x")
+def test_missing_folder_is_reported(tmp_path: Path) -> None:
+    status, _, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "no" / "x")
     assert status == 2
     assert "does not exist" in error
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_existing_files_are_kept(marsyard: Command, tmp_path: Path, suffix: str) -> None:
+def test_existing_files_are_kept(tmp_path: Path, suffix: str) -> None:
     existing = tmp_path / f"x{suffix}"
     existing.write_text("existing text")
-    status, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "x")
+    status, _, error = marsyard("render", "gusev", "--camera", "xc-55", "--out", tmp_path / "x")
     assert status == 2
     assert f"{existing}: files exist" in error
     assert existing.read_text() == "existing text"
 
 
-def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_filled_holes_of_a_dtm_are_marked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The camera looks down at the centre of a DTM whose eastern quarter has no heights."""
     heights = 3.0 * np.add.outer(np.sin(np.arange(120) / 7.0), np.cos(np.arange(120) / 9.0))
     heights[:, 90:] = np.nan
     dtm, prefix = tmp_path / "site.npz", tmp_path / "view"
     np.savez(dtm, dem=heights, dem_gsd=1.0)
     command = ("render", dtm, "--camera", "xc-55", "--altitude", 150, "--radiance", "--out", prefix)
-    status, message = marsyard(*command)
+    status, _, message = marsyard(*command)
     assert status == 2
     assert "25.0% of its posts have no height; allowed: up to 5.0%" in message
     calls: list[Sun] = []
@@ -158,7 +139,7 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path, mon
         return casters_towards(objects, sun)
 
     monkeypatch.setattr(scene, "casters_towards", count_calls)
-    status, message = marsyard(*command, "--max-holes", 0.3)
+    status, _, message = marsyard(*command, "--max-holes", 0.3)
     assert status == 0, message
     assert "show filled holes of the DTM" in message
     # image and truth layers have the same shadows
@@ -180,9 +161,7 @@ def test_filled_holes_of_a_dtm_are_marked(marsyard: Command, tmp_path: Path, mon
 
 
 @pytest.mark.parametrize("compiled_by", [None, "render", "descent"])
-def test_first_compilation_is_noted(
-    marsyard: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled_by: str | None
-) -> None:
+def test_first_compilation_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled_by: str | None) -> None:
     """Without compiled kernels, the note precedes rendering, which is replaced here by an error."""
 
     def fail(*_arguments: object, **_options: object) -> None:
@@ -192,7 +171,7 @@ def test_first_compilation_is_noted(
     monkeypatch.setattr(images, "render_images", fail)
     if compiled_by is not None:
         mark_ready(compiled_by)
-    status, message = marsyard("render", "heli-benign", "--camera", "xc-55", "--out", tmp_path / "x")
+    status, _, message = marsyard("render", "heli-benign", "--camera", "xc-55", "--out", tmp_path / "x")
     assert status == 2
     is_noted = message.startswith("note: compiling numeric kernels once on this machine")
     assert is_noted == (compiled_by is None)

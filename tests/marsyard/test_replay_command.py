@@ -1,7 +1,5 @@
 """Tests of `marsyard replay`: stored products are replaced only by complete new ones."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os
@@ -13,12 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
-from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import RecordingWatch, run, sign_folder, write_campaign
+from tests.command import run_command
 
 SCENARIO = """
 from tests.campaigns.fake_scenario import FakeScenario
@@ -43,12 +40,6 @@ def stored_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         os.chdir(working_folder)
     assert (folder / "run" / "cases" / "0" / "products.json").exists()
     return folder / "run"
-
-
-def run_command(*arguments: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, list(map(str, arguments)))
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result.exit_code, result.output
 
 
 def _read_files(folder: Path) -> dict[str, bytes]:

@@ -1,7 +1,5 @@
 """Tests of the options of `marsyard replay` that export a case in space and time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ from marsyard.scenarios.timeline import Timeline, timeline_products
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.campaigns.fake_scenario import FakeParameters, FakeScenario
-from tests.marsyard.test_replay_command import run_command
+from tests.command import run_command
 from tests.reports.timeline.timeline_example import make_timeline
 
 
@@ -62,7 +60,6 @@ def test_replay_exports_the_case(stored_run: Path, tmp_path: Path) -> None:
     assert (bag / "metadata.yaml").is_file()
     assert (tmp_path / "out" / "space.png").is_file()
     stored = Timeline.from_products(load_products(tmp_path / "out"))
-    assert stored is not None
     assert [*stored.paths] == ["true", "estimated"]
 
 

@@ -1,7 +1,5 @@
 """Tests of the Python interface: algorithms given as objects, campaigns without files, and results."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,11 +16,6 @@ from marsyard.result import Result, open_result
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.objects import name_object
 from tests.reports.synthetic_run import VELOCITY, make_rows, write_run
-
-pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
-    pytest.mark.filterwarnings("ignore::DeprecationWarning:matplotlib"),
-]
 
 SCENARIO = "tests.campaigns.fake_velocity:FakeVelocityScenario"
 REQUIREMENT = {"id": "V", "metric": "velocity_error_m_s", "bound": 5.0, "probability": 0.2, "confidence": 0.5}

@@ -1,7 +1,5 @@
 """Tests of the log file of a campaign: command, progress, end and interruptions."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

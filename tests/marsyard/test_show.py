@@ -1,16 +1,10 @@
 """Tests of `marsyard show`: dispersions, draws as table, figure and JSON, and invalid campaign files."""
 
-from __future__ import annotations
-
 import copy
-import io
 import json
 import re
-import sys
 import tomllib
 from collections.abc import Iterator
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.cli import app as cli
+from tests.campaigns.fake_campaign import to_toml
+from tests.command import marsyard
 
 CAMPAIGN = """
 name = "fake"
@@ -61,27 +56,6 @@ confidence = 0.9
 [retain]
 showcase = "worst"
 """
-
-
-@dataclass(frozen=True)
-class CommandResult:
-    status: int
-    out: str
-    err: str
-
-
-def marsyard(*arguments: object) -> CommandResult:
-    """Run a command in this process."""
-    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
-    sys.argv = ["marsyard", *map(str, arguments)]
-    try:
-        with redirect_stdout(out), redirect_stderr(err):
-            cli.main()
-    except SystemExit as error:
-        return CommandResult(int(error.code or 0), out.getvalue(), err.getvalue())
-    finally:
-        sys.argv = argv
-    raise AssertionError("the command did not exit")
 
 
 @pytest.fixture
@@ -186,21 +160,6 @@ _random_values = st.recursive(
 ) | st.just(_MISSING)
 
 
-def _format_toml(value: Any) -> str:
-    """Format a value as TOML on one line; each character of a text is escaped."""
-    if isinstance(value, dict):
-        return (
-            "{"
-            + ", ".join(f"{_format_toml(str(key))} = {_format_toml(inner_value)}" for key, inner_value in value.items())
-            + "}"
-        )
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_format_toml, value)) + "]"
-    if isinstance(value, str):
-        return '"' + "".join(f"\\U{ord(letter):08x}" for letter in value) + '"'
-    return str(value).lower()
-
-
 def _change_document(path: tuple[str | int, ...], value: Any) -> dict[str, Any]:
     """Return a copy of the campaign with another value at a path; `_MISSING` removes the key."""
     document = copy.deepcopy(_DOCUMENT)
@@ -229,7 +188,7 @@ _REPORTING_KEYS = {
 def test_random_changes_are_shown_or_reported_by_key(campaign: Path, path: tuple[str | int, ...], value: Any) -> None:
     """One value of a valid file is replaced or removed: the file is shown or the error names that key."""
     document = _change_document(path, value)
-    campaign.write_text("\n".join(f"{key} = {_format_toml(entry)}" for key, entry in document.items()))
+    campaign.write_text("\n".join(f"{key} = {to_toml(entry)}" for key, entry in document.items()))
     result = marsyard("show", campaign, "--draw", 2, "--json")
     assert "Traceback" not in result.err, result.err
     assert result.status in (0, 2)

@@ -1,7 +1,5 @@
 """Tests of the dashboard server: invalid paths and requests for other hosts are rejected."""
 
-from __future__ import annotations
-
 import http.client
 import socket
 import struct
@@ -18,8 +16,12 @@ from marsyard.reports.dashboard.server import create_server
 
 @pytest.fixture
 def port(tmp_path: Path) -> Iterator[int]:
-    (tmp_path / "index.html").write_text("the site")
-    with create_server(tmp_path, "127.0.0.1", 0) as http_server:
+    """Serve a folder with an empty folder and a link to a file outside of it."""
+    (tmp_path / "site" / "c").mkdir(parents=True)
+    (tmp_path / "site" / "index.html").write_text("the site")
+    (tmp_path / "secret.txt").write_text("secret")
+    (tmp_path / "site" / "outside-link").symlink_to(tmp_path / "secret.txt")
+    with create_server(tmp_path / "site", "127.0.0.1", 0) as http_server:
         threading.Thread(target=http_server.serve_forever, daemon=True).start()
         yield http_server.server_port
         http_server.shutdown()
@@ -37,7 +39,11 @@ def _request_status(port: int, path: str, host: str | None) -> int:
         connection.close()
 
 
-@pytest.mark.parametrize("path", ["/%00", "/a%00b/index.html", "/" + 5000 * "a", "/%2e%2e/%00"])
+#: Null bytes, a long name, a folder, and paths to a file outside of the site.
+INVALID = ("/%00", "/a%00b/index.html", "/" + 5000 * "a", "/%2e%2e/%00", "/c/", "/../secret.txt", "/%2e%2e/secret.txt")
+
+
+@pytest.mark.parametrize("path", [*INVALID, "/outside-link"])
 def test_invalid_paths_are_not_found(port: int, path: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert _request_status(port, path, f"127.0.0.1:{port}") == 404
     assert "Traceback" not in capfd.readouterr().err
@@ -83,7 +89,7 @@ def test_connections_are_limited_in_number_and_time(port: int, monkeypatch: pyte
 
 
 def test_reset_connections_print_nothing(port: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "large.html").write_bytes(bytes(30_000_000))
+    (tmp_path / "site" / "large.html").write_bytes(bytes(30_000_000))
     for request in (b"", b"GET / HT", b"GET /large.html HTTP/1.0\r\nHost: localhost\r\n\r\n"):
         with socket.create_connection(("127.0.0.1", port), timeout=20) as connection:
             connection.sendall(request)

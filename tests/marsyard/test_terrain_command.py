@@ -6,15 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from marsyard.cli.app import app
 from marsyard.sim.terrain import sites
-
-
-def run_terrain_command(*arguments: str) -> tuple[int, str]:
-    result = CliRunner().invoke(app, ["terrain", *arguments])
-    return result.exit_code, result.output
+from tests.command import run_command
 
 
 @pytest.fixture
@@ -28,7 +22,7 @@ def tile(tmp_path: Path) -> str:
 
 
 def test_list_names_every_site() -> None:
-    status, output = run_terrain_command("list")
+    status, output = run_command("terrain", "list")
     assert status == 0
     for name in sites():
         assert name in output
@@ -36,7 +30,7 @@ def test_list_names_every_site() -> None:
 
 @pytest.mark.slow
 def test_site_statistics_include_values_of_the_paper() -> None:
-    status, output = run_terrain_command("stats", "meridiani", "--json")
+    status, output = run_command("terrain", "stats", "meridiani", "--json")
     assert status == 0
     record = json.loads(output)
     assert record["site"] == "meridiani"
@@ -46,13 +40,13 @@ def test_site_statistics_include_values_of_the_paper() -> None:
 
 
 def test_file_statistics_report_real_and_filled_posts(tile: str) -> None:
-    status, output = run_terrain_command("stats", tile)
+    status, output = run_command("terrain", "stats", tile)
     assert status == 0
     message = " ".join(output.split())
     assert "Filled: 1 posts without height" in message
     assert "mean slope over 30 m, deg" in message
     assert "the terrain around it is synthetic" in message
-    assert json.loads(run_terrain_command("stats", tile, "--json")[1])["real"]["posting_m"] == 2.0
+    assert json.loads(run_command("terrain", "stats", tile, "--json")[1])["real"]["posting_m"] == 2.0
 
 
 def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
@@ -61,10 +55,10 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     heights = np.add.outer(np.sin(np.arange(64) / 5.0), np.cos(np.arange(64) / 6.0))
     heights[:, :31] = np.nan
     np.savez(path, dem=heights, dem_gsd=2.0)
-    status, output = run_terrain_command("stats", str(path))
+    status, output = run_command("terrain", "stats", path)
     assert status == 2
     assert "48.4% of its posts have no height; allowed: up to 5.0%" in output
-    status, output = run_terrain_command("stats", str(path), "--max-holes", "0.5", "--image", str(figure))
+    status, output = run_command("terrain", "stats", path, "--max-holes", "0.5", "--image", figure)
     assert status == 0, output
     assert "1984 posts without height (48.4%)" in " ".join(output.split())
     image = cv2.imread(str(figure))
@@ -74,7 +68,7 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     assert is_red.sum() == pytest.approx(31 * 64, rel=0.1)
     red_columns = np.flatnonzero(is_red.any(axis=0))
     assert red_columns[0] == pytest.approx(32, abs=1)
-    assert run_terrain_command("stats", str(path), "--max-holes", "0.5", "--image", str(figure))[0] == 2
+    assert run_command("terrain", "stats", path, "--max-holes", "0.5", "--image", figure)[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -86,6 +80,6 @@ def test_holes_are_rejected_or_counted_and_marked(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_arguments_are_reported(arguments: tuple[str, ...], message: str) -> None:
-    status, output = run_terrain_command(*arguments)
+    status, output = run_command("terrain", *arguments)
     assert status == 2
     assert message in output

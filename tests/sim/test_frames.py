@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.frames import SITE_FROM_WORLD, compose, direction, rigid, rigid_from_axes
@@ -12,20 +13,20 @@ from marsyard.sim.frames import SITE_FROM_WORLD, compose, direction, rigid, rigi
     [(0, 0, [0, 1, 0]), (90, 0, [1, 0, 0]), (180, 0, [0, -1, 0]), (123, 90, [0, 0, 1]), (0, -90, [0, 0, -1])],
 )
 def test_directions_are_clockwise_from_north(azimuth_deg: float, elevation_deg: float, expected: list[float]) -> None:
-    np.testing.assert_allclose(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), expected, atol=1e-15)
+    assert_allclose(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), expected, atol=1e-15)
 
 
 def test_site_axes_are_north_east_down() -> None:
     north, east, up = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     site_axes = SITE_FROM_WORLD.apply(np.stack([north, east, up]))
-    np.testing.assert_allclose(site_axes, np.diag([1.0, 1.0, -1.0]), atol=1e-15)
+    assert_allclose(site_axes, np.diag([1.0, 1.0, -1.0]), atol=1e-15)
     assert np.linalg.det(SITE_FROM_WORLD.as_matrix()) == pytest.approx(1.0)
 
 
 def test_rigid_transform_rotates_then_translates() -> None:
     quarter_turn = Rotation.from_euler("z", 90, degrees=True)
     point = rigid(quarter_turn, np.array([10.0, 0.0, 0.0])).apply([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(point, [10.0, 1.0, 0.0], atol=1e-15)
+    assert_allclose(point, [10.0, 1.0, 0.0], atol=1e-15)
 
 
 def test_unchecked_transforms_match_scipy() -> None:
@@ -33,10 +34,8 @@ def test_unchecked_transforms_match_scipy() -> None:
     rotations, positions = Rotation.random(20, rng=1), np.random.default_rng(1).normal(size=(20, 3))
     for rotation, position in zip(rotations, positions, strict=True):
         transform = RigidTransform.from_components(position, rotation)
-        np.testing.assert_allclose(
-            rigid_from_axes(rotation.as_matrix(), position).as_matrix(), transform.as_matrix(), atol=1e-15
-        )
+        assert_allclose(rigid_from_axes(rotation.as_matrix(), position).as_matrix(), transform.as_matrix(), atol=1e-15)
         composition = compose(transform, rigid(rotations[0], positions[0]))
-        np.testing.assert_allclose(
+        assert_allclose(
             composition.as_matrix(), (transform * rigid(rotations[0], positions[0])).as_matrix(), rtol=0.0, atol=4e-15
         )

@@ -1,7 +1,5 @@
 """Timelines of a case of each system: they agree with the images, do not change the row, and open in Rerun."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -74,7 +72,6 @@ def test_templates_on_the_ground_are_at_their_pixels() -> None:
     parameters = campaign.parameters(1)
     with recording_timelines():
         timeline = Timeline.from_products(campaign.scenario.run(parameters, campaign.streams(1)).products)
-    assert timeline is not None
     points = timeline.points["valid templates"]
     assert len(points.times_s) >= 2
     for time_s, position_m in zip(points.times_s, points.positions_m, strict=True):

@@ -1,7 +1,5 @@
 """Tests of the import contracts: they list each module of the simulation and of the scenarios; no circular imports."""
 
-from __future__ import annotations
-
 import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the files that distribute Marsyard: container file, conda recipe, GitHub workflow and release notes."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

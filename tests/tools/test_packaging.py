@@ -1,7 +1,5 @@
 """Tests of the wheel: it installs one package, `marsyard`, which works next to modules named `sim` or `reports`."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -68,11 +66,3 @@ def test_wheel_works_next_to_modules_of_the_same_names(wheel: Path, tmp_path: Pa
     )
     assert result.returncode == 0, result.stderr
     assert "DIMES-VEL" in result.stdout
-
-
-@pytest.mark.slow
-def test_description_of_the_wheel_is_valid(wheel: Path) -> None:
-    twine = Path(sys.executable).with_name("twine")
-    result = subprocess.run([twine, "check", "--strict", str(wheel)], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert "PASSED" in result.stdout

@@ -1,7 +1,5 @@
 """Tests that array shapes are checked at run time in the tests, except in modules of compiled kernels."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the set-up script, the demo script and the constraints. The tests install no package."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.scenarios.systems import catalogue
-from tests.campaigns.fake_campaign import CampaignFile
+from tests.campaigns.fake_campaign import CampaignFile, to_toml
 
 #: Module of the fake scenarios.
 FAKE = "tests.campaigns.fake_scenario"
@@ -31,9 +31,10 @@ def test_omitted_parameters_get_their_defaults(campaign_file: CampaignFile) -> N
     assert campaign.configuration.parameters["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
+NAMED = f"name='a'\nscenario='{FAKE}:FakeScenario'\n"
+#: Texts of a table of a campaign file (or option), and the message.
+INVALID = {
+    "parameters": [
         ("altitud_m = 3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?); allowed: aborting"),
         ("wind = {est_m_s = 3}", "parameters.wind.est_m_s: unknown key (did you mean 'east_m_s'?); allowed: east"),
         ("altitude_m = -10", "parameters.altitude_m: input should be greater than 0, got -10"),
@@ -42,17 +43,7 @@ def test_omitted_parameters_get_their_defaults(campaign_file: CampaignFile) -> N
         ("lowest_altitude_m = 2100.0", "parameters: altitude_m must be above lowest_altitude_m"),
         ("wind = 3", "parameters.wind: input should be a valid dictionary"),
     ],
-)
-def test_invalid_parameters_are_reported(campaign_file: CampaignFile, parameters: str, message: str) -> None:
-    path = campaign_file(parameters, dispersions="")
-    text = load_and_expect_error(path)
-    assert text.startswith(f"{path}: ")
-    assert message in text
-
-
-@pytest.mark.parametrize(
-    ("dispersion", "message"),
-    [
+    "dispersions": [
         ("altitud_m = {distribution='uniform', low=1, high=2}", "dispersions.altitud_m: unknown parameter 'altitud_m'"),
         ("wind = {distribution='uniform', low=1, high=2}", "dispersions.wind: is a table; disperse one of its values"),
         ("altitude_m = {distribution='unifrom', low=1, high=2}", "(did you mean 'uniform'?); allowed: uniform, normal"),
@@ -69,10 +60,7 @@ def test_invalid_parameters_are_reported(campaign_file: CampaignFile, parameters
         ("altitude_m = {distribution='gamma', scale=2}", "parameter 'a' is missing; gamma accepts a, loc, scale"),
         ("altitude_m = {distribution='gamma', a=1, scal=2}", "unknown parameter 'scal' (did you mean 'scale'?)"),
         ("altitude_m = {distribution='gamma', a=-1}", "gamma is not defined for a = -1.0"),
-        (
-            "altitude_m = {distribution='gamma', a='x'}",
-            "dispersions.altitude_m.a: unknown parameter 'x'; allowed: abort",
-        ),
+        ("altitude_m = {distribution='gamma', a='x'}", "altitude_m.a: unknown parameter 'x'; allowed: aborting_cases"),
         ("altitude_m = {distribution='gamma', a=[1]}", "altitude_m.a: input should be a valid number"),
         ("altitude_m = 'uniform'", "dispersions.altitude_m: input should be a valid dictionary"),
         ("altitude_m = {low = 1}", "dispersions.altitude_m.distribution: required, but missing"),
@@ -80,58 +68,26 @@ def test_invalid_parameters_are_reported(campaign_file: CampaignFile, parameters
         ("terrain = {distribution='integer', low=0.5, high=2}", "terrain.low: input should be a valid integer"),
         ("terrain = {distribution='integer', low=3, high=2}", "low = 3 must not be above high = 2"),
         ("terrain = {distribution='uniform', low=0, high=3}", "input should be a valid integer"),
-        (
-            "wind = {distribution='choice', values=[{}, {est_m_s=3}]}",
-            "includes {'est_m_s': 3}, which is not valid: wind.est_m_s: unknown key",
-        ),
+        ("wind = {distribution='choice', values=[{}, {est_m_s=3}]}", "which is not valid: wind.est_m_s: unknown key"),
         ("wind = {distribution='choice', values=[{}, 3]}", "includes 3, which is not valid"),
         ("kind = {distribution='choice', values=['a', 'B']}", "includes 'B', which is not valid"),
         ("kind = {distribution='choice', values=['a'], weights=[1, 2]}", "2 weights for 1 values"),
         ("kind = {distribution='choice', values=[]}", "kind.values: list should have at least 1 item"),
         ("kind = {distribution='choice', values=['a'], weights=[0]}", "kind.weights[0]: input should be greater"),
     ],
-)
-def test_invalid_dispersions_are_reported(campaign_file: CampaignFile, dispersion: str, message: str) -> None:
-    path = campaign_file(dispersions=f"[dispersions]\n{dispersion}")
-    text = load_and_expect_error(path)
-    assert text.startswith(f"{path}: dispersions.")
-    assert message in text
-
-
-def test_draws_with_invalid_combinations_are_reported(campaign_file: CampaignFile) -> None:
-    dispersions = """
-    [dispersions]
-    altitude_m = {distribution = "uniform", low = 1000, high = 2000}
-    """
-    text = load_and_expect_error(campaign_file("altitude_m = 2000\nlowest_altitude_m = 1500", dispersions=dispersions))
-    assert "altitude_m must be above lowest_altitude_m" in text
-
-
-@pytest.mark.parametrize(
-    ("top_level_keys", "message"),
-    [
+    "top_level_keys": [
         ("name='a'\nscenario='descnt'\ncases=1", "unknown scenario 'descnt' (did you mean 'descent'?)"),
         ("name='a'\nscenario='no_such_module:X'\ncases=1", "cannot import scenario 'no_such_module:X': No module"),
         (f"name='a'\nscenario='{FAKE}:Wind'\ncases=1", "is not a valid scenario: missing members: parameters_type"),
         (f"name='a b'\nscenario='{FAKE}:FakeScenario'\ncases=1", "name: string should match pattern"),
         (f"scenario='{FAKE}:FakeScenario'\ncases=1", "name: required, but missing"),
-        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=0", "cases: input should be greater"),
-        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=true", "cases: input should be a valid integer"),
-        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nseed=-1", "seed: input should be greater than or"),
-        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nsed=1", "sed: unknown key (did you mean 'seed'?)"),
-        (f"name='a'\nscenario='{FAKE}:FakeScenario'\ncases=1\nx=", "not valid TOML"),
+        (NAMED + "cases=0", "cases: input should be greater"),
+        (NAMED + "cases=true", "cases: input should be a valid integer"),
+        (NAMED + "cases=1\nseed=-1", "seed: input should be greater than or"),
+        (NAMED + "cases=1\nsed=1", "sed: unknown key (did you mean 'seed'?)"),
+        (NAMED + "cases=1\nx=", "not valid TOML"),
     ],
-)
-def test_invalid_campaign_keys_are_reported(campaign_file: CampaignFile, top_level_keys: str, message: str) -> None:
-    path = campaign_file(top_level_keys=top_level_keys)
-    text = load_and_expect_error(path)
-    assert text.startswith(f"{path}: ")
-    assert message in text
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+    "requirement": [
         ("bound = 'x'", "requirements[0].bound: input should be a valid number, got 'x'"),
         ("bound = inf", "requirements[0].bound: input should be a finite number"),
         ("probability = 1.0", "requirements[0].probability: input should be less than 1, got 1.0"),
@@ -141,13 +97,45 @@ def test_invalid_campaign_keys_are_reported(campaign_file: CampaignFile, top_lev
         ("metrik = 'x'", "requirements[0].metrik: unknown key (did you mean 'metric'?); allowed: accept_rate, bound"),
         ("accept_rate = true", 'accept_rate needs decide_by = "estimate"'),
     ],
+    "--set": [
+        ("altitude_m=-3", "parameters.altitude_m: input should be greater than 0, got -3"),
+        ("altitud_m=3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?)"),
+        ("cases=many", "cases: input should be a valid integer, got 'many'"),
+        ("wind=3", "parameters.wind: input should be a valid dictionary"),
+        ("wind.east_m_s.x=3", "parameters.wind.east_m_s: input should be a valid number"),
+        ("altitude_m", "expected KEY=VALUE"),
+        ("=3", "expected KEY=VALUE"),
+        ("a b=3", "is not a dotted key"),
+        ("a..b=3", "is not a dotted key"),
+        ("a=1\nb=2", "expected KEY=VALUE"),
+        ("dispersions.terrain.high=100000", "dispersions.terrain: integer(low=0, high=100000) includes 100000"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("table", "text", "message"), [(table, *entry) for table, entries in INVALID.items() for entry in entries]
 )
-def test_invalid_requirements_are_reported(campaign_file: CampaignFile, change: str, message: str) -> None:
-    key = change.split(" ")[0]
-    base = {"id": "'a'", "metric": "'m'", "bound": "1", "probability": "0.9", "confidence": "0.9"}
-    lines = [f"{name} = {value}" for name, value in base.items() if name != key]
-    path = campaign_file(requirement="[[requirements]]\n" + "\n".join([*lines, change]))
-    assert message in load_and_expect_error(path)
+def test_invalid_values_are_reported(campaign_file: CampaignFile, table: str, text: str, message: str) -> None:
+    texts = {table: text} | ({"dispersions": ""} if table == "parameters" else {})
+    if table == "dispersions":
+        texts = {table: f"[dispersions]\n{text}"}
+    elif table == "requirement":
+        values = {"id": "'a'", "metric": "'m'", "bound": "1", "probability": "0.9", "confidence": "0.9"}
+        lines = [f"{key} = {value}" for key, value in values.items() if key != text.split(" ")[0]]
+        texts = {table: "\n".join(["[[requirements]]", *lines, text])}
+    overrides = [texts.pop("--set")] if table == "--set" else []
+    path = campaign_file(**texts)
+    error = load_and_expect_error(path, *overrides)
+    start = {"dispersions": f"{path}: dispersions.", "--set": f"--set {text}: ".replace("\n", "\\n")}
+    assert error.startswith(start.get(table, f"{path}: "))
+    assert message in error
+
+
+def test_draws_with_invalid_combinations_are_reported(campaign_file: CampaignFile) -> None:
+    dispersions = '[dispersions]\naltitude_m = {distribution = "uniform", low = 1000, high = 2000}'
+    text = load_and_expect_error(campaign_file("altitude_m = 2000\nlowest_altitude_m = 1500", dispersions=dispersions))
+    assert "altitude_m must be above lowest_altitude_m" in text
 
 
 def test_duplicate_requirement_ids_are_rejected(campaign_file: CampaignFile) -> None:
@@ -207,45 +195,12 @@ def test_overrides_replace_values_and_dispersions(campaign_file: CampaignFile) -
     assert changed_configuration.cases == 3
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("altitude_m=-3", "parameters.altitude_m: input should be greater than 0, got -3"),
-        ("altitud_m=3", "parameters.altitud_m: unknown key (did you mean 'altitude_m'?)"),
-        ("cases=many", "cases: input should be a valid integer, got 'many'"),
-        ("wind=3", "parameters.wind: input should be a valid dictionary"),
-        ("wind.east_m_s.x=3", "parameters.wind.east_m_s: input should be a valid number"),
-        ("altitude_m", "expected KEY=VALUE"),
-        ("=3", "expected KEY=VALUE"),
-        ("a b=3", "is not a dotted key"),
-        ("a..b=3", "is not a dotted key"),
-        ("a=1\nb=2", "expected KEY=VALUE"),
-        ("dispersions.terrain.high=100000", "dispersions.terrain: integer(low=0, high=100000) includes 100000"),
-    ],
-)
-def test_invalid_overrides_are_reported_by_option(campaign_file: CampaignFile, override: str, message: str) -> None:
-    text = load_and_expect_error(campaign_file(), override)
-    assert text.startswith(f"--set {override}: ".replace("\n", "\\n"))
-    assert message in text
-
-
 #: Words of valid and invalid keys and values for random campaign files.
 _WORDS = """
 name scenario cases seed parameters dispersions requirements retain wind altitude_m wind.east_m_s distribution uniform
 low high choice values truncate norm gamma id
 """
 _random_words = st.sampled_from(_WORDS.split())
-
-
-def _to_toml(value: object) -> str:
-    """Format a value as TOML; all characters of texts are escaped."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_to_toml(str(key))} = {_to_toml(entry)}" for key, entry in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_to_toml, value)) + "]"
-    if isinstance(value, str):
-        return '"' + "".join(f"\\u{ord(character):04x}" for character in value) + '"'
-    return str(value).lower()
 
 
 _random_values = st.recursive(
@@ -259,7 +214,7 @@ _random_values = st.recursive(
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_random_files_are_loaded_or_their_keys_reported(tmp_path: Path, changes: dict[str, object]) -> None:
     base: dict[str, object] = {"name": "fake", "scenario": "tests.campaigns.fake_scenario:FakeScenario", "cases": 3}
-    text = "\n".join(f"{_to_toml(key)} = {_to_toml(value)}" for key, value in {**base, **changes}.items())
+    text = "\n".join(f"{to_toml(key)} = {to_toml(value)}" for key, value in {**base, **changes}.items())
     path = tmp_path / "random.toml"
     path.write_text(text)
     tomllib.loads(text)
@@ -299,7 +254,7 @@ def test_invalid_value_is_reported_by_its_key(
     tables[table].pop(key) if is_removed else tables[table].update({key: value})
     top_level_keys = 'name = "fake"\nscenario = "tests.campaigns.fake_scenario:FakeScenario"\ncases = 12\n'
     lines = [
-        f"{name} = {_to_toml([entries] if name == 'requirements' else entries)}" for name, entries in tables.items()
+        f"{name} = {to_toml([entries] if name == 'requirements' else entries)}" for name, entries in tables.items()
     ]
     path = tmp_path / "invalid.toml"
     path.write_text(top_level_keys + "\n".join(lines))

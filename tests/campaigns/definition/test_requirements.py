@@ -6,17 +6,16 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.configuration import Requirement
 from marsyard.campaigns.definition.loading import find_campaign, load_campaign
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
 from marsyard.campaigns.errors import ConfigurationError
-from marsyard.cli.app import app
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.systems import catalogue
 from tests.campaigns.fake_campaign import write_campaign
+from tests.command import run_command
 
 #: Bounds in the units of the metrics (m/s, m, s); None: the metric is true or false.
 BOUNDS = {
@@ -30,10 +29,7 @@ BOUNDS = {
 def test_shipped_requirements_have_a_source() -> None:
     shipped = shipped_requirements()
     assert {requirement_id: requirement.bound for requirement_id, requirement in shipped.items()} == BOUNDS
-    assert all(
-        requirement.kind and requirement.source and requirement.statement and requirement.campaigns
-        for requirement in shipped.values()
-    )
+    assert all(entry.kind and entry.source and entry.statement and entry.campaigns for entry in shipped.values())
 
 
 def test_campaigns_of_requirements_exist() -> None:
@@ -117,16 +113,11 @@ def test_requirement_texts_do_not_contain_algorithm_names() -> None:
     algorithm_name = re.compile(r"\b(DIMES|VTT|HDA|NCC)\b(?! paper)")
     for name, path in catalogue().items():
         campaign = tomllib.loads(path.read_text(encoding="utf-8"))
-        texts = [
-            campaign["description"],
-            *(requirement.get("statement", "") for requirement in campaign.get("requirements", ())),
-        ]
+        statements = [requirement.get("statement", "") for requirement in campaign.get("requirements", ())]
+        texts = [campaign["description"], *statements]
         assert not [text for text in texts if algorithm_name.search(text)], name
-    assert not [
-        requirement.statement
-        for requirement in shipped_requirements().values()
-        if algorithm_name.search(requirement.statement)
-    ]
+    shipped = [requirement.statement for requirement in shipped_requirements().values()]
+    assert not [statement for statement in shipped if algorithm_name.search(statement)]
 
 
 #: A user's score function: its results are additional columns of a case.
@@ -174,9 +165,8 @@ def test_misspelt_columns_are_reported_before_terrain_is_built(
         load_campaign(str(path))
     assert f"requirements[0].{key}" in str(error.value)
     assert hint in str(error.value)
-    result = CliRunner().invoke(app, ["run", str(path), "-n", "1", "--jobs", "1", "--out", str(tmp_path / "run")])
-    assert result.exit_code == 2
-    assert hint in result.output
+    status, output = run_command("run", path, "-n", 1, "--jobs", 1, "--out", tmp_path / "run")
+    assert (status, hint in output) == (2, True)
     assert prepared_inputs == []
     assert not (tmp_path / "run").exists()
 

@@ -3,8 +3,6 @@
 The address `local:N` starts a cluster of N workers on this machine.
 """
 
-from __future__ import annotations
-
 import gc
 import os
 import signal
@@ -31,7 +29,6 @@ from marsyard.campaigns.store.table import read_rows
 from tests.campaigns.fake_campaign import TOP_LEVEL_KEYS, RecordingWatch, run
 
 pytestmark = [
-    pytest.mark.filterwarnings("ignore:Failed to kill subprocesses"),
     # warnings of Dask itself
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),

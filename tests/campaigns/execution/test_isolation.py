@@ -1,9 +1,4 @@
-"""Tests of the isolation of cases: processes, threads and changed process state do not affect the next case.
-
-A worker process runs a task once for each item; in campaigns the items are the case numbers.
-"""
-
-from __future__ import annotations
+"""Tests of the isolation of cases: processes, threads and changed process state do not affect the next case."""
 
 import ctypes
 import os
@@ -15,10 +10,8 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -26,36 +19,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.errors import CRASHED, TIMED_OUT, WorkerExitError
+from marsyard.campaigns.errors import CRASHED, TIMED_OUT
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.cases import make_unfinished_row
-from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits, request_fresh_worker
+from marsyard.campaigns.execution.worker_process import Work, WorkLimits, request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
-#: Maximum duration of runs that could wait forever, in seconds.
-MAX_DURATION_S = 60.0
+from tests.campaigns.execution.items import (
+    MAX_DURATION_S,
+    get_process_id,
+    has_ended,
+    list_results,
+    read_exit,
+    run_items,
+)
 
 #: State that remains in the worker process after an item, such as references to running processes.
 _worker_state: list[object] = []
-
-
-def run_items(
-    task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
-) -> dict[int, TaskResult[Any]]:
-    """Run items in one worker; return their results after the worker has ended."""
-    with LocalExecutor(1) as workers:
-        batches = workers.run(Work(task, items, limits or WorkLimits()))
-        return {result.item: result for result in chain.from_iterable(batches)}
-
-
-def has_ended(process: int) -> bool:
-    """Return whether no process has this id, or the process is a zombie (state Z)."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 def start_endless_tasks(kind: str, folder: str, item: int) -> int:
@@ -87,11 +66,6 @@ def start_endless_tasks(kind: str, folder: str, item: int) -> int:
     if processes:
         Path(folder, "processes").write_text(" ".join(map(str, processes)))
     time.sleep(0.01)
-    return os.getpid()
-
-
-def get_process_id(_: int) -> int:
-    time.sleep(0.1)
     return os.getpid()
 
 
@@ -130,16 +104,13 @@ def wait_for_child_in_new_session(folder: str, item: int) -> int:
     return item
 
 
-@pytest.mark.slow
 def test_time_limit_ends_child_in_separate_session(tmp_path: Path) -> None:
     start_s = time.monotonic()
     results = run_items(partial(wait_for_child_in_new_session, str(tmp_path)), range(4), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
-    error = results[1].error
-    assert isinstance(error, WorkerExitError)
-    assert error.outcome == TIMED_OUT
-    assert " in wait_for_child_in_new_session" in error.trace
-    assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
+    error = read_exit(results[1])
+    assert (error.outcome, " in wait_for_child_in_new_session" in error.trace) == (TIMED_OUT, True)
+    assert list_results(results) == {0: 0, 2: 2, 3: 3}
     assert has_ended(int((tmp_path / "processes").read_text()))
 
 
@@ -158,16 +129,13 @@ def test_signal_to_supervisor_ends_only_the_case(signal_number: int, tmp_path: P
     start_s = time.monotonic()
     results = run_items(partial(signal_supervisor, signal_number, str(tmp_path)), range(3), WorkLimits(time_s=2.0))
     assert time.monotonic() - start_s < MAX_DURATION_S
-    error = results[1].error
-    assert isinstance(error, WorkerExitError)
-    assert error.outcome == (CRASHED if signal_number == signal.SIGKILL else TIMED_OUT)
-    assert (results[0].result, results[2].result) == (0, 2)
+    assert read_exit(results[1]).outcome == (CRASHED if signal_number == signal.SIGKILL else TIMED_OUT)
+    assert list_results(results) == {0: 0, 2: 2}
     assert has_ended(int((tmp_path / "processes").read_text()))
 
 
 def overwrite_board(item: int) -> int:
     """Write the integer 1 into all fields of the status board (shared memory: item of the worker)."""
-    assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:] = struct.pack("=q", 1) * (len(board) // 8)
     time.sleep(3600)
@@ -189,8 +157,7 @@ def test_status_board_written_by_a_case_is_not_used_as_process_ids(monkeypatch: 
     with LocalExecutor(1) as workers:
         (batch,) = workers.run(Work(overwrite_board, [1], WorkLimits(time_s=3.0)))
         worker = workers._workers[0]
-        assert isinstance(batch[0].error, WorkerExitError)
-        assert batch[0].error.outcome == TIMED_OUT
+        assert read_exit(batch[0]).outcome == TIMED_OUT
     assert worker is not None
     assert signalled_processes
     assert min(signalled_processes) > 1  # the value on the board is not signalled
@@ -295,7 +262,7 @@ def crash_after_other_case(item: int) -> int:
 def test_crash_after_other_case_is_repeated_in_fresh_worker() -> None:
     _worker_state.clear()
     results = run_items(crash_after_other_case, range(5))
-    assert {item: result.result for item, result in results.items()} == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
+    assert list_results(results) == {0: 0, 1: 1, 2: 2, 3: -1, 4: 4}
     # crashed_only_after names the earlier case; case 3 crashes in a fresh worker too
     assert [results[item].crashed_only_after for item in range(5)] == [None, 0, 1, None, None]
     assert [results[item].crashed for item in range(5)] == [False, False, False, True, False]
@@ -311,7 +278,7 @@ def close_files(item: int) -> int:
 def test_case_that_closes_worker_files_is_the_only_crashed_case() -> None:
     results = run_items(close_files, range(4))
     assert str(results[1].error) == "the case closed or replaced the worker's file descriptors"
-    assert {item: result.result for item, result in results.items() if item != 1} == {0: 0, 2: 2, 3: 3}
+    assert list_results(results) == {0: 0, 2: 2, 3: 3}
 
 
 def share_memory(item: int) -> int:
@@ -332,8 +299,7 @@ def share_memory(item: int) -> int:
 def test_memory_shared_by_forked_children_is_counted_once() -> None:
     # five processes with 100 MB each would exceed 0.3 GB if shared pages counted five times
     results = run_items(share_memory, [0], WorkLimits(memory_bytes=0.3e9))
-    assert results[0].error is None
-    assert results[0].result == 1
+    assert list_results(results) == {0: 1}
 
 
 def test_long_error_texts_are_shortened_in_the_middle() -> None:

@@ -1,9 +1,4 @@
-"""Tests of time limits: the parent measures them, and a suspended process is no case that takes too long.
-
-A worker process runs a task once for each item; in campaigns the items are the case numbers.
-"""
-
-from __future__ import annotations
+"""Tests of time limits: the parent measures them, and a suspended process is no case that takes too long."""
 
 import os
 import signal
@@ -12,10 +7,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +21,7 @@ from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.monitoring import BatchClock
 from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import LocalExecutor
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
-
-def run_items(
-    task: Callable[[int], Any],
-    items: Iterable[int],
-    limit_s: float,
-    load: Callable[[], object] | None = None,
-    total: int | None = None,
-) -> dict[int, TaskResult[Any]]:
-    """Run items in one worker with a time limit; return their results after the worker has ended."""
-    with LocalExecutor(1) as workers:
-        batches = workers.run(Work(task, items, WorkLimits(limit_s), total, load))
-        return {result.item: result for result in chain.from_iterable(batches)}
+from tests.campaigns.execution.items import list_results, run_items
 
 
 def is_timed_out(result: TaskResult[Any]) -> bool:
@@ -93,14 +73,14 @@ def suspend_once(folder: Path, item: int, seconds: float) -> Iterator[None]:
 def test_suspended_worker_repeats_its_case(tmp_path: Path) -> None:
     """The worker is stopped for 3 s, longer than the limit of 1.5 s of a case that takes 0.5 s."""
     with suspend_once(tmp_path, 1, 3.0):
-        results = run_items(partial(sleep_after_start, str(tmp_path), 0.5), range(3), 1.5)
-    assert {item: result.result for item, result in results.items()} == {0: 0, 1: 1, 2: 2}
+        results = run_items(partial(sleep_after_start, str(tmp_path), 0.5), range(3), WorkLimits(1.5))
+    assert list_results(results) == {0: 0, 1: 1, 2: 2}
     first, second = read_starts(tmp_path, 1)
     assert first != second
 
 
 def test_case_that_is_too_slow_without_suspension_runs_once(tmp_path: Path) -> None:
-    results = run_items(partial(sleep_after_start, str(tmp_path), 3600.0), [1], 1.0)
+    results = run_items(partial(sleep_after_start, str(tmp_path), 3600.0), [1], WorkLimits(1.0))
     assert is_timed_out(results[1])
     assert len(read_starts(tmp_path, 1)) == 1
 
@@ -114,9 +94,9 @@ def stop_itself(folder: str, item: int) -> int:
 
 def test_case_that_stops_itself_is_timed_out(tmp_path: Path) -> None:
     start_s = time.monotonic()
-    results = run_items(partial(stop_itself, str(tmp_path)), range(3), 1.0, total=3)
+    results = run_items(partial(stop_itself, str(tmp_path)), range(3), WorkLimits(1.0), total=3)
     assert is_timed_out(results[1])
-    assert (results[0].result, results[2].result) == (0, 2)
+    assert list_results(results) == {0: 0, 2: 2}
     assert len(read_starts(tmp_path, 1)) == 2
     # two attempts of 1 s, and the starts of three workers
     assert time.monotonic() - start_s < 30.0
@@ -125,8 +105,8 @@ def test_case_that_stops_itself_is_timed_out(tmp_path: Path) -> None:
 PROGRAM = """
 import sys
 from functools import partial
-from tests.campaigns.execution.test_limits import run_items, sleep_after_start
-results = run_items(partial(sleep_after_start, sys.argv[1], 1.0), range(3), 2.0)
+from tests.campaigns.execution.test_limits import WorkLimits, run_items, sleep_after_start
+results = run_items(partial(sleep_after_start, sys.argv[1], 1.0), range(3), WorkLimits(2.0))
 print(*(f"{item}:{result.result}:{result.error}" for item, result in sorted(results.items())))
 """
 
@@ -149,7 +129,6 @@ def test_suspended_parent_ends_no_case(tmp_path: Path, with_workers: bool) -> No
 
 def write_board(item: int | None) -> None:
     """Write an item, and in a layout with a start time one far in the future, to the status board."""
-    assert worker_process._context is not None
     board = worker_process._context.board._bytes
     board[:8] = struct.pack("=q", -1 if item is None else item)
     board[8:] = struct.pack("=d", time.monotonic() + 1e6)[: len(board) - 8]
@@ -168,22 +147,21 @@ def claim_items(claims: tuple[int | None, ...], hostile_item: int, seconds: floa
 @pytest.mark.parametrize("claims", [(5,), (None,), (6,), (-7,), (5, None) * 10])
 def test_case_cannot_write_its_start_time(claims: tuple[int | None, ...]) -> None:
     """A case of 4 s exceeds its limit of 1 s, although it writes start times, other cases or none to the board."""
-    results = run_items(partial(claim_items, claims, 5, 4.0), [5], 1.0, total=1)
+    results = run_items(partial(claim_items, claims, 5, 4.0), [5], WorkLimits(1.0), total=1)
     assert is_timed_out(results[5])
 
 
 def test_case_cannot_use_the_time_of_later_cases() -> None:
     """A case of 3 s in a batch of short cases claims each later case in turn; its limit is 1 s."""
-    results = run_items(partial(claim_items, tuple(range(21, 31)), 20, 3.0), range(60), 1.0, total=60)
+    results = run_items(partial(claim_items, tuple(range(21, 31)), 20, 3.0), range(60), WorkLimits(1.0), total=60)
     assert is_timed_out(results[20])
-    assert {item for item, result in results.items() if result.result == item} == {*range(60)} - {20}
+    assert list_results(results) == {item: item for item in range(60) if item != 20}
 
 
 @pytest.mark.slow
 def test_several_short_cases_may_exceed_the_limit_of_one() -> None:
     """Cases of 0.01 s, then cases of 0.3 s: batches together exceed the limit of 1 s, but no case does."""
-    results = run_items(sleep_longer_later, range(30), 1.0)
-    assert [results[item].result for item in range(30)] == list(range(30))
+    assert list_results(run_items(sleep_longer_later, range(30), WorkLimits(1.0))) == {item: item for item in range(30)}
 
 
 def sleep_longer_later(item: int) -> int:
@@ -205,9 +183,9 @@ def test_time_of_the_caller_is_not_time_of_the_cases(tmp_path: Path) -> None:
 def test_loading_has_its_own_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Loading takes 2 s, longer than the limit of 1 s of a case. Then its limit is 4 s, longer than starting takes."""
     task, load = partial(sleep_after_start, str(tmp_path), 0.0), partial(time.sleep, 2.0)
-    assert [result.result for result in run_items(task, range(3), 1.0, load).values()] == [0, 1, 2]
+    assert list_results(run_items(task, range(3), WorkLimits(1.0), load)) == {0: 0, 1: 1, 2: 2}
     monkeypatch.setattr("marsyard.campaigns.execution.monitoring._LOADING_S", 4.0)
-    results = run_items(task, [7], 60.0, partial(time.sleep, 60.0))
+    results = run_items(task, [7], WorkLimits(60.0), partial(time.sleep, 60.0))
     assert is_timed_out(results[7])
     assert str(results[7].error) == "loading took longer than its limit of 4 s"
 
@@ -217,8 +195,8 @@ def fail_to_load() -> None:
 
 
 def test_each_case_runs_after_a_failed_loading(tmp_path: Path) -> None:
-    results = run_items(partial(sleep_after_start, str(tmp_path), 0.0), range(3), 60.0, fail_to_load)
-    assert [results[item].result for item in range(3)] == [0, 1, 2]
+    results = run_items(partial(sleep_after_start, str(tmp_path), 0.0), range(3), WorkLimits(60.0), fail_to_load)
+    assert list_results(results) == {0: 0, 1: 1, 2: 2}
 
 
 def test_present_item_of_a_batch_never_goes_back() -> None:

@@ -1,15 +1,12 @@
 """Tests of the local executor: limits, worker crashes, batches of items and memory accounting."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import mmap
 import os
 import re
-import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -19,22 +16,11 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.processes import used_memory
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError, WorkerExitError
+from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError
 from marsyard.campaigns.execution.batches import MAX_BATCH, Batches
-from marsyard.campaigns.execution.worker_process import StatusBoard, TaskResult, Work, WorkLimits, run_batch
+from marsyard.campaigns.execution.worker_process import StatusBoard, Work, WorkLimits, run_batch
 from marsyard.campaigns.execution.workers import LocalExecutor
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
-
-def run_items(
-    workers: LocalExecutor, task: Callable[[int], Any], items: Iterable[int], limits: WorkLimits | None = None
-) -> Iterator[TaskResult[Any]]:
-    return chain.from_iterable(workers.run(Work(task, items, limits or WorkLimits())))
-
-
-def get_process_id(_: int) -> int:
-    return os.getpid()
+from tests.campaigns.execution.items import get_process_id, list_results, read_exit, run_items, sleep_and_return
 
 
 def abort_once(marker: str, item: int) -> int:
@@ -53,40 +39,31 @@ def raise_or_exit(item: int) -> object:
     return lambda: item
 
 
-def sleep_and_return(seconds: float, item: int) -> int:
-    time.sleep(seconds)
-    return item
-
-
 @pytest.mark.slow
 def test_number_of_worker_processes_is_respected() -> None:
-    with LocalExecutor(1) as workers:
-        assert {result.result for result in run_items(workers, get_process_id, range(5))} != {os.getpid()}
-    with LocalExecutor(2) as workers:
-        assert len({result.result for result in run_items(workers, get_process_id, range(20))}) == 2
+    assert set(list_results(run_items(get_process_id, range(5))).values()) != {os.getpid()}
+    assert len(set(list_results(run_items(get_process_id, range(20), jobs=2)).values())) == 2
 
 
 def test_task_of_killed_worker_is_repeated(tmp_path: Path) -> None:
-    with LocalExecutor(2) as workers:
-        results = list(run_items(workers, partial(abort_once, str(tmp_path / "marker")), range(6)))
-    assert sorted(result.item for result in results if result.result == result.item) == list(range(6))
-    assert all(result.error is None for result in results)
+    results = run_items(partial(abort_once, str(tmp_path / "marker")), range(6), jobs=2)
+    assert list_results(results) == {item: item for item in range(6)}
 
 
 def test_errors_are_assigned_to_their_tasks() -> None:
     with LocalExecutor(2) as workers:
-        results = {result.item: result for result in run_items(workers, raise_or_exit, range(3))}
+        results = {result.item: result for batch in workers.run(Work(raise_or_exit, range(3))) for result in batch}
         assert isinstance(results[0].error, LookupError)
-        assert isinstance(results[1].error, WorkerExitError)
-        assert str(results[1].error) == "the worker process died: EXIT (3)"
+        assert str(read_exit(results[1])) == "the worker process died: EXIT (3)"
         assert callable(results[2].result)
         # the executor still works
-        assert [result.result for result in run_items(workers, partial(sleep_and_return, 0.0), [7])] == [7]
+        (batch,) = workers.run(Work(partial(sleep_and_return, 0.0), [7]))
+        assert batch[0].result == 7
 
 
 def run_and_interrupt() -> None:
     with LocalExecutor(1) as workers:
-        for _ in run_items(workers, lambda item: sleep_and_return(60.0 * item, item), range(2)):
+        for _ in workers.run(Work(lambda item: sleep_and_return(60.0 * item, item), range(2))):
             raise KeyboardInterrupt
 
 
@@ -107,7 +84,8 @@ def test_items_are_read_only_as_workers_need_them() -> None:
             yield item
 
     with LocalExecutor(2) as workers:
-        for number, _ in enumerate(run_items(workers, partial(sleep_and_return, 0.0), items())):  # type: ignore[arg-type]
+        work = Work(partial(sleep_and_return, 0.0), items())  # type: ignore[arg-type]
+        for number, _ in enumerate(chain.from_iterable(workers.run(work))):
             if number == 10:
                 break
     # batches double: after 1, 2, 4 and 8, one of 16 and one of 32 may be running
@@ -135,34 +113,16 @@ def exceed_limit(folder: str, item: int) -> int:
 def test_only_tasks_that_exceed_a_limit_are_ended(tmp_path: Path) -> None:
     limits = WorkLimits(time_s=3.0, memory_bytes=0.2e9, output_bytes=1e5)
     # one worker runs the items in order; later batches contain several items
-    with LocalExecutor(1) as workers:
-        results = {
-            result.item: result
-            for result in run_items(
-                workers, partial(exceed_limit, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits
-            )
-        }
-    errors = {item: result.error for item, result in results.items() if result.error is not None}
-    assert all(isinstance(error, WorkerExitError) for error in errors.values())
-    assert {item: error.outcome for item, error in errors.items()} == {  # type: ignore[attr-defined]
-        1: TIMED_OUT,
-        2: OUT_OF_MEMORY,
-        3: TOO_MUCH_OUTPUT,
-        4: CRASHED,
-    }
-    assert [str(errors[item]) for item in (1, 2, 3, 4)] == [
-        "took longer than its limit of 3 s",
-        "used more memory than its limit of 0.2 GB",
-        "wrote more than its limit of 0.1 MB",
-        "the worker process died: SIGSEGV (-11)",
-    ]
+    results = run_items(partial(exceed_limit, str(tmp_path)), [0, 5, 6, 7, 1, 2, 3, 4, 8, 9], limits)
+    assert list_results(results) == {item: item for item in (0, 5, 6, 7, 8, 9)}
     # each error contains the trace of the line that was running
-    for error in errors.values():
-        assert isinstance(error, WorkerExitError)
-        assert " in exceed_limit" in error.trace
-    assert {item: result.result for item, result in results.items() if result.error is None} == {
-        n: n for n in (0, 5, 6, 7, 8, 9)
-    }
+    errors = [read_exit(results[item]) for item in (1, 2, 3, 4)]
+    assert [(error.outcome, str(error), " in exceed_limit" in error.trace) for error in errors] == [
+        (TIMED_OUT, "took longer than its limit of 3 s", True),
+        (OUT_OF_MEMORY, "used more memory than its limit of 0.2 GB", True),
+        (TOO_MUCH_OUTPUT, "wrote more than its limit of 0.1 MB", True),
+        (CRASHED, "the worker process died: SIGSEGV (-11)", True),
+    ]
     # a crash and missing memory may have another cause, so these tasks run twice; the time of a task in a batch of
     # several is measured in a second run
     starts = {item: len((tmp_path / str(item)).read_text()) for item in (1, 2, 3, 4)}
@@ -171,40 +131,16 @@ def test_only_tasks_that_exceed_a_limit_are_ended(tmp_path: Path) -> None:
 
 def leak_memory(item: int, arrays: list[object] = []) -> int:  # noqa: B006  (the list imitates a memory leak)
     arrays.append(np.ones(4_000_000))
-    return item
-
-
-@pytest.mark.slow
-def test_memory_leak_of_earlier_tasks_does_not_end_a_task() -> None:
-    # twelve tasks leak 32 MB each
-    limits = WorkLimits(memory_bytes=0.2e9)
-    with LocalExecutor(1) as workers:
-        results = list(run_items(workers, leak_memory_slowly, range(12), limits))
-    assert sorted(result.item for result in results if result.error is None) == list(range(12))
-
-
-def leak_memory_slowly(item: int) -> int:
-    leak_memory(item)
     # long enough for the watcher to measure the memory
     time.sleep(0.1)
     return item
 
 
-def start_endless_process(item: int) -> int:
-    subprocess.Popen(["sleep", "3600"])
-    time.sleep(3600)
-    return item
-
-
-def test_processes_started_by_a_task_end_with_the_task() -> None:
-    with LocalExecutor(1) as workers:
-        (result,) = run_items(workers, start_endless_process, [0], WorkLimits(time_s=1.0))
-        assert isinstance(result.error, WorkerExitError)
-        processes = subprocess.run(["ps", "-eo", "ppid,args"], capture_output=True, text=True, check=True).stdout
-    # process 1 becomes the parent of processes whose parent has ended
-    assert not [
-        line for line in processes.splitlines() if line.split()[1:] == ["sleep", "3600"] and line.split()[0] == "1"
-    ]
+@pytest.mark.slow
+def test_memory_leak_of_earlier_tasks_does_not_end_a_task() -> None:
+    """Twelve tasks leak 32 MB each; the limit is 200 MB."""
+    results = run_items(leak_memory, range(12), WorkLimits(memory_bytes=0.2e9))
+    assert list_results(results) == {item: item for item in range(12)}
 
 
 def exit_at_start(*_: object) -> None:
@@ -239,9 +175,8 @@ def test_campaign_survives_several_deaths_at_start(monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr(
             "marsyard.campaigns.execution.monitoring.run_batch", partial(exit_while_marked, str(tmp_path))
         )
-        results = list(run_items(workers, get_process_id, range(4)))
-    assert sorted(result.item for result in results) == [0, 1, 2, 3]
-    assert all(result.error is None for result in results)
+        results = {result.item: result for batch in workers.run(Work(get_process_id, range(4))) for result in batch}
+    assert sorted(list_results(results)) == [0, 1, 2, 3]
     # pauses of 0.5, 1 and 2 s
     assert time.monotonic() - start_s >= 3.5
 
@@ -302,6 +237,4 @@ def get_worker_number(_: int) -> str:
 
 
 def test_workers_are_numbered() -> None:
-    with LocalExecutor(2) as workers:
-        numbers = {result.result for result in run_items(workers, get_worker_number, range(4))}
-    assert numbers == {"0", "1"}
+    assert set(list_results(run_items(get_worker_number, range(4), jobs=2)).values()) == {"0", "1"}

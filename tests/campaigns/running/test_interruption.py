@@ -17,9 +17,8 @@ from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import refresh_table
+from tests.campaigns.execution.items import has_ended
 from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 
 
 def _start_campaign(path: Path, directory: Path, **environment: str) -> subprocess.Popen[bytes]:
@@ -45,14 +44,6 @@ def _find_workers(process: subprocess.Popen[bytes]) -> list[int]:
     return [int(child) for child in children if "loky_posix" in Path(f"/proc/{child}/cmdline").read_text()]
 
 
-def _has_ended(pid: int) -> bool:
-    """Return whether no process has this id, or the process is a zombie (state Z)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-    except OSError:
-        return True
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_path: Path, signal_number: int) -> None:
@@ -69,7 +60,7 @@ def test_interrupted_campaign_keeps_its_rows(campaign_file: CampaignFile, tmp_pa
     assert 0 < stored_record["cases_finished"] == len(read_case_rows(tmp_path / "run")) < 500
     assert (tmp_path / "run" / "cases.sqlite").exists()
     assert len(workers) == 2
-    assert all(map(_has_ended, workers))
+    assert all(map(has_ended, workers))
 
 
 @pytest.mark.slow
@@ -79,10 +70,10 @@ def test_workers_end_when_their_parent_is_killed(campaign_file: CampaignFile, tm
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     deadline = time.monotonic() + 10.0
-    while not all(map(_has_ended, workers)) and time.monotonic() < deadline:
+    while not all(map(has_ended, workers)) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert len(workers) == 2
-    assert all(map(_has_ended, workers))
+    assert all(map(has_ended, workers))
 
 
 def _find_marked_processes(mark: str) -> list[int]:
@@ -90,7 +81,7 @@ def _find_marked_processes(mark: str) -> list[int]:
     processes = []
     for process in Path("/proc").glob("[1-9]*"):
         with suppress(OSError):
-            if mark.encode() in (process / "environ").read_bytes() and not _has_ended(int(process.name)):
+            if mark.encode() in (process / "environ").read_bytes() and not has_ended(int(process.name)):
                 processes.append(int(process.name))
     return processes
 
@@ -148,7 +139,6 @@ with stop_on_signals():
         stderr=subprocess.PIPE,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    assert process.stdout is not None
     for word in (b"ready", b"stopping"):
         assert process.stdout.readline().strip() == word
         process.send_signal(signal.SIGINT)

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
@@ -18,10 +17,8 @@ from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.running.shards import Shard, merge_shards
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
-from marsyard.cli.app import app
 from tests.campaigns.fake_campaign import FAILING_CASES, CampaignFile, RecordingWatch, read_case_rows, write_campaign
-
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
+from tests.command import run_command
 
 
 def _run_shards(path: Path, folder: Path, count: int, overrides: Sequence[str] = ()) -> list[Path]:
@@ -169,12 +166,9 @@ def test_invalid_shards_are_reported(text: str) -> None:
 
 def test_commands_merge_shards(campaign_file: CampaignFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    path, runner = str(campaign_file("unanswered_cases = [2]")), CliRunner()
-    result = runner.invoke(app, ["run", path, "--shard", "1/1", "--jobs", "1", "--out", "a"])
-    assert result.exit_code == 0, result.output
-    assert "marsyard merge" in result.output
-    result = runner.invoke(app, ["merge", "a", "--out", "all", "--jobs", "1"])
-    assert result.exit_code in (1, 3), result.output
+    path = campaign_file("unanswered_cases = [2]")
+    status, output = run_command("run", path, "--shard", "1/1", "--jobs", 1, "--out", "a")
+    assert (status, "marsyard merge" in output) == (0, True), output
+    assert run_command("merge", "a", "--out", "all", "--jobs", 1)[0] in (1, 3)
     assert (tmp_path / "all" / "report.html").is_file()
-    result = runner.invoke(app, ["run", path, "--shard", "1/2", "--confirm", "--out", "b"])
-    assert result.exit_code == 2
+    assert run_command("run", path, "--shard", "1/2", "--confirm", "--out", "b")[0] == 2

@@ -73,10 +73,7 @@ def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile
     for row in range(3):
         for column in range(row):
             rank = ranks[row][column]
-            assert abs(estimated[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases), (
-                row,
-                column,
-            )
+            assert abs(estimated[row, column] - rank) < MAX_STANDARD_ERRORS * rank_standard_error(rank, cases)
     # the parameter outside the group is uncorrelated
     assert np.abs(estimated[3, :3]).max() < MAX_STANDARD_ERRORS / np.sqrt(cases - 1)
 

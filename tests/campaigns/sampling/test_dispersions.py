@@ -160,12 +160,8 @@ def test_formulas_use_draws_and_parameters(campaign_file: CampaignFile) -> None:
     # formulas use the values of overrides
     # with terrain 2, the mean altitude is 1500 + 100 * 2
     campaign_with_fixed_terrain = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
-    assert (
-        campaign_with_fixed_terrain.configuration.dispersions["altitude_m"]
-        .insert_values({"terrain": 2})
-        .describe()
-        .startswith("normal(mean=1700")
-    )
+    altitude = campaign_with_fixed_terrain.configuration.dispersions["altitude_m"].insert_values({"terrain": 2})
+    assert altitude.describe().startswith("normal(mean=1700")
 
 
 def test_truncation_in_the_far_tail_is_accurate() -> None:
@@ -192,24 +188,6 @@ def test_draws_stay_within_their_bounds(probability: float) -> None:
     assert make_dispersion(distribution="integer", low=0, high=6).quantile(probability) in range(7)
     assert make_dispersion(distribution="choice", values=[1, 2]).quantile(probability) in (1, 2)
     assert np.isfinite(make_dispersion(distribution="norm").quantile(probability))
-
-
-def test_draws_of_a_case_do_not_depend_on_other_cases(campaign_file: CampaignFile) -> None:
-    campaign = load_campaign(str(campaign_file()))
-    draws = [campaign.draws(case) for case in range(5)]
-    assert [load_campaign(str(campaign_file())).draws(case) for case in reversed(range(5))] == draws[::-1]
-    assert load_campaign(str(campaign_file()), cases=1000).draws(3) == draws[3]
-    assert load_campaign(str(campaign_file()), seed=6).draws(3) != draws[3]
-    assert len({str(draw) for draw in draws}) == 5
-
-
-def test_added_dispersion_does_not_change_other_draws(campaign_file: CampaignFile) -> None:
-    path = str(campaign_file())
-    draws_before = load_campaign(path).draws(4)
-    overrides = ['dispersions."wind.north_m_s"={distribution="normal", mean=0, sd=3}']
-    draws_after = load_campaign(path, overrides).draws(4)
-    assert draws_after.pop("wind.north_m_s") != 0.0
-    assert draws_after == draws_before
 
 
 def test_draws_set_the_parameters(campaign_file: CampaignFile) -> None:

@@ -16,8 +16,6 @@ from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import find_showcase, find_worst_cases, write_table
 from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run
 
-pytestmark = pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
-
 
 def test_showcase_is_the_worst_answered_case(failing_campaign: Path) -> None:
     rows = read_case_rows(failing_campaign)

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,15 +11,15 @@ from scipy.stats import norm
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, ConfigurationError
 from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.decision import Basis, RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
 from marsyard.reports.evaluation import evaluate_run
-from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read_case_rows
+from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.limit_state import CAMPAIGN
+from tests.command import run_command
 
 #: With a confidence of 0.99, the intervals of the fixed seeds contain the true probability norm.sf(3) = 0.00135.
 SETTINGS = RareSettings("LOAD", 5e-2, samples=100, replicates=(4,), random_cases=(50,), confidence=0.99)
@@ -37,6 +35,12 @@ def run_study(
 ) -> RareResult:
     campaign = load_campaign(str(path), overrides)
     return start_rare(campaign, settings, max_cases, directory, ExecutorConfig(1), RecordingWatch())
+
+
+@pytest.fixture
+def finished_study(campaign_path: Path, tmp_path: Path) -> Path:
+    assert run_study(campaign_path, tmp_path / "run").exit_code == 0
+    return tmp_path / "run"
 
 
 def rows_without_times(directory: Path) -> list[dict[str, object]]:
@@ -80,7 +84,6 @@ def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: 
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
     sizes = ["--samples", "50", "--replicates", "2", "--set", "sleep_s=0.03"]
@@ -141,21 +144,21 @@ def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaig
 
 
 @pytest.mark.slow
-def test_campaign_commands_reject_a_study(campaign_path: Path, tmp_path: Path) -> None:
-    run_study(campaign_path, tmp_path / "run")
-    with pytest.raises(CampaignError, match="contains a study"):
-        resume_campaign(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
-    with pytest.raises(CampaignError, match="contains a study"):
-        append_cases(tmp_path / "run", 10, ExecutorConfig(1), RecordingWatch())
-
-
-@pytest.mark.slow
-def test_changed_program_is_rejected(campaign_path: Path, tmp_path: Path) -> None:
-    run_study(campaign_path, tmp_path / "run")
-    stored_record = record.read(tmp_path / "run")
-    record.update(tmp_path / "run", {"identity": {**stored_record["identity"], "code": "other"}})
+def test_finished_study_is_protected(finished_study: Path) -> None:
+    """Commands of campaigns, another program, and results without a counting bound, which an earlier version wrote."""
+    executor, watch = ExecutorConfig(1), RecordingWatch()
+    for command in continuing_commands(finished_study, watch):
+        with pytest.raises(CampaignError, match="contains a study"):
+            command()
+    stored = record.read(finished_study)
+    record.update(finished_study, {"identity": {**stored["identity"], "code": "other"}})
     with pytest.raises(CampaignError, match="another program"):
-        continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+        continue_rare(finished_study, executor, watch)
+    record.update(finished_study, {"identity": stored["identity"]})
+    assert evaluate_run(finished_study).exit_code == 0
+    result = {name: value for name, value in stored["study"]["result"].items() if name != "decision"}
+    record.update(finished_study, {"study": {**stored["study"], "result": result}})
+    assert evaluate_run(finished_study).exit_code == 3
 
 
 @pytest.mark.parametrize(
@@ -194,11 +197,10 @@ def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
 @pytest.mark.slow
 def test_report_shows_the_verdict_of_the_study(campaign_path: Path, tmp_path: Path) -> None:
     options = ["--requirement", "LOAD", "--max-probability", "1e-2", "--samples", "100", "--jobs", "1"]
-    command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), *options, "--out", str(tmp_path / "run")]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr
-    assert "LOAD: PASS, by counting independent cases." in result.stdout
-    assert "independent random cases" in result.stdout
+    status, output = run_command("rare", campaign_path, *options, "--out", tmp_path / "run")
+    assert status == 0, output
+    assert "LOAD: PASS, by counting independent cases." in output
+    assert "independent random cases" in output
     data = json.loads((tmp_path / "run" / "report.json").read_text())
     assert (data["verdict"], data["exit_code"], data["verdicts"]) == ("PASS", 0, [])
     assert data["sections"]["rare"]["decision"]["interval"]["lower"] < norm.sf(3.0)
@@ -251,37 +253,18 @@ def test_cases_on_one_terrain_are_not_counted_as_independent(campaign_path: Path
 def test_printed_number_of_random_cases_decides(campaign_path: Path, tmp_path: Path) -> None:
     directory = tmp_path / "run"
     options = ["--max-probability", "1e-2", "--samples", "50", "--replicates", "2", "--random-cases", "50"]
-    command = [sys.executable, "-m", "marsyard", "rare", str(campaign_path), "--requirement", "LOAD", *options]
-    command += ["--set", "beta=5", "--jobs", "1", "--max-cases", "1500", "--out", str(directory)]
-    first = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert first.returncode == 3, first.stderr
+    options += ["--set", "beta=5", "--jobs", "1", "--max-cases", "1500"]
+    status, output = run_command("rare", campaign_path, "--requirement", "LOAD", *options, "--out", directory)
+    assert status == 3, output
     # the second evaluation has a risk of 2.5 %: 367.0 = ln(0.025) / ln(0.99) cases, of which 150 are finished
-    advice = re.search(r"marsyard append DIR (\d+) --random", first.stdout)
+    advice = re.search(r"marsyard append DIR (\d+) --random", output)
     assert advice is not None
     assert int(advice[1]) == 368 - 150
-    arguments = [sys.executable, "-m", "marsyard", "append", str(directory), advice[1], "--random", "--jobs", "1"]
-    second = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert second.returncode == 0, second.stderr
-    assert "from 0 violations in 368 independent random cases" in second.stdout
+    status, output = run_command("append", directory, advice[1], "--random", "--jobs", 1)
+    assert status == 0, output
+    assert "from 0 violations in 368 independent random cases" in output
 
 
-@pytest.mark.slow
-def test_verdict_of_an_earlier_version_is_not_kept(campaign_path: Path, tmp_path: Path) -> None:
-    """Results without a counting bound assumed a continuous margin."""
-    assert run_study(campaign_path, tmp_path / "run").exit_code == 0
-    assert evaluate_run(tmp_path / "run").exit_code == 0
-    study = record.read(tmp_path / "run")["study"]
-    result = {name: value for name, value in study["result"].items() if name != "decision"}
-    record.update(tmp_path / "run", {"study": {**study, "result": result}})
-    assert evaluate_run(tmp_path / "run").exit_code == 3
-
-
-@pytest.mark.slow
-def test_random_cases_are_rejected_for_a_campaign(campaign_path: Path, tmp_path: Path) -> None:
-    directory = str(tmp_path / "run")
-    run = ["marsyard", "run", str(campaign_path), "--cases", "5", "--jobs", "1", "--out", directory]
-    subprocess.run([sys.executable, "-m", *run], capture_output=True, check=False)
-    command = [sys.executable, "-m", "marsyard", "append", directory, "10", "--random"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 2
-    assert "--random is for studies" in " ".join(result.stderr.split())
+def test_random_cases_are_rejected_for_a_campaign(failing_campaign: Path) -> None:
+    status, output = run_command("append", failing_campaign, 10, "--random")
+    assert (status, "--random is for studies" in " ".join(output.split())) == (2, True)

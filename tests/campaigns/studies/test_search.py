@@ -1,8 +1,6 @@
 """Tests of the search for violations: a planted defect is found and reduced; continuation, files, report and errors."""
 
 import json
-import subprocess
-import sys
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +21,7 @@ from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture
 from tests.campaigns.studies import limit_state
 from tests.campaigns.studies.killing import kill_and_resume
 from tests.campaigns.studies.planted_defect import CAMPAIGN
+from tests.command import run_command
 
 campaign_path = campaign_fixture(CAMPAIGN)
 
@@ -95,7 +94,6 @@ def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> 
     assert result.cases <= 200
 
 
-@pytest.mark.filterwarnings("ignore:Failed to kill subprocesses")
 @pytest.mark.slow
 def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_path: Path) -> None:
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
@@ -107,11 +105,7 @@ def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     # the campaign file of the reduced violation violates the requirement in each of its cases
     (plan,) = tomllib.loads((killed_run / "failures" / "nightly.toml").read_text())["campaigns"][:1]
     file = killed_run / "failures" / plan["campaign"]
-    run_options = ["--out", str(tmp_path / "regression"), "--jobs", "1"]
-    run_result = subprocess.run(
-        [sys.executable, "-m", "marsyard", "run", str(file), *run_options], capture_output=True, text=True, check=False
-    )
-    assert run_result.returncode == 1, run_result.stderr
+    assert run_command("run", file, "--out", tmp_path / "regression", "--jobs", 1)[0] == 1
     data = json.loads((killed_run / "report.json").read_text())
     assert data["verdict"] == "FAIL"
     assert data["sections"]["search"]["failures"][0]["values"].keys() == {"sun_deg", "yaw_deg"}
@@ -127,16 +121,9 @@ def test_invalid_settings_are_reported(settings: dict[str, int], message: str) -
         SearchSettings("VELOCITY", **settings)
 
 
-def test_search_is_not_a_study_of_rare_violations(campaign_path: Path, tmp_path: Path) -> None:
+def test_search_has_no_replicates_and_no_rates(campaign_path: Path, tmp_path: Path) -> None:
     run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
     with pytest.raises(CampaignError, match="does not contain a study of rare violations"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
-
-
-@pytest.mark.slow
-def test_rates_of_studies_cannot_be_compared(campaign_path: Path, tmp_path: Path) -> None:
-    run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
-    command = [sys.executable, "-m", "marsyard", "compare", str(tmp_path / "run"), str(tmp_path / "run")]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode == 2
-    assert "contains a study" in result.stderr
+    status, output = run_command("compare", tmp_path / "run", tmp_path / "run")
+    assert (status, "contains a study" in output) == (2, True)

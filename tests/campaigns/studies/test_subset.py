@@ -109,7 +109,6 @@ def test_importance_sampling_is_unbiased_and_precise(dimension: int) -> None:
     margins = linear_margin(dimension, 1e-4)
     violations = np.concatenate([run_seeded(margins, dimension, 200, rng)[0].violations for _ in range(4)])
     density = fit_density(violations)
-    assert density is not None
     coordinates, weights = density.draw(4000, rng)
     # a tenth of the cases is drawn from the nominal density, which limits the weights to 10
     assert weights.max() <= 10.0
@@ -123,7 +122,6 @@ def test_separate_failure_regions_have_separate_densities() -> None:
     coordinates = rng.standard_normal((200_000, 2))
     violations = coordinates[np.abs(coordinates[:, 0]) > 3.0]
     density = fit_density(violations)
-    assert density is not None
     assert sorted(np.sign(density.centres[:, 0])) == [-1.0, 1.0]
 
 

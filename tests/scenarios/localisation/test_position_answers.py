@@ -162,7 +162,7 @@ def test_table_answers_every_image(tmp_path: Path) -> None:
         for name in ("position_m", "velocity_m_s", "covariance"):
             np.testing.assert_array_equal(getattr(answer, name), getattr(estimate, name), err_msg=name)
     assert isinstance(answers.estimates[1].world_from_body, Rotation)
-    assert (answers.estimates[1].world_from_body * expected[1].world_from_body.inv()).magnitude() < 1e-12  # type: ignore[union-attr]
+    assert (answers.estimates[1].world_from_body * expected[1].world_from_body.inv()).magnitude() < 1e-12
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,13 @@
 """Labels with a camera model in a given frame, in the formats of PDS3 and PDS4, for tests."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.sim.camera import CameraModel
+from marsyard.sim.camera import CameraFileError, CameraModel, read_cameras
 
 #: Pose of Opportunity in its site frame, from the label of 1F483288473EFFCMUFP1214L0M1.
 SITE_FROM_ROVER = RigidTransform.from_components(
@@ -82,9 +84,8 @@ def pds3_label(
     rover = ""
     if rover_reference is not None:
         quaternion = rover_pose.rotation.as_quat()[[3, 0, 1, 2]].tolist()
-        rover = _ROVER.format(
-            offset=_list(rover_pose.translation.tolist()), quaternion=_list(quaternion), reference=rover_reference
-        )
+        offset = _list(rover_pose.translation.tolist())
+        rover = _ROVER.format(offset=offset, quaternion=_list(quaternion), reference=rover_reference)
     index = 194 if frame.startswith("SITE") else "(194,835,1,0,0)"
     columns, rows = camera.size
     text = _PDS3.format(**locals())
@@ -161,3 +162,15 @@ def _frame_element(frame: str) -> str:
         f"<geom:coordinate_space_frame_type>{frame}</geom:coordinate_space_frame_type>{index}"
         "</geom:Coordinate_Space_Indexed>"
     )
+
+
+def assert_fault(
+    path: Path, text: str, change: tuple[str, str], fault: str, read: Callable[[Path], object] = read_cameras
+) -> None:
+    """Assert that a file with a changed text is rejected with a message that names the file and what is allowed."""
+    assert change[0] in text
+    path.write_bytes(text.replace(*change).encode("latin-1"))
+    with pytest.raises(CameraFileError, match=fault) as error_info:
+        read(path)
+    assert path.name in str(error_info.value)
+    assert "allowed" in str(error_info.value)

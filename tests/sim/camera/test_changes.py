@@ -288,9 +288,8 @@ def test_derived_quantities_match_the_formulas_of_cmod(navcam: Cahvor) -> None:
     assert hc == pytest.approx(navcam.a @ navcam.h, rel=3e-6)
     assert vc == pytest.approx(navcam.a @ navcam.v, rel=3e-6)
     a_cross_v, a_cross_h = np.cross(navcam.a, navcam.v), np.cross(navcam.a, navcam.h)
-    assert navcam.theta == pytest.approx(
-        math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, a_cross_v @ a_cross_h), abs=1e-8
-    )
+    theta = math.atan2(np.cross(navcam.v, navcam.h) @ navcam.a, a_cross_v @ a_cross_h)
+    assert navcam.theta == pytest.approx(theta, abs=1e-8)
     assert np.allclose(hs * navcam.right + hc * navcam.a, navcam.h, atol=1e-2)
     half_angles = np.arccos(navcam.corner_rays()[1] @ navcam.boresight())
     assert np.degrees(2 * half_angles.max()) == pytest.approx(61.4, abs=0.1)  # diagonal of 45 x 45 degrees

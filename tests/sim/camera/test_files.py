@@ -24,6 +24,7 @@ from marsyard.sim.camera import (
     write_cahvor,
 )
 from marsyard.sim.sensor import CustomCamera, CustomCameraChoice
+from tests.sim.camera.labels import assert_fault
 
 #: A label in the format of Opportunity's products, with the model of the front hazcam.
 LABEL = """PDS_VERSION_ID                    = PDS3
@@ -126,12 +127,8 @@ def test_cahvore_types_set_linearity(tmp_path: Path, cahvore_type: str, linearit
 
 
 def test_components_are_assigned_by_letter(tmp_path: Path, hazcam: Cahvore) -> None:
-    text = (
-        LABEL.replace("(C,A,H,V,O,R,E,T,P)", "(C,A,V,H,O,R,E,T,P)")
-        .replace("_3 ", "_X ")
-        .replace("_4 ", "_3 ")
-        .replace("_X ", "_4 ")
-    )
+    text = LABEL.replace("(C,A,H,V,O,R,E,T,P)", "(C,A,V,H,O,R,E,T,P)")
+    text = text.replace("_3 ", "_X ").replace("_4 ", "_3 ").replace("_X ", "_4 ")
     assert read_camera(write_file(tmp_path, text)) == dataclasses.replace(hazcam, size=(1020, 1024))
 
 
@@ -216,22 +213,13 @@ LABEL_FAULTS = [
     ("LINE_SAMPLES                    = 1020", "LINE_SAMPLES = -4", "IMAGE.LINE_SAMPLES: -4"),
     ("= IMAGE\n", "= PICTURE\n", "IMAGE: missing"),
     ("\nEND\n", "\n", "END: missing"),
-    (
-        "END_GROUP                         = GEOMETRIC_CAMERA_MODEL\n",
-        "",
-        "GEOMETRIC_CAMERA_MODEL: missing or not closed",
-    ),
+    ("END_GROUP                         = GEOMETRIC_CAMERA_MODEL\n", "", "GEOMETRIC_CAMERA_MODEL: .* or not closed"),
 ]
 
 
 @pytest.mark.parametrize(("old", "new", "fault"), LABEL_FAULTS, ids=[f"{new!r}" for _, new, _ in LABEL_FAULTS])
 def test_label_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
-    assert old in LABEL
-    path = write_file(tmp_path, LABEL.replace(old, new), "faulty.IMG")
-    with pytest.raises(CameraFileError, match=fault) as error_info:
-        read_camera(path)
-    assert "faulty.IMG" in str(error_info.value)
-    assert "allowed" in str(error_info.value)
+    assert_fault(tmp_path / "faulty.IMG", LABEL, (old, new), fault, read_camera)
 
 
 # ----- JPL text files -----
@@ -248,9 +236,8 @@ def test_cmod_text_file_is_read(tmp_path: Path, navcam: Cahvor) -> None:
 @pytest.mark.parametrize("ending", ["\n", "\r\n"])
 def test_spacing_and_line_endings_may_differ(tmp_path: Path, ending: str) -> None:
     text = CMOD_TEXT.replace("C =", "  C  =").replace("Dimensions = 1024 1024", "Dimensions=1024\t1024 # columns, rows")
-    assert read_camera(write_file(tmp_path, text.replace("\n", ending))) == read_cahvor(
-        write_file(tmp_path, CMOD_TEXT, "plain")
-    )
+    expected = read_cahvor(write_file(tmp_path, CMOD_TEXT, "plain"))
+    assert read_camera(write_file(tmp_path, text.replace("\n", ending))) == expected
 
 
 @pytest.mark.parametrize(
@@ -324,12 +311,7 @@ CMOD_TEXT_FAULTS = [
 
 @pytest.mark.parametrize(("old", "new", "fault"), CMOD_TEXT_FAULTS, ids=[f"{new!r}" for _, new, _ in CMOD_TEXT_FAULTS])
 def test_text_errors_name_field_and_allowed_values(tmp_path: Path, old: str, new: str, fault: str) -> None:
-    assert old in CMOD_TEXT
-    path = write_file(tmp_path, CMOD_TEXT.replace(old, new, 1), "faulty.cahvor")
-    with pytest.raises(CameraFileError, match=fault) as error_info:
-        read_camera(path)
-    assert "faulty.cahvor" in str(error_info.value)
-    assert "allowed" in str(error_info.value)
+    assert_fault(tmp_path / "faulty.cahvor", CMOD_TEXT, (old, new), fault, read_camera)
 
 
 def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.dynamics.helicopter import HelicopterFlight, HelicopterParameters, draw_helicopter_flight
+from tests.sim.sensor.motions import assert_derivatives
 
 #: Ground point under the middle of the flight line, world axes, m.
 ORIGIN = np.array([100.0, -200.0, 35.0])
@@ -17,20 +18,15 @@ def make_flight(**changes: object) -> HelicopterFlight:
     return draw_helicopter_flight(parameters, ORIGIN, np.radians(70.0), 9.8, np.random.default_rng(7))
 
 
+def draw_default_flight(seed: int) -> HelicopterFlight:
+    return draw_helicopter_flight(HelicopterParameters(), ORIGIN, 0.3, 9.8, np.random.default_rng(seed))
+
+
 @pytest.mark.parametrize("turns_with_flight", [False, True])
 def test_velocity_rate_and_force_are_derivatives(turns_with_flight: bool) -> None:
     """The truncation error of central differences over 0.4 ms is below 1e-6 m/s for the vibration of 13 Hz."""
-    flight, step = make_flight(turns_with_flight=turns_with_flight), 2e-4
-    times = np.linspace(-40.0, 2540.0, 400)
-    before, motion, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
-    velocity = (after.positions_m - before.positions_m) / (2.0 * step)
-    np.testing.assert_allclose(motion.velocities_m_s, velocity, atol=1e-5)
-    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step)
-    specific_force = motion.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, 9.8]))
-    np.testing.assert_allclose(motion.specific_forces_m_s2, specific_force, atol=1e-4)
-    rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
-    # The body axes rotate by up to half a step during the central difference.
-    np.testing.assert_allclose(motion.body_rates_rad_s, rate, atol=2e-5)
+    flight = make_flight(turns_with_flight=turns_with_flight)
+    assert_derivatives(flight.motion, np.linspace(-40.0, 2540.0, 400), 2e-4, 9.8, velocity=1e-5, force=1e-4, rate=2e-5)
 
 
 def test_heights_speed_and_tilt_match_the_paper() -> None:
@@ -58,15 +54,7 @@ def test_rates_of_climb_are_uniform() -> None:
     The maximum height does not select the rates of the first five passes: they climb by at most 5 x 70 s x 2 m/s, or
     700 m.
     """
-    rates = np.array(
-        [
-            flight_pass.climb_m_s
-            for seed in range(80)
-            for flight_pass in draw_helicopter_flight(
-                HelicopterParameters(), ORIGIN, 0.3, 9.8, np.random.default_rng(seed)
-            ).passes[:5]
-        ]
-    )
+    rates = np.array([leg.climb_m_s for seed in range(80) for leg in draw_default_flight(seed).passes[:5]])
     assert rates.min() >= 1.0
     assert rates.max() <= 2.0
     assert rates.mean() == pytest.approx(1.5, abs=4.0 * np.sqrt(1.0 / 12.0 / 400))
@@ -77,8 +65,7 @@ def test_rates_of_climb_are_uniform() -> None:
 def test_run_ends_at_the_maximum_height() -> None:
     """Paper, III.C and III.D.4: from 1000 m to 2000 m, images for about 30 min, about 40 min between the targets."""
     for seed in range(20):
-        flight = draw_helicopter_flight(HelicopterParameters(), ORIGIN, 0.3, 9.8, np.random.default_rng(seed))
-        passes = flight.passes
+        passes = draw_default_flight(seed).passes
         assert passes[0].start_m == 1000.0
         for before, after in pairwise(passes):
             assert before.end_s - before.start_s == pytest.approx(70.0)
@@ -129,16 +116,16 @@ def test_targets_are_overflown_about_40_minutes_apart() -> None:
 
 
 def test_inconsistent_parameters_are_rejected() -> None:
-    with pytest.raises(ValueError, match=r"max_climb_m_s is 0\.5; allowed: at least min_climb_m_s, 1\.0"):
-        HelicopterParameters(max_climb_m_s=0.5)
-    with pytest.raises(ValueError, match=r"highest_m is 900\.0; allowed: more than lowest_m, 1000\.0"):
-        HelicopterParameters(highest_m=900.0)
-    # 1000 s of passes at 1 m/s, and 14 turns of 20 s between 15 passes of at most 70 s
-    with pytest.raises(ValueError, match=r"collection_s is 1279\.0; allowed: at least 1280,"):
-        HelicopterParameters(collection_s=1279.0)
+    for change, message in (
+        ({"max_climb_m_s": 0.5}, r"max_climb_m_s is 0\.5; allowed: at least min_climb_m_s, 1\.0"),
+        ({"highest_m": 900.0}, r"highest_m is 900\.0; allowed: more than lowest_m, 1000\.0"),
+        # 1000 s of passes at 1 m/s, and 14 turns of 20 s between 15 passes of at most 70 s
+        ({"collection_s": 1279.0}, r"collection_s is 1279\.0; allowed: at least 1280,"),
+        # 90 + 300 + 2040 + 70 = 2500 s
+        ({"collection_s": 2040.0}, r"2500\.0 s, do not fit into the 2500\.0 s between"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make_flight(**change)
     assert len(make_flight(collection_s=1280.0, min_climb_m_s=1.0, max_climb_m_s=1.0).passes) == 15
-    # 90 + 300 + 2040 + 70 = 2500 s
-    with pytest.raises(ValueError, match=r"2500\.0 s, do not fit into the 2500\.0 s between"):
-        HelicopterParameters(collection_s=2040.0)
     with pytest.raises(ValueError, match="outside of the motion"):
         make_flight().state(3000.0)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.dynamics.recorded import COLUMNS, RecordedMotion, TrajectoryFileError, read_poses
-from tests.sim.sensor.motions import GRAVITY, Swaying
+from tests.sim.sensor.motions import GRAVITY, Swaying, assert_derivatives
 
 #: The first two poses of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012), repeated after one second.
 TUM = """# ground truth trajectory
@@ -121,22 +121,9 @@ def test_rates_and_forces_are_spline_derivatives() -> None:
         * _make_swaying_motion().motion(knots_s).attitudes
     )
     positions = _make_swaying_motion().motion(knots_s).positions_m + 0.1 * rng.standard_normal((knots_s.size, 3))
-    motion, times_s, step_s = (
-        RecordedMotion(knots_s, positions, noisy_attitudes, GRAVITY),
-        np.linspace(0.5, 2.5, 57),
-        1e-5,
-    )
-    before, centre, after = motion.motion(times_s - step_s), motion.motion(times_s), motion.motion(times_s + step_s)
-    assert np.allclose((after.positions_m - before.positions_m) / (2 * step_s), centre.velocities_m_s, atol=1e-4)
-    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2 * step_s)
-    assert np.allclose(
-        centre.attitudes.apply(centre.specific_forces_m_s2),
-        acceleration + np.array([0.0, 0.0, GRAVITY]),
-        rtol=1e-4,
-        atol=1e-2,
-    )
-    body_rates = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2 * step_s)
-    assert np.allclose(body_rates, centre.body_rates_rad_s, atol=1e-4)
+    motion = RecordedMotion(knots_s, positions, noisy_attitudes, GRAVITY)
+    tolerances = {"velocity": 1e-4, "force": 1e-2, "rate": 1e-4, "force_rtol": 1e-4}
+    assert_derivatives(motion.motion, np.linspace(0.5, 2.5, 57), 1e-5, GRAVITY, **tolerances)
 
 
 def test_pandas_tables_are_read(tmp_path: Path) -> None:

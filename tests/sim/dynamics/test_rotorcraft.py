@@ -21,6 +21,7 @@ from marsyard.sim.dynamics.rotorcraft import (
     simulate_landing,
     simulate_transit,
 )
+from tests.sim.sensor.motions import assert_derivatives
 
 #: Gravity, m/s2; course and heading of the transit, rad.
 GRAVITY, COURSE, HEADING = 9.8, 0.3, 1.0
@@ -85,15 +86,8 @@ def test_velocity_rate_and_force_are_derivatives() -> None:
     assert isinstance(flight, Trajectory)
     first, last = flight.span_s
     times = np.random.default_rng(0).uniform(first + step, last - step, 2000)
-    before, motion, after = (flight.motion(times + shift) for shift in (-step, 0.0, step))
-    velocity = (after.positions_m - before.positions_m) / (2.0 * step)
-    np.testing.assert_allclose(motion.velocities_m_s, velocity, atol=1e-6)
-    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step)
-    specific_force = motion.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, GRAVITY]))
     # Third derivatives jump at the knots, by up to 100 m/s3 at the touchdown.
-    np.testing.assert_allclose(motion.specific_forces_m_s2, specific_force, atol=5e-3)
-    rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step)
-    np.testing.assert_allclose(motion.body_rates_rad_s, rate, atol=1e-5)
+    assert_derivatives(flight.motion, times, step, GRAVITY, velocity=1e-6, force=5e-3, rate=1e-5)
 
 
 def test_specific_force_is_rotor_thrust_plus_drag() -> None:

@@ -1,21 +1,20 @@
 """Tests of pixels with edges: subpixel rays, ray intersection, and images against 256 rays per pixel."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.motion import View, supersample
-from benchmarks.validation.raycast import cast_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.kernels.hierarchy import nearest_hit
-from marsyard.sim.render.kernels.structs import Ray
+from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.renderer import edge_pixels, supersample_rays
-from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
+from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from tests.sim.scenes import FORWARD, flat_ground, rocks_near
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
 #: Rays along each side of a pixel in the reference image.
@@ -23,14 +22,7 @@ RAYS_PER_SIDE = 16
 
 
 def _make_camera(size: tuple[int, int], focal_m: float = 16e-3) -> Cahv:
-    return Cahv.from_focal_length(
-        focal_m=focal_m,
-        pixel_pitch_m=12e-6,
-        size=size,
-        centre=np.zeros(3),
-        axis=np.array([1.0, 0.0, 0.0]),
-        right=np.array([0.0, -1.0, 0.0]),
-    )
+    return Cahv.from_focal_length(focal_m, 12e-6, size, **FORWARD)
 
 
 @pytest.fixture(scope="module")
@@ -43,19 +35,9 @@ def rocky_view() -> View:
     target = PlacedRock(name="target", east_m=10.0, north_m=10.0, diameter_m=1.0, shape=3, yaw_deg=20.0)
     field = RockField.draw(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
     eye = np.array([5.0, 10.0, float(surface.height(10.0, 10.0)) + 1.0])
-    mesh = field.near(eye[0], eye[1], 9.0, above_m=1.0)
-    rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.08)
-    scene = Scene(
-        surface,
-        (eye[0], eye[1]),
-        SUN,
-        Photometry(),
-        rocks,
-        mesh_finest_m=0.04,
-        mesh_half_width_m=3000.0,
-        mesh_lines=801,
-        among_objects=True,
-    )
+    rocks = rocks_near(field, eye[0], eye[1], 9.0, 1.0, albedo=0.08)
+    mesh: dict[str, Any] = {"mesh_finest_m": 0.04, "mesh_half_width_m": 3000.0, "mesh_lines": 801}
+    scene = Scene(surface, (eye[0], eye[1]), SUN, Photometry(), rocks, among_objects=True, **mesh)
     return View(scene, _make_camera((192, 160), 6e-3), rigid(Rotation.from_euler("y", 8.0, degrees=True), eye))
 
 
@@ -79,17 +61,6 @@ def test_subpixel_rays_are_evenly_distributed() -> None:
     for axis in range(2):
         steps = np.diff(np.sort(positions[..., axis], axis=1), axis=1)
         np.testing.assert_allclose(steps, 1.0 / 9.0, atol=2e-3)
-
-
-def test_nearest_triangle_equals_exhaustive_search(rocky_view: View) -> None:
-    objects, pose = rocky_view.scene.objects, rocky_view.world_from_body
-    rays = pose.rotation.apply(rocky_view.rays(rocky_view.camera).directions[::37].astype(np.float64))
-    starts = np.broadcast_to(pose.translation, rays.shape)
-    expected = cast_triangles(objects, starts, rays)
-    tree = objects.hierarchy(np.arange(len(objects.triangles)))
-    result = np.array([nearest_hit(tree, Ray(*pose.translation, *ray), np.inf).distance for ray in rays])
-    assert 0.05 < np.mean(np.isfinite(expected)) < 0.95
-    np.testing.assert_allclose(result, expected, rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -128,9 +99,7 @@ def test_plane_horizon_is_at_the_mesh_border(renderer: Renderer) -> None:
 
     The mesh ends 200 m away, 5 mrad or 3.3 pixels below the horizon.
     """
-    samples = np.zeros((64, 64, 2), dtype=np.float32)
-    samples[..., 1] = 0.2
-    surface = Surface.from_samples(samples, 0.5)
+    surface = flat_ground(64, 0.5)
     photometry = Photometry(lunar_fraction=0.0, surge_amplitude=0.0)
     scene = Scene(surface, (0.0, 0.0), SUN, photometry, mesh_finest_m=0.04, mesh_half_width_m=200.0, mesh_lines=801)
     camera = _make_camera((128, 64), 8e-3)

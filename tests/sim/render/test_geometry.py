@@ -1,7 +1,5 @@
 """Tests of the geometry of rendered images against analytic truth and an independent ray cast."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
@@ -18,6 +16,7 @@ from marsyard.sim.render.kernels.structs import GroundLevel, Ray
 from marsyard.sim.render.renderer import NO_CEILING
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
+from tests.sim.scenes import descent_camera
 
 OVERHEAD = Sun(np.array([0.0, 0.0, 1.0]))
 #: Lambert reflectance: under the overhead sun, the radiance factor of level ground equals its albedo.
@@ -73,7 +72,7 @@ def _compute_expected_centroid(camera: Cahvor, spot: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer) -> None:
     """Requirement: 0.05 px rms through a strongly distorted CAHVOR camera, tilted and rolled."""
     surface, spots = _make_spotted_plane(height_m=7.0)
     camera = descent_camera(r=STRONG_DISTORTION)
@@ -98,9 +97,7 @@ def test_spots_on_a_plane_are_at_projected_pixels(renderer: Renderer, descent_ca
 
 @pytest.mark.slow
 @pytest.mark.parametrize("height_m", [500.0, 2000.0])
-def test_world_points_are_on_the_plane_and_on_rays(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor], height_m: float
-) -> None:
+def test_world_points_are_on_the_plane_and_on_rays(renderer: Renderer, height_m: float) -> None:
     surface, _ = _make_spotted_plane(height_m=-3.0)
     camera = descent_camera(r=STRONG_DISTORTION)
     pose = rigid(ATTITUDE, np.array([100.0, 50.0, height_m - 3.0]))
@@ -132,9 +129,7 @@ def _cast_ray(surface: Surface, origin: np.ndarray, ray: np.ndarray, expected_m:
     return float(brentq(lambda t: clearance(t).item(), t[first_below - 1], t[first_below], xtol=1e-9))
 
 
-def test_rough_ground_ranges_match_independent_ray_cast(
-    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_rough_ground_ranges_match_independent_ray_cast(renderer: Renderer, terrain: Surface) -> None:
     rays = PixelRays.from_camera(descent_camera())
     pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
     frame = renderer.render(Scene(terrain, (380.0, 200.0), OVERHEAD, ALBEDO_ONLY), rays, pose)
@@ -221,9 +216,7 @@ def test_blocks_below_a_ray_are_skipped(terrain: Surface) -> None:
         assert is_below_ceiling[(distances_m > skip_end_m) & (distances_m < skip_end_m + 2.0 * block)].any()
 
 
-def test_mesh_resolution_does_not_change_the_image(
-    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_mesh_resolution_does_not_change_the_image(renderer: Renderer, terrain: Surface) -> None:
     """The mesh only defines the start of the search: a mesh three times as coarse gives the same image."""
     rays = PixelRays.from_camera(descent_camera(256))
     pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))
@@ -233,11 +226,10 @@ def test_mesh_resolution_does_not_change_the_image(
     assert is_equal.mean() > 0.995
 
 
-def test_sky_is_above_the_horizon(renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]) -> None:
+def test_sky_is_above_the_horizon(renderer: Renderer, terrain: Surface) -> None:
     level_pose = rigid(Rotation.from_euler("x", 90.0, degrees=True), np.array([0.0, 0.0, 500.0]))
-    frame = renderer.render(
-        Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(descent_camera(128)), level_pose
-    )
+    scene = Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY)
+    frame = renderer.render(scene, PixelRays.from_camera(descent_camera(128)), level_pose)
     upper, lower = frame.range_m[:60], frame.range_m[-40:]
     assert np.isinf(upper).all()
     assert np.isfinite(lower).all()
@@ -245,40 +237,32 @@ def test_sky_is_above_the_horizon(renderer: Renderer, terrain: Surface, descent_
     assert np.isnan(frame.points_world()[:60]).all()
 
 
-def test_objects_out_of_view_do_not_change_the_image(
-    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_objects_out_of_view_do_not_change_the_image(renderer: Renderer, terrain: Surface) -> None:
     """Without visible objects OpenGL draws no triangle, and the search must not read triangle numbers."""
     position = np.array([100.0, 200.0, 300.0])
     corners = position + np.array([[0.0, 0.0, 100.0], [1.0, 0.0, 100.0], [0.0, 1.0, 100.0]])
     faces = np.array([[0, 1, 2]], dtype=np.int32)
     object_above = Objects.of_mesh(corners, np.tile([0.0, 0.0, 1.0], (3, 1)), faces, np.zeros(1, np.int32), albedo=0.1)
     sun = Sun(direction(0.3, np.radians(5.0)))
-    rays = PixelRays.from_camera(descent_camera(256))
-    with_object, without_objects = (
-        renderer.render(
-            Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True),
-            rays,
-            rigid(ATTITUDE, position),
-        )
+    rays, pose = PixelRays.from_camera(descent_camera(256)), rigid(ATTITUDE, position)
+    scenes = (
+        Scene(terrain, (100.0, 200.0), sun, ALBEDO_ONLY, objects, among_objects=True)
         for objects in (object_above, Objects.none())
     )
+    with_object, without_objects = (renderer.render(scene, rays, pose) for scene in scenes)
     assert (with_object.body == -1).all()
     np.testing.assert_array_equal(with_object.range_m, without_objects.range_m)
     np.testing.assert_array_equal(with_object.radiance, without_objects.radiance)
 
 
-def test_camera_below_ground_fails(renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]) -> None:
+def test_camera_below_ground_fails(renderer: Renderer, terrain: Surface) -> None:
     pose = rigid(Rotation.identity(), np.array([0.0, 0.0, -1000.0]))
+    scene = Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY)
     with pytest.raises(RenderingError, match="below the ground"):
-        renderer.render(
-            Scene(terrain, (0.0, 0.0), OVERHEAD, ALBEDO_ONLY), PixelRays.from_camera(descent_camera(64)), pose
-        )
+        renderer.render(scene, PixelRays.from_camera(descent_camera(64)), pose)
 
 
-def test_image_does_not_depend_on_earlier_images(
-    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_image_does_not_depend_on_earlier_images(renderer: Renderer, terrain: Surface) -> None:
     rays = PixelRays.from_camera(descent_camera(256))
     sun = Sun(direction(np.radians(100.0), np.radians(40.0)))
     pose = rigid(ATTITUDE, np.array([380.0, 200.0, 1500.0]))

@@ -19,14 +19,19 @@ from marsyard.sim.terrain.kernels import sample
 EYE = np.array([0.3, -0.2, 1.1])
 
 
-@pytest.fixture(scope="module")
-def objects() -> Objects:
-    """Return triangles with sizes of about 0.03 m to 0.6 m in all directions."""
+def _make_triangles(scale: float) -> Objects:
+    """Make triangles with sizes of about 0.03 m to 0.6 m, times a scale, in all directions."""
     rng = np.random.default_rng(6)
     centres = rng.uniform(-12.0, 12.0, (1500, 1, 3))
-    corners = (centres + 10.0 ** rng.uniform(-1.5, -0.2, (1500, 1, 1)) * rng.normal(size=(1500, 3, 3))).reshape(-1, 3)
+    sizes = scale * 10.0 ** rng.uniform(-1.5, -0.2, (1500, 1, 1))
+    corners = (centres + sizes * rng.normal(size=(1500, 3, 3))).reshape(-1, 3)
     faces = np.arange(4500, dtype=np.int32).reshape(-1, 3)
     return Objects.of_mesh(corners, np.zeros_like(corners), faces, np.zeros(1500, dtype=np.int32), albedo=0.1)
+
+
+@pytest.fixture(scope="module")
+def objects() -> Objects:
+    return _make_triangles(1.0)
 
 
 def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
@@ -34,7 +39,8 @@ def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def test_nearest_triangle_equals_exhaustive_search(objects: Objects) -> None:
+def test_nearest_triangle_equals_exhaustive_search() -> None:
+    objects = _make_triangles(4.0)  # many rays hit several triangles
     rays = _draw_rays(np.random.default_rng(7), 800)
     expected = cast_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
     tree = objects.hierarchy(np.arange(1500))

@@ -1,6 +1,5 @@
 """Tests of relief finer than the terrain's samples: spectrum, shading, and unchanged geometric truth."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +8,8 @@ from scipy import special
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render import PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.microrelief import (
     FADING,
     HEIGHT_VARIANCE,
@@ -25,8 +23,8 @@ from marsyard.sim.render.kernels.strips import ROW, STRIP
 from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
+from tests.sim.scenes import LAMBERT, descent_camera
 
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 #: Map of amplitude factors with a single sample, 1: equal relief everywhere.
 UNIFORM = np.ones((1, 1, 3), dtype=np.float32)
 POSE = rigid(Rotation.identity(), np.array([30.0, 40.0, 20.0]))
@@ -162,7 +160,7 @@ def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.nd
 
 @pytest.mark.parametrize("rms_slope_deg", [pytest.param(8.0, marks=pytest.mark.slow), 15.0])
 def test_shading_changes_with_the_sun_as_for_a_height_field(
-    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], rms_slope_deg: float
+    renderer: Renderer, flat: Surface, rms_slope_deg: float
 ) -> None:
     """Images under two sun azimuths 90 deg apart have the correlation of a ray-cast height field, within 0.05."""
     cell, pixels, samples_per_pixel = 0.8, 96, 6
@@ -190,9 +188,7 @@ def test_shading_changes_with_the_sun_as_for_a_height_field(
         assert frame.radiance.std() > 0.03 * frame.radiance.mean()
 
 
-def test_relief_does_not_change_geometric_truth_and_mean_brightness(
-    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_relief_does_not_change_geometric_truth_and_mean_brightness(renderer: Renderer, flat: Surface) -> None:
     rays = PixelRays.from_camera(descent_camera(128))
     without_relief = Scene(flat, (30.0, 40.0), Sun(direction(2.0, np.radians(50.0))), LAMBERT)
     with_relief = replace(without_relief, relief=_make_relief(1.2, *0.02 * 0.5 ** np.arange(8.0)))

@@ -1,18 +1,20 @@
 """Tests of image motion between renderings against the camera model; `make validate` has longer versions."""
 
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.estimators import PATCH, SmoothImage, symmetric_shifts
 from benchmarks.validation.motion import View, measure, patch_grid
-from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
-from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture
+from marsyard.sim.render import Photometry, Renderer, Scene, Sun, Texture
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
+from tests.sim.scenes import FORWARD, descent_camera, rocks_near
 
 SUN = Sun(direction(np.radians(110.0), np.radians(40.0)))
 #: Limit of the mean error over all patches; the full validation has at least 200 patches.
@@ -34,17 +36,13 @@ def test_known_shift_is_estimated() -> None:
     shift = np.array([0.37, -0.22])
     first, second = SmoothImage(render_bumps(np.zeros(2))), SmoothImage(0.8 * render_bumps(shift) + 0.1)
     shifts = symmetric_shifts(first, second, patch_grid((160, 160)))
-    np.testing.assert_allclose(shifts.motion_px, np.broadcast_to(shift, shifts.motion_px.shape), atol=2e-3)
+    assert_allclose(shifts.motion_px, np.broadcast_to(shift, shifts.motion_px.shape), atol=2e-3)
     # If all pixels of a patch have the same motion, the expected shift is that motion.
     uniform_motion = np.broadcast_to(shift, (len(shifts.motion_px), PATCH, PATCH, 2))
-    np.testing.assert_allclose(
-        shifts.expected(uniform_motion), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9
-    )
+    assert_allclose(shifts.expected(uniform_motion), np.broadcast_to(shift, shifts.motion_px.shape), atol=1e-9)
 
 
-def test_descent_image_motion_matches_the_camera(
-    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor]
-) -> None:
+def test_descent_image_motion_matches_the_camera(renderer: Renderer, terrain: Surface) -> None:
     texture = Texture(3.0, (0.03,) * 6)
     scene = Scene(terrain, (380.0, 200.0), SUN, Photometry(), ground_texture=texture)
     camera = descent_camera().crop(256, 256, (512, 512))
@@ -64,28 +62,11 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
     target = PlacedRock(name="target", east_m=10.0, north_m=10.0, diameter_m=2.0, shape=3, yaw_deg=20.0)
     field = RockField.draw(surface, RockParameters(abundance=0.05, placed=(target,)), np.random.default_rng(1))
     eye = np.array([9.2 - distance_m, 10.0, float(surface.height(10.0, 10.0)) + 1.4])
-    mesh = field.near(eye[0], eye[1], distance_m + 3.0, above_m=1.4)
-    rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=0.15)
-    scene = Scene(
-        surface,
-        (eye[0], eye[1]),
-        SUN,
-        Photometry(),
-        rocks,
-        ground_texture=Texture(0.2, (0.05,) * 6),
-        object_texture=Texture(0.2, (0.06,) * 8),
-        mesh_finest_m=0.04,
-        mesh_half_width_m=200.0,
-        among_objects=True,
-    )
-    camera = Cahv.from_focal_length(
-        focal_m=16e-3,
-        pixel_pitch_m=4.65e-6,
-        size=(512, 384),
-        centre=np.zeros(3),
-        axis=np.array([1.0, 0.0, 0.0]),
-        right=np.array([0.0, -1.0, 0.0]),
-    )
+    rocks = rocks_near(field, eye[0], eye[1], distance_m + 3.0, 1.4, albedo=0.15)
+    textures = {"ground_texture": Texture(0.2, (0.05,) * 6), "object_texture": Texture(0.2, (0.06,) * 8)}
+    settings: dict[str, Any] = {"mesh_finest_m": 0.04, "mesh_half_width_m": 200.0, "among_objects": True, **textures}
+    scene = Scene(surface, (eye[0], eye[1]), SUN, Photometry(), rocks, **settings)
+    camera = Cahv.from_focal_length(16e-3, 4.65e-6, (512, 384), **FORWARD)
     depression_rad = np.arctan2(0.9, distance_m)
     view = View(scene, camera, rigid(Rotation.from_euler("y", depression_rad), eye))
     for motion in measure(renderer, view, np.array([0.3, 0.75])):

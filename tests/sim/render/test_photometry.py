@@ -1,6 +1,5 @@
 """Tests of the rendered reflectance law: brightness, reciprocity, integrated albedo, opposition peak and texture."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +8,15 @@ from scipy import ndimage
 from scipy.spatial.transform import RigidTransform, Rotation
 from scipy.stats import qmc
 
-from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.sim.camera import Cahv, Cahvore, CameraModel
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.noise import allocate_noise, noise_3d
 from marsyard.sim.render.kernels.photometry import MIN_CELLS, NOISE_VARIANCE, add_texture
 from marsyard.sim.render.kernels.strips import STRIP
 from marsyard.sim.terrain import Surface, sites
+from tests.sim.scenes import DOWN, descent_camera, flat_ground, make_ground
 
-ALBEDO = 0.2
 LAWS = {
     "Lambert": Photometry(lunar_fraction=0.0, surge_amplitude=0.0),
     "Mars": Photometry(),
@@ -28,20 +27,12 @@ with_each_law = pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 
 @pytest.fixture(scope="module")
 def flat() -> Surface:
-    samples = np.zeros((64, 64, 2), dtype=np.float32)
-    samples[..., 1] = ALBEDO
-    return Surface.from_samples(samples, 64.0)
+    return flat_ground(64, 64.0)
 
 
 def _render(renderer: Renderer, flat: Surface, law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) -> float:
     """Render the radiance factor of flat ground in direct sunlight."""
-    camera = Cahv.from_field_of_view(
-        horizontal_rad=0.002,
-        size=(9, 9),
-        centre=np.zeros(3),
-        axis=np.array([0.0, 0.0, -1.0]),
-        right=np.array([1.0, 0.0, 0.0]),
-    )
+    camera = Cahv.from_field_of_view(0.002, (9, 9), **DOWN)
     pose = rigid(Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0], 100.0 * to_eye)
     scene = Scene(flat, (0.0, 0.0), Sun(to_sun), replace(law, sky_fraction=0.0, surrounding_albedo=0.0))
     return float(renderer.render(scene, PixelRays.from_camera(camera), pose).radiance[4, 4])
@@ -70,21 +61,12 @@ def test_albedo_is_the_reflected_fraction_of_light(law: Photometry) -> None:
 
 
 def _make_fisheye_camera() -> Cahvore:
-    pinhole = Cahv.from_focal_length(
-        focal_m=5.58e-3,
-        pixel_pitch_m=24e-6,
-        size=(512, 512),
-        centre=np.zeros(3),
-        axis=np.array([0.0, 0.0, -1.0]),
-        right=np.array([1.0, 0.0, 0.0]),
-    )
+    pinhole = Cahv.from_focal_length(5.58e-3, 24e-6, (512, 512), **DOWN)
     return Cahvore.from_cahv(pinhole, r=np.array([0.0, -0.02, 0.002]), e=np.full(3, 0.006), linearity=-0.1)
 
 
 @pytest.mark.parametrize("is_fisheye", [False, True])
-def test_opposition_peak_is_at_the_antisolar_point(
-    renderer: Renderer, flat: Surface, descent_camera: Callable[..., Cahvor], is_fisheye: bool
-) -> None:
+def test_opposition_peak_is_at_the_antisolar_point(renderer: Renderer, flat: Surface, is_fisheye: bool) -> None:
     """The centroid of the peak is within half a pixel of the antisolar point."""
     camera = _make_fisheye_camera() if is_fisheye else descent_camera(512)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
@@ -103,33 +85,24 @@ def test_opposition_peak_is_at_the_antisolar_point(
 NADIR = rigid(Rotation.identity(), np.array([0.0, 0.0, 1000.0]))
 
 
-def _make_surface(heights: np.ndarray, albedo: float = 0.2) -> Surface:
-    samples = np.empty((*heights.shape, 2), dtype=np.float32)
-    samples[..., 0] = heights
-    samples[..., 1] = albedo
-    return Surface.from_samples(samples, 8.0)
-
-
-FLAT = _make_surface(np.zeros((256, 256)))
+FLAT = flat_ground(256)
 
 
 def _render_ground(
     renderer: Renderer, camera: CameraModel, surface: Surface, sun: Sun, law: Photometry, pose: RigidTransform = NADIR
 ) -> np.ndarray:
-    radiance: np.ndarray = renderer.render(
-        Scene(surface, (0.0, 0.0), sun, law), PixelRays.from_camera(camera), pose
-    ).radiance
-    return radiance
+    scene = Scene(surface, (0.0, 0.0), sun, law)
+    return np.asarray(renderer.render(scene, PixelRays.from_camera(camera), pose).radiance)
 
 
-def test_lambert_plane_follows_the_cosine_law(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_lambert_plane_follows_the_cosine_law(renderer: Renderer) -> None:
     sun = Sun(direction(np.radians(70.0), np.radians(35.0)))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     radiance = _render_ground(renderer, descent_camera(128), FLAT, sun, law)
     np.testing.assert_allclose(radiance, 0.2 * np.sin(np.radians(35.0)), rtol=1e-5)
 
 
-def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_lunar_lambert_matches_the_formula(renderer: Renderer) -> None:
     camera = descent_camera(64)
     sun = Sun(direction(np.radians(200.0), np.radians(50.0)))
     law = Photometry(
@@ -148,53 +121,34 @@ def test_lunar_lambert_matches_the_formula(renderer: Renderer, descent_camera: C
     np.testing.assert_allclose(_render_ground(renderer, camera, FLAT, sun, law), expected, rtol=1e-4)
 
 
-def test_opposition_spot_is_at_the_antisolar_point(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
-    camera = descent_camera()
-    sun = Sun(direction(np.radians(30.0), np.radians(80.0)))
-    law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
-    radiance = _render_ground(renderer, camera, FLAT, sun, law)
-    expected, visible = camera.transform(NADIR).project(NADIR.translation - 500.0 * sun.direction)
-    assert visible
-    peak = np.unravel_index(radiance.argmax(), radiance.shape)
-    # The brightest pixel is the nearest to the antisolar point.
-    assert np.abs(np.array(peak[::-1]) - expected).max() <= 0.51
-
-
-def test_slopes_facing_the_sun_are_brighter(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_slopes_facing_the_sun_are_brighter(renderer: Renderer) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(20.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     law = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
     camera = descent_camera(256)
     # The ground faces the eastern sun where its height decreases with x.
     east_sun = Sun(direction(np.radians(90.0), np.radians(40.0)))
-    frame = renderer.render(
-        Scene(_make_surface(heights), (0.0, 0.0), east_sun, law), PixelRays.from_camera(camera), NADIR
-    )
+    scene = Scene(make_ground(heights, 8.0), (0.0, 0.0), east_sun, law)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), NADIR)
     is_facing_east = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) < -0.5
     is_facing_west = np.cos(2 * np.pi * frame.points_world()[..., 0] / 512.0) > 0.5
     assert frame.radiance[is_facing_east].min() > frame.radiance[is_facing_west].max()
 
 
-def test_ground_facing_away_receives_only_sky_light(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_ground_facing_away_receives_only_sky_light(renderer: Renderer) -> None:
     x = np.arange(256) * 8.0
     heights = np.broadcast_to(40.0 * np.sin(2 * np.pi * x / 512.0), (256, 256))
     low_sun = Sun(direction(np.radians(90.0), np.radians(5.0)))
-    without_sky = _render_ground(
-        renderer,
-        descent_camera(128),
-        _make_surface(heights),
-        low_sun,
-        Photometry(sky_fraction=0.0, surrounding_albedo=0.0),
+    without_sky, with_sky = (
+        _render_ground(renderer, descent_camera(128), make_ground(heights, 8.0), low_sun, law)
+        for law in (Photometry(sky_fraction=0.0, surrounding_albedo=0.0), Photometry(sky_fraction=0.15))
     )
     assert without_sky.min() == 0.0
-    with_sky = _render_ground(
-        renderer, descent_camera(128), _make_surface(heights), low_sun, Photometry(sky_fraction=0.15)
-    )
     # Sky fraction times albedo, with a margin of 10 %.
     assert with_sky.min() > 0.15 * 0.2 * 0.9
 
 
-def test_albedo_finer_than_a_pixel_is_averaged(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_albedo_finer_than_a_pixel_is_averaged(renderer: Renderer) -> None:
     """Stripes four times finer than a pixel appear as their mean, without aliasing."""
     samples = np.zeros((512, 512, 2), dtype=np.float32)
     samples[..., 1] = 0.2

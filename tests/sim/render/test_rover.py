@@ -9,13 +9,12 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, settle
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun, may_cast_shadow
+from marsyard.sim.render import PixelRays, Renderer, Scene, Sun, may_cast_shadow
 from marsyard.sim.render.rover import ROVER_NAME, rover_objects, rover_sphere
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
-from marsyard.sim.terrain import Surface
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
+from tests.sim.scenes import DOWN, LAMBERT, flat_ground
 
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 EAST = 0.5 * np.pi
 
 
@@ -81,9 +80,7 @@ def test_rover_tilts_with_the_ground() -> None:
 
 
 def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
-    samples = np.zeros((64, 64, 2), dtype=np.float32)
-    samples[..., 1] = 0.2
-    surface = Surface.from_samples(samples, 1.0)
+    surface = flat_ground(64, 1.0)
     stance = settle(MER, surface, 32.0, 32.0, 0.0)
     elevation = np.radians(25.0)
     sun = Sun(direction(EAST, elevation))
@@ -93,9 +90,7 @@ def test_mast_shadow_is_opposite_the_sun(renderer: Renderer) -> None:
     mast = stance.world_from_rover.apply(np.array([*MER_MAST.base_m[:2], 0.0]))
     height_m = 1.28
     expected = mast + np.array([-height_m / np.tan(elevation), 0.0, 0.0])
-    camera = Cahv.from_field_of_view(
-        horizontal_rad=0.1, size=(101, 101), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
-    )
+    camera = Cahv.from_field_of_view(0.1, (101, 101), **DOWN)
     pose = rigid(Rotation.identity(), expected + np.array([0.0, 0.0, 6.0]))
     frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
     points = frame.points_world()

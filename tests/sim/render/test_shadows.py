@@ -1,7 +1,6 @@
 """Tests of cast shadows against an independent ray cast: SciPy's B-spline for the ground, brute force for triangles."""
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.validation.raycast import Ground, cast_triangles
-from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.kernels.casters import find_occluded_positions
@@ -24,19 +23,16 @@ from marsyard.sim.render.scene import (
 )
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
+from tests.sim.scenes import DOWN, LAMBERT, descent_camera, make_ground, rocks_near
 
 ALBEDO = 0.2
-#: With this law the radiance is albedo times the cosine of incidence in sunlight, and 0 in shadow.
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
 #: Required fraction of equal pixels, from docs/validation.md.
 MIN_AGREEMENT = 0.995
 
 
 def _with_uniform_albedo(surface: Surface) -> Surface:
     """Return the same ground with uniform albedo."""
-    samples = surface.levels[0].copy()
-    samples[..., 1] = ALBEDO
-    return Surface.from_samples(samples, surface.spacing_m)
+    return make_ground(surface.levels[0][..., 0], surface.spacing_m, ALBEDO)
 
 
 def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) -> tuple[float, float]:
@@ -55,7 +51,7 @@ def _compare_with_ray_cast(frame: Frame, scene: Scene, count: int, step: float) 
 
 @pytest.mark.parametrize("azimuth_deg", [110.0, 200.0])
 def test_low_sun_shadows_of_rough_ground_match_ray_cast(
-    renderer: Renderer, terrain: Surface, descent_camera: Callable[..., Cahvor], azimuth_deg: float
+    renderer: Renderer, terrain: Surface, azimuth_deg: float
 ) -> None:
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(12.0)))
     scene = Scene(_with_uniform_albedo(terrain), (380.0, 200.0), sun, LAMBERT, edge_rays=1)
@@ -72,32 +68,23 @@ def test_rock_shadows_match_ray_cast(renderer: Renderer) -> None:
     )
     surface = _with_uniform_albedo(synthesise(parameters, np.random.default_rng(5)))
     field = RockField.draw(surface, RockParameters(abundance=0.1, smallest_m=0.15), np.random.default_rng(1))
-    mesh = field.near(10.0, 10.0, 7.0, above_m=8.0)
-    rocks = Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=ALBEDO)
-    camera = Cahv.from_field_of_view(
-        horizontal_rad=0.3,
-        size=(256, 256),
-        centre=np.zeros(3),
-        axis=np.array([0.0, 0.0, -1.0]),
-        right=np.array([1.0, 0.0, 0.0]),
-    )
+    rocks = rocks_near(field, 10.0, 10.0, 7.0, 8.0, albedo=ALBEDO)
+    camera = Cahv.from_field_of_view(0.3, (256, 256), **DOWN)
     sun = Sun(direction(np.radians(200.0), np.radians(35.0)))
     scene = Scene(surface, (10.0, 10.0), sun, LAMBERT, rocks, mesh_finest_m=0.1, mesh_half_width_m=100.0, edge_rays=1)
     eye = np.array([10.0, 10.0, float(surface.height(10.0, 10.0)) + 8.0])
-    frame = renderer.render(
-        scene, PixelRays.from_camera(camera), rigid(Rotation.from_euler("x", 15.0, degrees=True), eye)
-    )
+    pose = rigid(Rotation.from_euler("x", 15.0, degrees=True), eye)
+    frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
     agreement, shaded_fraction = _compare_with_ray_cast(frame, scene, 3000, 0.02)
     assert shaded_fraction > 0.02
     assert agreement >= MIN_AGREEMENT
 
 
-def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer) -> None:
     """The penumbra 55 m from the ridge equals the visible fraction of the solar disc."""
     spacing, elevation = 0.5, np.radians(20.0)
     heights = np.zeros((256, 256)) + np.maximum(20.0 - spacing * np.abs(np.arange(256.0) - 60.0), 0.0)
-    samples = np.stack([heights, np.full_like(heights, ALBEDO)], axis=-1).astype(np.float32)
-    surface = Surface.from_samples(samples, spacing)
+    surface = make_ground(heights, spacing, ALBEDO)
     sun = Sun(direction(np.radians(270.0), elevation))
     # Elevation of the ridge at x = 30 m, seen from ground positions in the east.
     profile = np.arange(28.0, 32.0, 0.01)
@@ -106,9 +93,8 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
     skyline = np.arctan2(crest, ground[:, None] - profile).max(axis=1)
     edge = float(np.interp(elevation, skyline[::-1], ground[::-1]))
     pose = rigid(Rotation.identity(), np.array([edge, 64.0, 8.0]))
-    frame = renderer.render(
-        Scene(surface, (edge, 64.0), sun, LAMBERT), PixelRays.from_camera(descent_camera(256)), pose
-    )
+    scene = Scene(surface, (edge, 64.0), sun, LAMBERT)
+    frame = renderer.render(scene, PixelRays.from_camera(descent_camera(256)), pose)
     x_m = frame.points_world()[..., 0].ravel()
     offset = np.clip((elevation - np.interp(x_m, ground, skyline)) / sun.angular_radius_rad, -1.0, 1.0)
     expected = 0.5 + (offset * np.sqrt(1.0 - offset**2) + np.arcsin(offset)) / np.pi
@@ -120,9 +106,8 @@ def test_ridge_penumbra_matches_visible_sun_fraction(renderer: Renderer, descent
 
 def _random_bodies(rng: np.random.Generator, centres: np.ndarray, sizes: np.ndarray) -> Objects:
     """Create one body of seven random triangles at each centre."""
-    triangles = (
-        centres[:, None, None] + sizes[:, None, None, None] * rng.normal(size=(len(centres), 7, 3, 3))
-    ).reshape(-1, 3)
+    offsets = sizes[:, None, None, None] * rng.normal(size=(len(centres), 7, 3, 3))
+    triangles = (centres[:, None, None] + offsets).reshape(-1, 3)
     faces = np.arange(len(triangles), dtype=np.int32).reshape(-1, 3)
     body_ids = np.repeat(np.arange(len(centres), dtype=np.int32), 7)
     return Objects.of_mesh(triangles, np.zeros_like(triangles), faces, body_ids, ALBEDO)

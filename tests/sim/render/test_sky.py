@@ -1,6 +1,5 @@
 """Tests of sky radiance, irradiance and cloud layers against formulas."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
-from marsyard.sim.camera import Cahv, Cahvor, CameraModel
+from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import (
     CloudLayer,
@@ -23,31 +22,21 @@ from marsyard.sim.render import (
 )
 from marsyard.sim.render.kernels.photometry import sky_brightness
 from marsyard.sim.terrain import Surface
+from tests.sim.scenes import LAMBERT, descent_camera, flat_ground
 
 #: Sky with an optical depth of 0.5, a single-scattering albedo of 0.95 and an asymmetry of 0.65.
 DUSTY = Photometry(sky_fraction=0.25, sky=DustySky(0.5, 0.95, 0.65))
 
 
-def _make_flat_ground() -> Surface:
-    samples = np.zeros((64, 64, 2), dtype=np.float32)
-    samples[..., 1] = 0.2
-    return Surface.from_samples(samples, 8.0)
-
-
 def _make_sky_camera(size: int = 200) -> Cahv:
     """Return a camera with a field of view of 40 deg that looks north, 10 deg above the horizon."""
     up = np.radians(10.0)
-    return Cahv.from_field_of_view(
-        horizontal_rad=np.radians(40.0),
-        size=(size, size),
-        centre=np.zeros(3),
-        axis=np.array([0.0, np.cos(up), np.sin(up)]),
-        right=np.array([1.0, 0.0, 0.0]),
-    )
+    axis = np.array([0.0, np.cos(up), np.sin(up)])
+    return Cahv.from_field_of_view(np.radians(40.0), (size, size), axis=axis, right=(1.0, 0.0, 0.0))
 
 
 def _render_from_mast(renderer: Renderer, camera: Cahv, sun: Sun, photometry: Photometry) -> Frame:
-    scene = Scene(_make_flat_ground(), (0.0, 0.0), sun, photometry, mesh_finest_m=0.5, mesh_half_width_m=5000.0)
+    scene = Scene(flat_ground(), (0.0, 0.0), sun, photometry, mesh_finest_m=0.5, mesh_half_width_m=5000.0)
     return renderer.render(scene, PixelRays.from_camera(camera), rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5])))
 
 
@@ -139,14 +128,6 @@ def test_invalid_sky_is_rejected(depth: float, albedo: float, asymmetry: float) 
 
 ALBEDO = 0.3
 SUN = Sun(direction(np.radians(130.0), np.radians(50.0)))
-#: With this law the radiance is albedo times the cosine of incidence times the transmittance of the clouds.
-LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
-
-
-def _make_cloud_ground() -> Surface:
-    samples = np.zeros((64, 64, 2), dtype=np.float32)
-    samples[..., 1] = ALBEDO
-    return Surface.from_samples(samples, 64.0)
 
 
 def _make_layer(seed: int = 1, **changes: float) -> CloudLayer:
@@ -154,7 +135,7 @@ def _make_layer(seed: int = 1, **changes: float) -> CloudLayer:
 
 
 def _make_scene(clouds: CloudLayer | None, photometry: Photometry = LAMBERT) -> Scene:
-    return Scene(_make_cloud_ground(), (0.0, 0.0), SUN, photometry, clouds=clouds, edge_rays=1)
+    return Scene(flat_ground(64, 64.0, ALBEDO), (0.0, 0.0), SUN, photometry, clouds=clouds, edge_rays=1)
 
 
 def _render_from_above(
@@ -178,7 +159,7 @@ def test_cover_and_size_equal_the_parameters(cover: float) -> None:
     assert is_cloud.sum() / n_crossings * layers[0].cell_m == pytest.approx(900.0, rel=0.05)
 
 
-def test_sunlight_is_attenuated_by_the_optical_depth(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_sunlight_is_attenuated_by_the_optical_depth(renderer: Renderer) -> None:
     layer = _make_layer(cover=0.4, optical_depth=1.0, edge_m=10.0)
     frame = _render_from_above(renderer, _make_scene(layer), descent_camera(128))
     elevation = np.radians(50.0)
@@ -188,10 +169,9 @@ def test_sunlight_is_attenuated_by_the_optical_depth(renderer: Renderer, descent
     assert frame.radiance.min() == pytest.approx(sunlight * np.exp(-1.0 / np.sin(elevation)) + skylight, rel=1e-3)
 
 
-def test_rendered_transmittance_equals_truth(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_rendered_transmittance_equals_truth(renderer: Renderer) -> None:
     scene = _make_scene(_make_layer(seed=3, asymmetry=0.0, optical_depth=100.0))
     frame = _render_from_above(renderer, scene, descent_camera(128), time_s=12.0)
-    assert scene.clouds is not None
     transmittance = scene.clouds.transmittance(frame.points_world(), SUN, 12.0)
     sky_light = scene.clouds.parameters.sky_light(SUN)
     expected = ALBEDO * (SUN.direction[2] * transmittance + sky_light)
@@ -199,7 +179,7 @@ def test_rendered_transmittance_equals_truth(renderer: Renderer, descent_camera:
     assert 0.1 < np.mean(transmittance < 0.5) < 0.9
 
 
-def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable[..., Cahvor]) -> None:
+def test_shadows_move_with_the_wind(renderer: Renderer) -> None:
     """From a camera that drifts with the wind, the shadows on uniform ground are static."""
     scene, camera = _make_scene(_make_layer(wind_east_m_s=9.0, wind_north_m_s=-4.0)), descent_camera(128)
     first = _render_from_above(renderer, scene, camera, 5.0)
@@ -211,9 +191,7 @@ def test_shadows_move_with_the_wind(renderer: Renderer, descent_camera: Callable
     assert np.abs(fixed_camera.radiance - first.radiance).max() > 0.05
 
 
-def test_zero_cover_is_bitwise_equal_to_no_clouds(
-    renderer: Renderer, descent_camera: Callable[..., Cahvor], terrain: Surface
-) -> None:
+def test_zero_cover_is_bitwise_equal_to_no_clouds(renderer: Renderer, terrain: Surface) -> None:
     camera = PixelRays.from_camera(descent_camera(128))
     pose = rigid(Rotation.identity(), np.array([380.0, 200.0, 900.0]))
     clear_scene = Scene(terrain, (380.0, 200.0), SUN, Photometry())

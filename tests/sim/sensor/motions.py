@@ -1,5 +1,6 @@
 """Closed-form motions for the tests of instruments: a swaying body, and uniform motion of an image."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -72,3 +73,26 @@ class Swaying:
             body_rates_rad_s=rates,
             specific_forces_m_s2=attitudes.inv().apply(accelerations + GRAVITY * up),
         )
+
+
+def assert_derivatives(
+    motion_at: Callable[[np.ndarray], Motion],
+    times_s: np.ndarray,
+    step_s: float,
+    gravity_m_s2: float,
+    *,
+    force_rtol: float = 1e-7,
+    **atol: float,
+) -> None:
+    """Compare velocities, specific forces and body rates with central differences; `atol` by the first word of each.
+
+    The body axes rotate by up to half a step during a difference.
+    """
+    before, motion, after = (motion_at(times_s + shift) for shift in (-step_s, 0.0, step_s))
+    velocity = (after.positions_m - before.positions_m) / (2.0 * step_s)
+    np.testing.assert_allclose(motion.velocities_m_s, velocity, atol=atol["velocity"])
+    acceleration = (after.velocities_m_s - before.velocities_m_s) / (2.0 * step_s)
+    force = motion.attitudes.inv().apply(acceleration + np.array([0.0, 0.0, gravity_m_s2]))
+    np.testing.assert_allclose(motion.specific_forces_m_s2, force, rtol=force_rtol, atol=atol["force"])
+    rate = (before.attitudes.inv() * after.attitudes).as_rotvec() / (2.0 * step_s)
+    np.testing.assert_allclose(motion.body_rates_rad_s, rate, atol=atol["rate"])

@@ -30,14 +30,8 @@ class ProfileMotion:
     def motion(self, times_s: Float64[np.ndarray, "n"]) -> Motion:
         zeros = np.zeros((times_s.size, 3))
         approach = self.approach
-        return Motion(
-            times_s,
-            zeros,
-            zeros,
-            approach.attitudes(times_s),
-            approach.body_rates(times_s),
-            approach.specific_forces(times_s),
-        )
+        attitudes, rates = approach.attitudes(times_s), approach.body_rates(times_s)
+        return Motion(times_s, zeros, zeros, attitudes, rates, approach.specific_forces(times_s))
 
 
 def _propagate_at_full_rate(imu: Imu, approach: Approach, seeds: range) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -80,10 +74,8 @@ def test_profile_has_specified_deceleration_and_ends_upright() -> None:
     times = np.linspace(approach.start_s, 0.0, 200001)
     forces = approach.specific_forces(times)
     gravity_delta_v = parameters.gravity_m_s2 * parameters.parachute_s
-    total_delta_v = np.trapezoid(forces[:, 2], times)
-    assert total_delta_v == pytest.approx(
-        parameters.entry_delta_v_m_s + parameters.parachute_delta_v_m_s + gravity_delta_v, rel=1e-3
-    )
+    total_delta_v = parameters.entry_delta_v_m_s + parameters.parachute_delta_v_m_s + gravity_delta_v
+    assert np.trapezoid(forces[:, 2], times) == pytest.approx(total_delta_v, rel=1e-3)
     assert approach.attitudes(np.array([0.0]))[0].apply([0.0, 0.0, -1.0])[2] == pytest.approx(-1.0)
     # At the start the body -z axis points to the heading, 12 deg below the horizon.
     start_axis = approach.attitudes(np.array([approach.start_s]))[0].apply([0.0, 0.0, -1.0])
@@ -121,10 +113,8 @@ def test_noise_matches_a_full_rate_propagation() -> None:
     imu = Imu.draw(unit_parameters, (approach.start_s, 0.0), np.random.default_rng(0))
     fast = [approach.errors(imu, np.random.default_rng(seed)) for seed in range(400)]
     slow = _propagate_at_full_rate(imu, approach, range(120))
-    attitude_fast, velocity_fast = (
-        np.std([errors.attitude_rad for errors in fast], axis=0),
-        np.std([errors.velocity_m_s for errors in fast], axis=0),
-    )
+    attitude_fast = np.std([errors.attitude_rad for errors in fast], axis=0)
+    velocity_fast = np.std([errors.velocity_m_s for errors in fast], axis=0)
     attitude_slow, velocity_slow = (np.std([errors[k] for errors in slow], axis=0) for k in (0, 1))
     # The standard error of the ratio from 400 and 120 values is 7.4 %; the tolerance is three times that.
     np.testing.assert_allclose(attitude_fast / attitude_slow, 1.0, atol=0.22)
@@ -138,9 +128,8 @@ def test_scale_error_rotates_attitude_about_spin_axis() -> None:
     approach = Approach(parameters, 0.0)
     imu = Imu.draw(make_parameters(gyro_scale_ppm=1e4), (approach.start_s, 0.0), np.random.default_rng(0))
     calibrated_imu = approach.calibrate(imu, np.random.default_rng(1))
-    level_approach = Approach(
-        parameters.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0}), 0.0
-    )
+    level = parameters.model_copy(update={"entry_off_nadir_deg": 0.0, "deploy_off_nadir_deg": 0.0})
+    level_approach = Approach(level, 0.0)
     error = level_approach.errors(calibrated_imu, np.random.default_rng(0)).attitude_rad
     # Spin of 2 rpm for 900 s of cruise and 40 s of entry.
     rotation_rad = 2.0 * np.pi / 30.0 * 940.0

@@ -72,9 +72,8 @@ def test_equal_random_streams_produce_equal_images() -> None:
 
 
 def test_calibration_response_has_the_specified_error() -> None:
-    detector = Detector.draw(
-        UNIFORM, DetectorParameters(response_spread=0.02, calibration_error=0.005), np.random.default_rng(3)
-    )
+    parameters = DetectorParameters(response_spread=0.02, calibration_error=0.005)
+    detector = Detector.draw(UNIFORM, parameters, np.random.default_rng(3))
     true_response = detector.response.reshape(16, 4, 48).mean(axis=1)
     # The standard error of the deviation from 768 pixels is 2.6 %. The mean of four rows has half the deviation of one.
     assert (detector.calibration.flat_field / true_response).std() == pytest.approx(0.005, rel=0.1)
@@ -91,11 +90,8 @@ def test_dimes_correction_removes_the_smear() -> None:
     rng = np.random.default_rng(5)
     large_scale = gaussian_filter(rng.standard_normal((1024, 32)), 60.0, mode="wrap")
     fine_scale = gaussian_filter(rng.standard_normal((1024, 32)), 1.5, mode="wrap")
-    scene = (
-        (0.15 * (1.0 + 0.3 * large_scale / large_scale.std() + 0.08 * fine_scale / fine_scale.std()))
-        .clip(0.05)
-        .astype(np.float32)
-    )
+    contrast = 0.3 * large_scale / large_scale.std() + 0.08 * fine_scale / fine_scale.std()
+    scene = (0.15 * (1.0 + contrast)).clip(0.05).astype(np.float32)
     detector = _make_detector(scene.shape)
     parameters = detector.parameters
 
@@ -182,15 +178,13 @@ def test_hot_and_dead_pixels_have_specified_fractions() -> None:
 
 def test_bursts_disturb_runs_along_the_rows() -> None:
     scene = 0.1 * np.ones((256, 64), dtype=np.float32)
-    undisturbed = _make_detector(scene.shape, rows_summed=1)
-    disturbed = _make_detector(
-        scene.shape, rows_summed=1, bursts=BurstParameters(bursts=3.0, length_px=200.0, amplitude_dn=500.0)
+    bursts = BurstParameters(bursts=3.0, length_px=200.0, amplitude_dn=500.0)
+    detectors = (_make_detector(scene.shape, rows_summed=1), _make_detector(scene.shape, rows_summed=1, bursts=bursts))
+    undisturbed, disturbed = (
+        np.stack([detector.expose(scene, np.random.default_rng(n)).reshape(-1) for n in range(60)])
+        for detector in detectors
     )
-    pairs = [
-        (undisturbed.expose(scene, np.random.default_rng(n)), disturbed.expose(scene, np.random.default_rng(n)))
-        for n in range(60)
-    ]
-    is_disturbed = np.stack([(without_bursts != with_bursts).reshape(-1) for without_bursts, with_bursts in pairs])
+    is_disturbed = undisturbed != disturbed
     # The standard error from 180 bursts of 200 pixels is 10 %. The image border clips 1 % of the pixels.
     assert is_disturbed.sum() / 60 == pytest.approx(600.0, rel=0.25)
     # A burst is one run of pixels, so few disturbed pixels follow an undisturbed one (some noise rounds to zero).
@@ -229,9 +223,8 @@ def test_exposure_time_is_set_in_parameters_and_calibration() -> None:
 
 
 def test_subframe_has_the_pixels_of_the_full_frame() -> None:
-    parameters = DetectorParameters(
-        transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=DefectParameters(hot_fraction=0.02)
-    )
+    defects = DefectParameters(hot_fraction=0.02)
+    parameters = DetectorParameters(transfer_row_s=0.0, clear_row_s=0.0, optics=SHARP, defects=defects)
     full_frame = Detector.draw(UNIFORM, parameters, np.random.default_rng(6))
     subframe = full_frame.window(8, 16, (24, 32))
     scene = np.random.default_rng(2).random(UNIFORM.shape, dtype=np.float32)

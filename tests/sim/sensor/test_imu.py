@@ -54,10 +54,9 @@ def test_allan_deviation_shows_random_walk_and_bias_instability() -> None:
     # standard errors are sqrt(tau / (3 x 43200)): 0.6 % and 3.8 %. Tolerances are three times that, plus 1 % for
     # interpolation of the bias.
     assert compute_expected_deviation(5.0) == pytest.approx(walk * DEG_SQRT_H / np.sqrt(5.0), rel=0.01)
-    assert _compute_allan_deviation(rates, int(5.0 * rate)) == pytest.approx(compute_expected_deviation(5.0), rel=0.03)
-    assert _compute_allan_deviation(rates, int(190.0 * rate)) == pytest.approx(
-        compute_expected_deviation(190.0), rel=0.12
-    )
+    for tau, tolerance in ((5.0, 0.03), (190.0, 0.12)):
+        expected = compute_expected_deviation(tau)
+        assert _compute_allan_deviation(rates, int(tau * rate)) == pytest.approx(expected, rel=tolerance)
     assert compute_expected_deviation(190.0) > 0.618 * wander * DEG_H
 
 

@@ -78,9 +78,8 @@ def test_accelerometer_bias_and_tilt_cause_velocity_errors() -> None:
 def test_random_walks_have_the_specified_deviation() -> None:
     attitudes_deg, velocities_m_s = [], []
     for seed in range(150):
-        parameters = make_parameters(
-            rate_hz=50.0, angular_random_walk_deg_sqrt_h=0.07, velocity_random_walk_ug_sqrt_hz=50.0
-        )
+        walks = {"angular_random_walk_deg_sqrt_h": 0.07, "velocity_random_walk_ug_sqrt_hz": 50.0}
+        parameters = make_parameters(rate_hz=50.0, **walks)
         _, solution = _navigate(Swaying(), parameters, seed=seed)
         attitudes_deg.append(np.degrees(solution.attitude(np.array([18.0]))[0].as_rotvec()))
         velocities_m_s.append(solution.velocity(np.array([18.0]))[0, 2])

@@ -138,9 +138,8 @@ def test_disparity_errors_are_uniform_within_their_bound() -> None:
 
 def test_row_errors_and_common_rotations_shift_images() -> None:
     design, point = stereo_mast("research-navcam"), np.array([50.0, 0.0, 0.0])
-    misaligned_pair = StereoHead.draw(
-        design, EXACT_CALIBRATION.model_copy(update={"epipolar_error_px": 1.0}), _make_rng(5)
-    ).calibrated
+    misaligned = EXACT_CALIBRATION.model_copy(update={"epipolar_error_px": 1.0})
+    misaligned_pair = StereoHead.draw(design, misaligned, _make_rng(5)).calibrated
     rows = [camera.project(point)[0][1] for camera in (misaligned_pair.left, misaligned_pair.right)]
     columns = [camera.project(point)[0][0] for camera in (misaligned_pair.left, misaligned_pair.right)]
     expected = [camera.project(point)[0][0] for camera in (design.left, design.right)]

@@ -17,6 +17,7 @@ from marsyard.sim.sensor import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.kernels import write_path_kernel
 from marsyard.sim.sensor.optics import moving_exposure
 from marsyard.sim.terrain import TerrainParameters, synthesise
+from tests.sim.scenes import DOWN, FORWARD, descent_camera
 from tests.sim.sensor.motions import uniform_motion
 
 Image = NDArray[np.float64]
@@ -51,9 +52,7 @@ def test_rotating_camera_matches_many_renderings() -> None:
     transfer_row_s, clear_row_s = 5e-6 * 1024 / size, 1e-6 * 1024 / size
     parameters = TerrainParameters(samples=512, rms_slope_deg=6.0, outer_scale_m=400.0, albedo_contrast=0.2)
     surface = synthesise(parameters, np.random.default_rng(11))
-    pinhole = Cahv.from_focal_length(
-        14.67e-3, 12e-6, (size, size), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
-    )
+    pinhole = Cahv.from_focal_length(14.67e-3, 12e-6, (size, size), **DOWN)
     camera = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
     rays = PixelRays.from_camera(camera)
     renderer = process_renderer(default_backend())
@@ -140,10 +139,7 @@ def test_slow_motion_equals_static_exposure() -> None:
 
 
 def test_image_velocity_matches_finite_differences() -> None:
-    pinhole = Cahv.from_focal_length(
-        14.67e-3, 24e-6, (512, 512), axis=np.array([0.0, 0.0, -1.0]), right=np.array([1.0, 0.0, 0.0])
-    )
-    camera = Cahvor.from_cahv(pinhole, r=np.array([0.00096, -0.002183, 0.018547]))
+    camera = descent_camera(512)
     rng = np.random.default_rng(4)
     distance = 1000.0 + 100.0 * rng.random((512, 512))
     pose = rigid(Rotation.from_euler("xyz", [0.2, 0.1, 1.0]), np.array([3.0, 5.0, 900.0]))
@@ -162,9 +158,7 @@ def test_image_velocity_matches_finite_differences() -> None:
 
 
 def test_image_at_infinite_range_moves_only_by_rotation() -> None:
-    camera = Cahv.from_focal_length(
-        6e-3, 12e-6, (128, 96), axis=np.array([1.0, 0.0, 0.0]), right=np.array([0.0, -1.0, 0.0])
-    )
+    camera = Cahv.from_focal_length(6e-3, 12e-6, (128, 96), **FORWARD)
     pose = rigid(Rotation.identity(), np.zeros(3))
     sky = np.full((96, 128), np.inf)
     assert ImageMotion.from_camera(camera, sky, pose, np.array([50.0, 20.0, 0.0]), np.zeros(3)).max_px_s < 1e-3

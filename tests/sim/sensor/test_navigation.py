@@ -84,20 +84,14 @@ def test_errors_are_consistent_with_the_covariance() -> None:
 
     The state of each flight has fifteen degrees of freedom.
     """
-    receiver_with_float_solutions = RtkParameters(float_fraction=0.3, float_s=10.0)
+    with_float_solutions = RtkParameters(float_fraction=0.3, float_s=10.0)
     squared_errors = []
     for seed in range(N_FLIGHTS):
-        path, imu, solution = _run_filter(
-            seed, rtk_parameters=receiver_with_float_solutions, covariance_times_s=(-3.0, 0.0, 2.5, 5.0)
-        )
+        times_s = (-3.0, 0.0, 2.5, 5.0)
+        path, imu, solution = _run_filter(seed, rtk_parameters=with_float_solutions, covariance_times_s=times_s)
         errors = _compute_errors(path, imu, solution, solution.covariance_indices)
-        covariances = solution.covariances
-        squared_errors.append(
-            [
-                float(error @ np.linalg.solve(covariance, error))
-                for error, covariance in zip(errors, covariances, strict=True)
-            ]
-        )
+        pairs = zip(errors, solution.covariances, strict=True)
+        squared_errors.append([float(error @ np.linalg.solve(covariance, error)) for error, covariance in pairs])
     low, high = (float(chi2.ppf(probability, 15 * N_FLIGHTS)) / N_FLIGHTS for probability in (0.001, 0.999))
     means = np.mean(squared_errors, axis=0)
     assert np.all((means > low) & (means < high)), means

@@ -91,14 +91,11 @@ def test_odometry_errors_are_specified_fractions_of_the_distance() -> None:
     """The default errors after 8 m are 2 % with visual odometry and 1.1 % with wheels that do not slip."""
     drives = _drive(Plane(), (DriveCommand(forward_m=2.0),) * 4)
     end = drives[-1].end.world_from_rover
-    errors = [
-        np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n, visual=True)[1].error_m(end))
-        for n in range(100)
-    ]
-    # The RMS of 100 vectors with one to three degrees of freedom has a standard error of up to 7 %.
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(0.02 * 8.0, rel=0.2)
-    wheels = [np.linalg.norm(_estimate_poses(drives, OdometryParameters(), n)[1].error_m(end)) for n in range(100)]
-    assert np.sqrt(np.mean(np.square(wheels))) == pytest.approx(0.011 * 8.0, rel=0.2)
+    for visual, fraction in ((True, 0.02), (False, 0.011)):
+        estimates = [_estimate_poses(drives, OdometryParameters(), n, visual)[1] for n in range(100)]
+        errors = [np.linalg.norm(estimate.error_m(end)) for estimate in estimates]
+        # The RMS of 100 vectors with one to three degrees of freedom has a standard error of up to 7 %.
+        assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(fraction * 8.0, rel=0.2)
 
 
 @pytest.mark.slow

@@ -1,16 +1,14 @@
 """Tests of the optics model: point spread, defocus, stray light, fall-off and dust."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from marsyard.sim.camera import Cahv, Cahvore
 from marsyard.sim.sensor import Detector, DetectorParameters, natural_fall_off
 from marsyard.sim.sensor.optics import OpticsParameters, apply_point_spread, dust_transmission, line_spread
+from tests.sim.scenes import DOWN
 
 OPTICS = OpticsParameters()
-CAMERA_AXES: dict[str, Any] = {"axis": np.array([0.0, 0.0, -1.0]), "right": np.array([1.0, 0.0, 0.0])}
 
 
 @pytest.mark.parametrize(
@@ -52,9 +50,7 @@ def test_zero_spread_returns_the_scene() -> None:
 
 
 def test_perspective_fall_off_is_cosine_to_the_fourth() -> None:
-    camera = Cahv.from_field_of_view(
-        horizontal_rad=np.radians(60.0), size=(101, 101), centre=np.zeros(3), **CAMERA_AXES
-    )
+    camera = Cahv.from_field_of_view(np.radians(60.0), (101, 101), **DOWN)
     fall_off = natural_fall_off(camera)
     assert fall_off[50, 50] == pytest.approx(1.0)
     cosine = camera.rays(camera.pixel_grid())[1] @ camera.a
@@ -64,7 +60,7 @@ def test_perspective_fall_off_is_cosine_to_the_fourth() -> None:
 
 def test_equidistant_fisheye_fall_off_matches_formula() -> None:
     """The solid angle of a pixel decreases with sin(theta) / theta, and the pupil tilts by a twentieth of theta."""
-    pinhole = Cahv.from_focal_length(5.58e-3, 96e-6, (128, 128), centre=np.zeros(3), **CAMERA_AXES)
+    pinhole = Cahv.from_focal_length(5.58e-3, 96e-6, (128, 128), **DOWN)
     camera = Cahvore.from_cahv(pinhole, r=np.zeros(3), linearity=0.0)
     theta = np.arccos(np.clip(camera.rays(camera.pixel_grid())[1] @ camera.a, -1.0, 1.0))
     expected = np.cos(0.95 * theta) * np.sinc(theta / np.pi)

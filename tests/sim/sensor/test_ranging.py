@@ -20,15 +20,12 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.sensor.ranging import RangingUnit, first_return, range_along
 from marsyard.sim.terrain import Surface
+from tests.sim.scenes import flat_ground, make_ground
 from tests.sim.sensor.motions import Swaying
 
 #: A carrier-phase (RTK) receiver with a nearby base station, resolved integer ambiguities and errors of 2 cm.
 RTK = GpsParameters(
-    horizontal_noise_m=0.01,
-    vertical_noise_m=0.015,
-    horizontal_wander_m=0.01,
-    vertical_wander_m=0.02,
-    correlation_s=120.0,
+    horizontal_noise_m=0.01, vertical_noise_m=0.015, horizontal_wander_m=0.01, vertical_wander_m=0.02, correlation_s=120
 )
 DESCENT = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))
 #: Samples per side of a surface, their spacing and the coordinate of its centre, m.
@@ -36,15 +33,9 @@ SIDE, SPACING = 1024, 5.0
 MIDDLE = 0.5 * SIDE * SPACING
 
 
-def _make_surface(heights: Float64[np.ndarray, "rows columns"], spacing: float = SPACING) -> Surface:
-    samples = np.zeros((*heights.shape, 2), dtype=np.float32)
-    samples[..., 0] = heights
-    return Surface.from_samples(samples, spacing)
-
-
 def _make_plane(slope: float) -> Surface:
     """Make a plane that rises to the east, with height 0 at the centre; it falls at the distant periodic border."""
-    return _make_surface(np.tile(slope * (np.arange(SIDE) * SPACING - MIDDLE), (SIDE, 1)))
+    return make_ground(np.tile(slope * (np.arange(SIDE) * SPACING - MIDDLE), (SIDE, 1)), SPACING)
 
 
 def _make_rough_surface(seed: int) -> Surface:
@@ -53,7 +44,7 @@ def _make_rough_surface(seed: int) -> Surface:
     wavenumbers = np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE)[None, :])
     wavenumbers[0, 0] = np.inf
     heights = np.fft.irfft2(wavenumbers**-1.7 * np.fft.rfft2(rng.standard_normal((SIDE, SIDE))), s=(SIDE, SIDE))
-    return _make_surface(30.0 * heights / heights.std(), 2.0)
+    return make_ground(30.0 * heights / heights.std(), 2.0)
 
 
 def _make_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray, "3"]:
@@ -63,7 +54,7 @@ def _make_axis(tilt_deg: float, azimuth_deg: float = 90.0) -> Float64[np.ndarray
 
 
 Instrument = RadarAltimeter | Gps
-FLAT = _make_surface(np.zeros((64, 64)))
+FLAT = flat_ground(64, SPACING)
 
 
 def _make_radar(rng: np.random.Generator, **errors: object) -> Instrument:
@@ -187,11 +178,11 @@ def test_radar_near_a_cliff_measures_the_range_to_its_edge() -> None:
     edge = SIDE // 2 + 60
     heights[:, edge:] = 200.0
     position = np.array([MIDDLE, MIDDLE, 1500.0])
-    result = first_return(_make_surface(heights), position, _make_axis(0.0), np.radians(30.0), 5000.0)
+    result = first_return(make_ground(heights, SPACING), position, _make_axis(0.0), np.radians(30.0), 5000.0)
     # The spline turns the step into a ramp, whose top is one cell beyond the edge.
     assert result == pytest.approx(np.hypot(61 * SPACING, 1300.0), abs=0.1)
     # The edge is 13 deg from nadir, outside a beam with a half angle of 10 deg.
-    result = first_return(_make_surface(heights), position, _make_axis(0.0), np.radians(10.0), 5000.0)
+    result = first_return(make_ground(heights, SPACING), position, _make_axis(0.0), np.radians(10.0), 5000.0)
     assert result == pytest.approx(1500.0)
 
 
@@ -221,11 +212,11 @@ def test_radar_measures_the_ledge_below_it_or_the_ground_beyond() -> None:
     # The radar is 1 m above the ledge, 20 m from its edge. The narrow beam points east, 60 deg from nadir, and hits the
     # ledge.
     position = np.array([edge * SPACING - 20.0, MIDDLE, 401.0])
-    result = first_return(_make_surface(heights), position, _make_axis(60.0), np.radians(2.0), 5000.0)
+    result = first_return(make_ground(heights, SPACING), position, _make_axis(60.0), np.radians(2.0), 5000.0)
     assert result < 10.0
     # 15 m beyond the edge, the beam hits the ground 401 m below.
     position = np.array([edge * SPACING + 15.0, MIDDLE, 401.0])
-    result = first_return(_make_surface(heights), position, _make_axis(60.0), np.radians(2.0), 5000.0)
+    result = first_return(make_ground(heights, SPACING), position, _make_axis(60.0), np.radians(2.0), 5000.0)
     assert result == pytest.approx(401.0 / np.cos(np.radians(58.0)), rel=5e-3)
 
 
@@ -257,13 +248,9 @@ def test_boresight_error_has_the_specified_deviation() -> None:
 def test_side_lobes_receive_the_ground_at_nadir() -> None:
     """A beam of 60 deg width, tilted by 50 deg, ends 20 deg from nadir. The side lobes include the nadir."""
     tilted_motion = Swaying(position_m=(160.0, 160.0, 1000.0), tilt=Rotation.from_rotvec([0.0, np.radians(50.0), 0.0]))
-    times = np.arange(100) * 0.1
+    times, exact = np.arange(100) * 0.1, {"scale_error": 0.0, "noise": 0.0, "count_m": 0.0}
     main_lobe, with_side_lobes = (
-        RadarAltimeter.draw(
-            RadarParameters(scale_error=0.0, noise=0.0, count_m=0.0, sidelobe_fraction=fraction),
-            FLAT,
-            np.random.default_rng(0),
-        )
+        _make_radar(np.random.default_rng(0), **exact, sidelobe_fraction=fraction)
         .measure(tilted_motion, times, np.random.default_rng(1))
         .values
         for fraction in (0.0, 0.3)

@@ -9,18 +9,8 @@ from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from tests.sim.sensor.motions import GRAVITY, Swaying
 
-NO_ERRORS: dict[str, object] = dict.fromkeys(
-    (
-        "tilt_bias_deg",
-        "tilt_noise_deg",
-        "heading_bias_deg",
-        "hard_iron_deg",
-        "soft_iron_deg",
-        "heading_noise_deg",
-        "count_deg",
-    ),
-    0.0,
-) | {"clock": ClockParameters()}
+_ERRORS = ("tilt_bias", "tilt_noise", "heading_bias", "hard_iron", "soft_iron", "heading_noise", "count")
+NO_ERRORS: dict[str, object] = {f"{name}_deg": 0.0 for name in _ERRORS} | {"clock": ClockParameters()}
 
 
 def _read(motion: Swaying, times: np.ndarray, seed: int = 0, **changes: object) -> TiltCompassReadings:

@@ -34,15 +34,8 @@ def npz(tmp_path: Path) -> Path:
 
 
 def make_terrain_parameters(source: RealTerrain, **changes: object) -> TerrainParameters:
-    values: dict[str, object] = {
-        "samples": 256,
-        "spacing_m": 1.0,
-        "craters_per_km2": 0.0,
-        "outer_scale_m": 100.0,
-        "source": source,
-        **changes,
-    }
-    return TerrainParameters.model_validate(values)
+    values: dict[str, object] = {"samples": 256, "spacing_m": 1.0, "craters_per_km2": 0.0, "outer_scale_m": 100.0}
+    return TerrainParameters.model_validate({**values, "source": source, **changes})
 
 
 def build_surface(parameters: TerrainParameters) -> Surface:
@@ -166,17 +159,9 @@ def test_geotiff_units_and_holes_are_read(tmp_path: Path) -> None:
     heights = make_dem().astype(np.float32)
     heights[3, 4] = -9999.0
     path = tmp_path / "dtm.tif"
-    profile = {
-        "driver": "GTiff",
-        "height": ROWS,
-        "width": COLUMNS,
-        "count": 1,
-        "dtype": "float32",
-        "nodata": -9999.0,
-        "crs": "EPSG:32611",
-        "transform": rasterio.transform.from_origin(5000.0, 9000.0, 2.0, 2.0),
-    }
-    with rasterio.open(path, "w", **profile) as file:
+    size = {"driver": "GTiff", "height": ROWS, "width": COLUMNS, "count": 1, "dtype": "float32", "nodata": -9999.0}
+    origin = rasterio.transform.from_origin(5000.0, 9000.0, 2.0, 2.0)
+    with rasterio.open(path, "w", **size, crs="EPSG:32611", transform=origin) as file:
         file.write(heights, 1)
     raster, ortho = read_rasters(RealTerrain(dtm=path))
     assert ortho is None

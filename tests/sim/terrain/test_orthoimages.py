@@ -184,13 +184,7 @@ def test_missing_pixels_are_limited(tmp_path: Path, columns: int) -> None:
 
 @pytest.mark.parametrize(
     ("dtype", "scale", "offset"),
-    [
-        ("uint8", 2.0, 0.0),
-        ("uint8", 1.0, -10.0),
-        ("int16", 0.01, 70.0),
-        ("uint16", 0.005, 10.0),
-        ("uint16", -0.01, 130.0),
-    ],
+    [("uint8", 2, 0), ("uint8", 1, -10), ("int16", 0.01, 70), ("uint16", 0.005, 10), ("uint16", -0.01, 130)],
 )
 def test_scale_and_offset_apply(tmp_path: Path, expected: np.ndarray, dtype: str, scale: float, offset: float) -> None:
     stored = np.rint((BRIGHTNESS * (2.0 if scale == 2.0 else 1.0) - offset) / scale)[None]
@@ -242,7 +236,6 @@ def test_colours_become_luminance(tmp_path: Path, dtype: str, alpha: bool) -> No
     source = make_source(tmp_path, np.array(bands).astype(dtype), colorinterp=names)
     check_source(source)
     _, ortho = read_rasters(source)
-    assert ortho is not None
     luminances = 0.299 * 200 + 0.587 * 30 + 0.114 * 5, 0.299 * 10 + 0.587 * 20 + 0.114 * 250
     np.testing.assert_allclose(ortho.values[0, [0, -1]], luminances)
     assert np.count_nonzero(np.isnan(ortho.values)) == (4 * 2 * COLUMNS if alpha else 0)

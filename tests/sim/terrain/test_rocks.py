@@ -25,6 +25,7 @@ from marsyard.sim.terrain.rocks.shapes import (
     max_pixels,
     rock_shapes,
 )
+from tests.sim.scenes import make_ground
 
 TARGET = PlacedRock(name="target", east_m=3.0, north_m=60.0, diameter_m=1.5, shape=4, yaw_deg=30.0)
 
@@ -34,9 +35,7 @@ def ground() -> Surface:
     """Return ground of 64 m with waves and slopes up to 20 deg."""
     side, spacing = 256, 0.25
     phase = 2 * np.pi * np.arange(side) / side
-    samples = np.full((side, side, 2), 0.2, dtype=np.float32)
-    samples[..., 0] = np.sin(3 * phase)[None, :] * 0.9 + np.cos(2 * phase)[:, None] * 0.8
-    return Surface.from_samples(samples, spacing)
+    return make_ground(np.sin(3 * phase)[None, :] * 0.9 + np.cos(2 * phase)[:, None] * 0.8, spacing)
 
 
 def make_field(ground: Surface, seed: int = 1, **changes: object) -> RockField:

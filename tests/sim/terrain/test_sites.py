@@ -10,6 +10,7 @@ from marsyard.sim.terrain import Environment, Surface, TerrainParameters, site, 
 from marsyard.sim.terrain.rocks import RockField
 from marsyard.sim.terrain.sites import PAPER
 from marsyard.sim.terrain.surface import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
+from tests.sim.scenes import make_ground
 
 FIELD_SITES = ("pisgah", "kelso", "ivanpah")
 MARS_SITES = ("gusev", "meridiani")
@@ -113,10 +114,7 @@ def test_site_grounds_can_be_built_with_rocks(name: str) -> None:
 
 def test_mean_slope_of_a_sine_wave_equals_its_closed_form() -> None:
     side, spacing = 256, 2.0
-    samples = np.full((side, side, 2), 0.2, dtype=np.float32)
-    phase = 2 * np.pi * np.arange(side) / side
-    samples[..., 0] = 10.0 * np.sin(2 * phase)[None, :]
-    surface = Surface.from_samples(samples, spacing)
+    surface = make_ground(np.tile(10.0 * np.sin(4 * np.pi * np.arange(side) / side), (side, 1)), spacing)
     # The mean absolute slope of a sine is 2 / pi of its maximum. The mean over both axes is half of that, because the
     # slope along the crests is zero.
     steepest = 10.0 * 2 * 2 * np.pi / 512
@@ -168,13 +166,10 @@ def test_terrain_with_landforms_is_read_from_a_file() -> None:
 def test_site_terrain_can_be_partly_changed() -> None:
     default = site("gusev").terrain("ground")
     custom = site("gusev").terrain("ground", {"samples": 512, "rocks": {"abundance": 0.2}, "ripples": None})
-    assert default.rocks is not None
-    assert custom.rocks is not None
     assert (custom.samples, custom.rocks.abundance, custom.ripples) == (512, 0.2, None)
     assert custom.rocks.model_copy(update={"abundance": default.rocks.abundance}) == default.rocks
     assert custom.albedo == default.albedo
     with_dunes = site("gusev").terrain("descent", {"dunes": {"wavelength_m": 40.0}})
-    assert with_dunes.dunes is not None
     assert with_dunes.dunes.wavelength_m == 40.0
     assert site("gusev").terrain("descent", {}) == site("gusev").descent
 
@@ -216,10 +211,8 @@ def test_solar_disc_is_smaller_at_mars() -> None:
 
 def test_relief_is_that_of_the_spline_surface() -> None:
     """Alternating control values of +1 and -1 m give heights of +1/9 and -1/9 m at the knots: (4 - 2)**2 / 36."""
-    samples = np.full((32, 32, 2), 0.2, dtype=np.float32)
     rows, columns = np.indices((32, 32))
-    samples[..., 0] = np.where((rows + columns) % 2 == 0, 1.0, -1.0)
-    surface = Surface.from_samples(samples, 2.0)
+    surface = make_ground(np.where((rows + columns) % 2 == 0, 1.0, -1.0), 2.0)
     relief = terrain_statistics(surface).relief_m
     assert relief == pytest.approx(2.0 / 9.0, rel=1e-5)
     knots = surface.height(2.0 * columns, 2.0 * rows)

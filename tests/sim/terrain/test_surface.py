@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from pydantic import ValidationError
 from scipy.ndimage import map_coordinates
 
@@ -32,7 +33,7 @@ def test_height_matches_scipy_spline(surface: Surface, positions: tuple[np.ndarr
     for channel, actual in ((0, surface.height(x, y, level)), (1, surface.albedo(x, y, level))):
         control = surface.levels[level][..., channel].astype(np.float64)
         expected = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
-        np.testing.assert_allclose(actual, expected, atol=1e-12)
+        assert_allclose(actual, expected, atol=1e-12)
 
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
@@ -41,7 +42,7 @@ def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple
     step = 1e-4
     derivative_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
     derivative_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
-    np.testing.assert_allclose(surface.gradient(x, y), np.stack([derivative_x, derivative_y], axis=-1), atol=1e-7)
+    assert_allclose(surface.gradient(x, y), np.stack([derivative_x, derivative_y], axis=-1), atol=1e-7)
 
 
 @pytest.mark.parametrize("level", [0, 2])
@@ -63,9 +64,7 @@ def test_ceilings_bound_the_height(surface: Surface, level: int) -> None:
 
 def test_surface_is_periodic(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
     x, y = positions
-    np.testing.assert_allclose(
-        surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11
-    )
+    assert_allclose(surface.height(x + surface.period_m, y - 2 * surface.period_m), surface.height(x, y), atol=1e-11)
 
 
 def test_resolution_levels_are_aligned() -> None:

@@ -24,6 +24,7 @@ from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
 from marsyard.sim.terrain.rocks.tails import WindTails
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS, TEXTURE
+from tests.sim.scenes import flat_ground
 
 #: Types of units: fraction of the area, albedo, and factors of roughness, texture amplitude and rock density.
 KINDS: list[dict[str, Any]] = [
@@ -100,15 +101,8 @@ def test_sum_of_split_field_equals_the_field() -> None:
 
 def test_crater_sizes_follow_saturation_and_production() -> None:
     """Cumulative numbers vary as D**-1.83 below the knee (saturation) and as D**-3.2 above it (production)."""
-    parameters = _make_parameters(
-        samples=4096,
-        spacing_m=3.0,
-        craters_per_km2=600.0,
-        crater_diameter_min_m=8.0,
-        crater_diameter_max_m=2000.0,
-        crater_exponent=1.83,
-        crater_knee_m=60.0,
-    )
+    sizes = {"crater_diameter_min_m": 8.0, "crater_diameter_max_m": 2000.0, "crater_exponent": 1.83}
+    parameters = _make_parameters(samples=4096, spacing_m=3.0, craters_per_km2=600.0, crater_knee_m=60.0, **sizes)
     diameters = 2.0 * draw_craters(parameters, np.random.default_rng(5))[:, 2]
     assert np.all(np.diff(diameters) <= 0.0)
     counts = {size: np.count_nonzero(diameters > size) for size in (8.0, 16.0, 32.0, 64.0, 128.0)}
@@ -194,18 +188,12 @@ SPACING_M, SIDE, ALBEDO = 0.02, 256, 0.25
 DIAMETER_M, HEIGHT_M, CENTRE_M = 0.4, 0.2, 2.5
 
 
-def _make_flat_surface() -> Surface:
-    samples = np.zeros((SIDE, SIDE, 2), dtype=np.float32)
-    samples[..., 1] = ALBEDO
-    return Surface.from_samples(samples, SPACING_M)
-
-
 def _make_surface_with_tail(tails: WindTails, diameter_m: float = DIAMETER_M) -> Surface:
     rock = PlacedRock(name="rock", east_m=CENTRE_M, north_m=CENTRE_M, diameter_m=diameter_m, height_m=HEIGHT_M)
     rocks = RockField.draw(
-        _make_flat_surface(), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1)
+        flat_ground(SIDE, SPACING_M, ALBEDO), RockParameters(abundance=0.0, placed=(rock,)), np.random.default_rng(1)
     )
-    return tails.apply(_make_flat_surface(), rocks, np.random.default_rng(2))
+    return tails.apply(flat_ground(SIDE, SPACING_M, ALBEDO), rocks, np.random.default_rng(2))
 
 
 def test_ridge_has_the_height_length_and_direction_of_its_parameters() -> None:
@@ -249,8 +237,6 @@ def test_tails_in_the_bank_do_not_move_rocks(tmp_path: Path, monkeypatch: pytest
     assert tail_heights.min() == 0.0
     assert tail_heights.max() > 0.02
     rocks, rocks_of_plain = (bank.rocks(0, bank.terrain(0)) for bank in (tail_bank, plain_bank))
-    assert rocks is not None
-    assert rocks_of_plain is not None
     np.testing.assert_array_equal(rocks.position_m[:, :2], rocks_of_plain.position_m[:, :2])
     # Rocks stand on the surface with ridges.
     x, y, z = rocks.position_m.T

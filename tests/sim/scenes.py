@@ -1,0 +1,39 @@
+"""Cameras, grounds and objects of the tests of rendering and of sensors."""
+
+from typing import Any
+
+import numpy as np
+
+from marsyard.sim.camera import Cahv, Cahvor
+from marsyard.sim.render import Objects, Photometry
+from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.rocks import RockField
+
+#: Axes of cameras in the body frame: looking down with +x to the right, and looking along +x.
+DOWN: dict[str, Any] = {"axis": (0.0, 0.0, -1.0), "right": (1.0, 0.0, 0.0)}
+FORWARD: dict[str, Any] = {"axis": (1.0, 0.0, 0.0), "right": (0.0, -1.0, 0.0)}
+#: With this law the radiance is albedo times the cosine of incidence in sunlight, and 0 in shadow.
+LAMBERT = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0, surrounding_albedo=0.0)
+
+
+def descent_camera(size: int = 1024, r: tuple[float, float, float] = (0.00096, -0.002183, 0.018547)) -> Cahvor:
+    """Make a descent camera of given size (pixels) and distortion, in the body frame."""
+    pinhole = Cahv.from_focal_length(14.67e-3, 12e-6 * 1024 / size, (size, size), **DOWN)
+    return Cahvor.from_cahv(pinhole, r=np.array(r))
+
+
+def make_ground(heights_m: np.ndarray, spacing_m: float, albedo: float = 0.2) -> Surface:
+    """Make ground of uniform albedo from control values of the heights."""
+    samples = np.stack([heights_m, np.full(heights_m.shape, albedo)], axis=-1).astype(np.float32)
+    return Surface.from_samples(samples, spacing_m)
+
+
+def flat_ground(side: int = 64, spacing_m: float = 8.0, albedo: float = 0.2) -> Surface:
+    """Make level ground at height 0."""
+    return make_ground(np.zeros((side, side)), spacing_m, albedo)
+
+
+def rocks_near(field: RockField, x_m: float, y_m: float, radius_m: float, above_m: float, albedo: float) -> Objects:
+    """Return the rocks around a position as objects."""
+    mesh = field.near(x_m, y_m, radius_m, above_m=above_m)
+    return Objects.of_mesh(mesh.vertices, mesh.vertex_normals, mesh.faces, mesh.rock_of_face, albedo=albedo)
