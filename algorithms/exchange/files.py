@@ -48,7 +48,7 @@ FORMAT_VERSION = 1
 ANSWER_VERSIONS = (1, 2)
 
 #: JSON files of a case and of a single descent image.
-CASE_FILE, FRAME_FILE = "case.json", "frame.json"
+CASE_FILE, IMAGE_FILE = "case.json", "image.json"
 
 #: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
@@ -91,12 +91,15 @@ def write_case(
     write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, **content, "images": images})
 
 
+def write_image(folder: Path, image: DetectorImage, content: Mapping[str, Any] | None = None) -> None:
+    """Write one image and further values into an existing folder. Raises OSError if that fails."""
+    (record,) = write_images(folder, [image], "pgm")
+    write_json(folder / IMAGE_FILE, {"exchange": FORMAT_VERSION, "image": record, **(content or {})})
+
+
 def write_frame(folder: Path, frame: DescentFrame) -> None:
     """Write one descent image and its measurements into an existing folder. Raises OSError if that fails."""
-    (image,) = write_images(folder, [frame.image], "pgm")
     content = {
-        "exchange": FORMAT_VERSION,
-        "image": image,
         "attitude": _encode_attitude(frame.attitude),
         "altitude": encode_altitude(frame.altitude),
         "sun_direction": frame.sun_direction.tolist(),
@@ -104,15 +107,21 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
         "interval_velocity_m_s": _encode_vector(frame.interval_velocity_m_s),
         **_encode_gravity(frame.gravity_m_s2),
     }
-    write_json(folder / FRAME_FILE, content)
+    write_image(folder, frame.image, content)
+
+
+def read_detector_image(folder: Path) -> DetectorImage:
+    """Read the image that `write_image` wrote. Raises ValueError if it is missing or has another version."""
+    with open_json(folder / IMAGE_FILE, "descent image") as content:
+        check_version(content)
+        return read_image(folder, content["image"])
 
 
 def read_frame(folder: Path) -> DescentFrame:
     """Read the frame that `write_frame` wrote. Raises ValueError if it is missing or has another version."""
-    with open_json(folder / FRAME_FILE, "descent image") as content:
-        check_version(content)
+    with open_json(folder / IMAGE_FILE, "descent image") as content:
         return DescentFrame(
-            image=read_image(folder, content["image"]),
+            image=read_detector_image(folder),
             attitude=_read_attitude(content["attitude"]),
             altitude=read_altitude(content["altitude"]),
             sun_direction=_read_vector(content["sun_direction"]),

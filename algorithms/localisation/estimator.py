@@ -53,13 +53,13 @@ class MapRelativeEstimator:
         self._is_contradicted = False
         self._last_update_s: float | None = None
 
-    def imu(self, increments: ImuIncrements) -> None:
+    def process_increments(self, increments: ImuIncrements) -> None:
         """Propagate the state by inertial increments; pure inertial navigation follows if the fix is discarded."""
         self._filter.propagate(increments)
         if self._has_fix:
             self._increments_since_fix.append(increments)
 
-    def altitude(self, measurement: AltitudeMeasurement) -> None:
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Update the state by an altitude, if the position on the map is known; store it otherwise.
 
         An altitude outside of the stored inertial data is ignored.
@@ -70,7 +70,7 @@ class MapRelativeEstimator:
         if self._has_fix:
             self._update_altitude(measurement)
 
-    def image(self, image: DetectorImage) -> PositionEstimate:
+    def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Match an image with the map, and return the state at its time.
 
         An image outside of the stored inertial data is refused with OUTSIDE_INERTIAL_DATA, and not used.

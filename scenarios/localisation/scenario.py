@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
 
 import numpy as np
 from jaxtyping import UInt16
 from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.localisation.answers import check_estimate
-from marsyard.algorithms.localisation.interface import InitialState, PositionEstimator, PositionOutcome
+from marsyard.algorithms.localisation.interface import InitialState, PositionOutcome
 from marsyard.scenarios.algorithm_run import case_result, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario, algorithm_result
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
@@ -24,11 +22,10 @@ from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
 from marsyard.scenarios.localisation.map_product import MapTruth, make_map
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements, StreamAnswers, feed
+from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.localisation.world import LocalisationWorld
-from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.scenarios.parts.named import PartKind
 from marsyard.scenarios.timeline import timeline_products
 from marsyard.sim.dynamics import State
@@ -82,14 +79,10 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
         }
 
         def evaluate(algorithm: str) -> CaseResult:
-            measurements = descent.measurements
-            tags = measurements.increments.times_s
-            span_s = (float(tags[0]), float(tags[-1]))
             algorithm_run = run_on_measurements(
                 lambda: LOCALISATION.make(algorithm, p.lvs, p.executable, streams.case),
-                lambda answers: _check_answers(answers, span_s),
-                measurements,
-                _run_estimator,
+                descent.measurements.check,
+                descent.measurements,
             )
             answers = algorithm_run.answer
             row = {**algorithm_run.row, **({} if answers is None else score.answer_row(descent, answers))}
@@ -103,21 +96,6 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             return algorithm_result(algorithm_run, is_answered, row, products)
 
         return case_result(p.algorithms, evaluate, shared)
-
-
-def _run_estimator(algorithm: object, inputs: LocalisationMeasurements) -> object:
-    """Run an estimator over the stream; an export and a table of answers receive all measurements at once."""
-    if isinstance(algorithm, CaseExporter | RecordedAnswer):
-        return algorithm.estimate(inputs)
-    return feed(cast(PositionEstimator, algorithm), inputs.initial, inputs.map_product, inputs.events)
-
-
-def _check_answers(answers: Any, span_s: tuple[float, float]) -> StreamAnswers:
-    """Validate the answers of a stream. Raises AlgorithmError."""
-    checked: StreamAnswers = replace(
-        answers, estimates=tuple(check_estimate(answer, span_s) for answer in answers.estimates)
-    )
-    return checked
 
 
 @dataclass(frozen=True)

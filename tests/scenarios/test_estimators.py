@@ -12,10 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.algorithms.answers import StreamedEstimator
 from marsyard.algorithms.baselines import HomographyEstimator
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
+from marsyard.algorithms.exchange import ExecutableAlgorithm, ExecutableLimits, ExecutableTargetTracker
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.reports.comparison import select_algorithm
@@ -24,6 +23,7 @@ from marsyard.scenarios.algorithm_run import case_result, run_algorithm
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.estimators import LANDING, TRACKING, VELOCITY, Task, check_algorithms, labels
 from marsyard.scenarios.interface import CaseResult, Failure
+from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.velocity import consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
@@ -60,7 +60,7 @@ def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pyt
 
 def test_programs_are_accepted_as_algorithms() -> None:
     algorithm = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
-    assert isinstance(algorithm, ExecutableVelocityEstimator)
+    assert isinstance(algorithm, ExecutableAlgorithm)
     assert algorithm.command.words == ("cat", "--number")
     LANDING.check("serve:cat")
     TRACKING.check("exec:cat")
