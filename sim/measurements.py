@@ -198,9 +198,11 @@ class DescentMeasurements:
         start_s, end_s = float(self.increments.times_s[0]), frames[-1].image.time_s
         # several images can have the same reading of the altimeter
         readings = {reading.time_s: reading for reading in self.altitudes if not math.isnan(reading.altitude_m)}
-        altitudes = [(tag, reading) for tag, reading in readings.items() if start_s <= tag <= end_s]
-        images = [(frame.image.time_s, frame) for frame in frames]
-        events = self.increments.merge([*altitudes, *images])
+        tagged: list[tuple[float, AltitudeMeasurement | DescentFrame]] = [
+            *((tag, reading) for tag, reading in readings.items() if start_s <= tag <= end_s),
+            *((frame.image.time_s, frame) for frame in frames),
+        ]
+        events = self.increments.merge(tagged)
         # increments after the last image
         return events[:-1] if isinstance(events[-1], ImuIncrements) else events
 

@@ -12,7 +12,7 @@ from marsyard.algorithms.arrays import Points2
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.map_sampling import sample_raster
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import FilterOptions, LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage, binning_factor
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
@@ -35,7 +35,7 @@ class InertialEstimator:
     def start(self, initial: InitialState, map_product: MapProduct) -> None:
         """Reset the state for a new descent."""
         self._map = map_product
-        self._filter = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._filter = LocalisationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
 
     def process_increments(self, increments: ImuIncrements) -> None:
         """Propagate the state by inertial increments."""

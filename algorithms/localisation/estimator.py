@@ -22,7 +22,7 @@ from marsyard.algorithms.localisation.fine import match_landmarks
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.landmarks import Landmarks, select_landmarks
 from marsyard.algorithms.localisation.map_sampling import elevation_at
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import FilterOptions, LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.algorithms.localisation.state_updates import GroundHeight, UpdateOutcome
@@ -43,7 +43,7 @@ class MapRelativeEstimator:
         self._map = map_product
         self._landmarks: Landmarks = select_landmarks(map_product, self.options)
         # pure inertial navigation: the filter returns to it when a coarse fix is discarded
-        self._inertial = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._inertial = LocalisationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
         self._filter = self._inertial
         self._has_fix = False
         self._increments_since_fix: list[ImuIncrements] = []

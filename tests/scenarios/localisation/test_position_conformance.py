@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.localisation.navigation_filter import NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.replay import create_subject
 from marsyard.scenarios.conformance import Subject, check_names, determine_task, subject_kinds
 from marsyard.scenarios.conformance.inputs import make_blank
@@ -219,7 +219,7 @@ def test_estimators_and_programs_have_the_localisation_suite() -> None:
 def test_inertial_data_are_exact() -> None:
     """Propagation preserves the error of the initial position: the increments have no errors."""
     case = inputs.ordinary_descent()
-    navigation = NavigationFilter.from_initial(case.initial)
+    navigation = LocalisationFilter.from_initial(case.initial)
     for event in case.events():
         if isinstance(event, ImuIncrements):
             navigation.propagate(event)
