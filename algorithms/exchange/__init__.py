@@ -9,10 +9,8 @@ from marsyard.algorithms.exchange.executable import (
 from marsyard.algorithms.exchange.files import (
     FORMAT_VERSION,
     ImageFormat,
-    read_altitude,
     read_case,
     read_frame,
-    read_increments,
     read_mast,
     read_pose,
     read_stop,
@@ -27,5 +25,5 @@ from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 __all__ = ["FORMAT_VERSION", "PREFIXES", "SITE_FORM", "SITE_REQUESTS", "VELOCITY_FORM", "VELOCITY_REQUESTS"]
 __all__ += ["VELOCITY_STREAM", "AnswerForm", "Command", "ExecutableAlgorithm", "ExecutableLimits"]
 __all__ += ["ExecutableTargetTracker", "ImageFormat", "ProgramDetails", "StreamForm", "answer_time_s", "parse_command"]
-__all__ += ["read_altitude", "read_case", "read_frame", "read_increments", "read_mast", "read_pose", "read_stop"]
+__all__ += ["read_case", "read_frame", "read_mast", "read_pose", "read_stop"]
 __all__ += ["read_target", "write_case", "write_frame"]

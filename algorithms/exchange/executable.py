@@ -13,7 +13,7 @@ from typing import Any
 
 from marsyard.algorithms import interface
 from marsyard.algorithms.answers import check_aim, check_update
-from marsyard.algorithms.exchange.files import encode_pose, encode_target, write_case, write_mast, write_stop
+from marsyard.algorithms.exchange.files import encode_pose, write_case, write_mast, write_stop
 from marsyard.algorithms.exchange.forms import (
     SITE_FORM,
     VELOCITY_FORM,
@@ -25,6 +25,7 @@ from marsyard.algorithms.exchange.forms import (
 )
 from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
 from marsyard.algorithms.exchange.serving import KeptFolder, Session, run_once
+from marsyard.algorithms.exchange.values import encode
 from marsyard.algorithms.faults import AlgorithmError, bad_answer
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements
 
@@ -161,7 +162,7 @@ def _read_update(
 VELOCITY_REQUESTS, SITE_REQUESTS = _estimate_requests(VELOCITY_FORM), _estimate_requests(SITE_FORM)
 TRACKER_REQUESTS: Mapping[str, Request] = {
     "designate": Request(
-        lambda target, pose: {"target": encode_target(target), "world_from_rover": encode_pose(pose)}, _read_state
+        lambda target, pose: {"target": encode(target), "world_from_rover": encode_pose(pose)}, _read_state
     ),
     "aim": Request(
         lambda pose, mast: {"world_from_rover": encode_pose(pose), "mast": KeptFolder(mast, write_mast)}, _read_aim

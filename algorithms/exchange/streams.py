@@ -12,17 +12,11 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from marsyard.algorithms.exchange.executable import Request
-from marsyard.algorithms.exchange.files import (
-    ANSWER_VERSIONS,
-    encode_altitude,
-    encode_increments,
-    read_altitude,
-    read_frame,
-    read_increments,
-    write_frame,
-)
+from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, read_frame, write_frame
 from marsyard.algorithms.exchange.forms import VELOCITY_FORM, AnswerForm, ProgramDetails, check_keys
+from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.faults import bad_answer
+from marsyard.sim.measurements import AltitudeMeasurement, ImuIncrements
 
 Answer = TypeVar("Answer")
 
@@ -48,8 +42,8 @@ class StreamForm(Generic[Answer]):
         """Requests of a program, by the method of the stream."""
         return {
             "start": Request(self.encode_start, _read_null),
-            "process_increments": Request(lambda item: {"increments": encode_increments(item)}, _read_null),
-            "process_altitude": Request(lambda item: {"altitude": encode_altitude(item)}, _read_null),
+            "process_increments": Request(lambda item: {"increments": encode(item)}, _read_null),
+            "process_altitude": Request(lambda item: {"altitude": encode(item)}, _read_null),
             "process_image": Request(
                 lambda image: {"image": lambda folder: self.write_image(folder, image)}, self._read_optional
             ),
@@ -80,8 +74,8 @@ class StreamForm(Generic[Answer]):
         """Call the stream's method of a request, if it has it. Raises ValueError for an unknown request."""
         readers: Mapping[str, Callable[[], tuple[Any, ...]]] = {
             "start": lambda: self.read_start(request),
-            "process_increments": lambda: (read_increments(request["increments"]),),
-            "process_altitude": lambda: (read_altitude(request["altitude"]),),
+            "process_increments": lambda: (decode(ImuIncrements, request["increments"]),),
+            "process_altitude": lambda: (decode(AltitudeMeasurement, request["altitude"]),),
             "process_image": lambda: (self.read_image(Path(request["image"])),),
             "finish": lambda: (),
         }

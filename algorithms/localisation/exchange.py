@@ -6,12 +6,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.exchange.files import (
@@ -24,64 +22,39 @@ from marsyard.algorithms.exchange.files import (
 )
 from marsyard.algorithms.exchange.forms import AnswerForm
 from marsyard.algorithms.exchange.streams import StreamForm
+from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.localisation.answers import check_estimate
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 
 #: JSON file of a map.
 MAP_FILE = "map.json"
-#: Numbers of `MapProduct` in the map file.
-_MAP_KEYS = ("pixel_m", "registration_sd_m", "distortion_sd_m", "elevation_sd_m")
 #: Key of the attitude in an answer.
 _ATTITUDE = "world_from_body_xyzw"
 #: Largest difference of a quaternion's norm from 1 in an answer.
 _MAX_NORM_ERROR = 1e-3
 
 
-def encode_initial(initial: InitialState) -> dict[str, Any]:
-    """Encode the initial state for JSON."""
-    vectors = {name: getattr(initial, name).tolist() for name in ("position_m", "velocity_m_s", "covariance")}
-    attitude = initial.world_from_body.as_quat().tolist()
-    scalars = {"time_s": initial.time_s, "gravity_m_s2": initial.gravity_m_s2}
-    return {**scalars, **vectors, "world_from_body_xyzw": attitude}
-
-
-def read_initial(content: Mapping[str, Any]) -> InitialState:
-    """Decode the initial state that `encode_initial` encoded."""
-    return InitialState(
-        time_s=content["time_s"],
-        position_m=np.array(content["position_m"], dtype=np.float64),
-        velocity_m_s=np.array(content["velocity_m_s"], dtype=np.float64),
-        world_from_body=Rotation.from_quat(content["world_from_body_xyzw"]),
-        covariance=np.array(content["covariance"], dtype=np.float64),
-        gravity_m_s2=content["gravity_m_s2"],
-    )
-
-
 def write_map(folder: Path, map_product: MapProduct) -> None:
     """Write a map into an existing folder: two rasters of little-endian float32, row by row, and a table."""
     rows, columns = map_product.appearance.shape
     content: dict[str, Any] = {"exchange": FORMAT_VERSION, "rows": rows, "columns": columns}
-    for name in ("appearance", "elevation"):
+    for name, raster in (("appearance", map_product.appearance), ("elevation", map_product.elevation_m)):
         content[name] = f"{name}.f32"
-    map_product.appearance.astype("<f4").tofile(folder / content["appearance"])
-    map_product.elevation_m.astype("<f4").tofile(folder / content["elevation"])
-    content["origin_m"] = map_product.origin_m.tolist()
-    write_json(folder / MAP_FILE, {**content, **{name: getattr(map_product, name) for name in _MAP_KEYS}})
+        raster.astype("<f4").tofile(folder / content[name])
+    write_json(folder / MAP_FILE, {**content, **encode(map_product, ["appearance", "elevation_m"])})
 
 
 def read_map(folder: Path) -> MapProduct:
     """Read the map that `write_map` wrote. Raises ValueError if it is missing or has another version."""
-
-    def read_raster(file: str) -> Float32[np.ndarray, "rows columns"]:
-        values = np.fromfile(folder / file, dtype="<f4").reshape(content["rows"], content["columns"])
-        return np.asarray(values, dtype=np.float32)
-
     with open_json(folder / MAP_FILE, "map") as content:
         check_version(content)
-        origin = np.array(content["origin_m"], dtype=np.float64)
-        appearance, elevation = read_raster(content["appearance"]), read_raster(content["elevation"])
-        return MapProduct(appearance, elevation, origin, **{name: content[name] for name in _MAP_KEYS})
+        shape = content["rows"], content["columns"]
+        appearance, elevation = (
+            np.fromfile(folder / content[name], dtype="<f4").reshape(shape).astype(np.float32)
+            for name in ("appearance", "elevation")
+        )
+        return decode(MapProduct, content, appearance=appearance, elevation_m=elevation)
 
 
 def _create_estimate(
@@ -106,7 +79,7 @@ def _get_numbers(estimate: PositionEstimate, key: str) -> Any:
 
 
 def _encode_start(initial: InitialState, map_product: MapProduct) -> dict[str, Any]:
-    return {"initial": encode_initial(initial), "map": lambda folder: write_map(folder, map_product)}
+    return {"initial": encode(initial), "map": lambda folder: write_map(folder, map_product)}
 
 
 POSITION_FORM = AnswerForm(
@@ -121,5 +94,5 @@ POSITION_STREAM = StreamForm(
     write_image,
     read_detector_image,
     _encode_start,
-    lambda request: (read_initial(request["initial"]), read_map(Path(request["map"]))),
+    lambda request: (decode(InitialState, request["initial"]), read_map(Path(request["map"]))),
 )

@@ -17,16 +17,13 @@ from marsyard.algorithms.exchange.files import (
     CASE_FILE,
     FORMAT_VERSION,
     check_version,
-    encode_altitude,
-    encode_increments,
     open_json,
-    read_altitude,
     read_image,
-    read_increments,
     write_images,
     write_json,
 )
-from marsyard.algorithms.localisation.exchange import POSITION_FORM, encode_initial, read_initial, read_map, write_map
+from marsyard.algorithms.exchange.values import decode, encode
+from marsyard.algorithms.localisation.exchange import POSITION_FORM, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.scenarios.localisation.stream import LocalisationMeasurements
 from marsyard.scenarios.offline import AnswerFormat
@@ -36,27 +33,17 @@ from marsyard.scenarios.streamed import StreamAnswers
 def write_descent(folder: Path, measurements: LocalisationMeasurements) -> None:
     """Write the measurements of a descent into an existing folder. Raises OSError if that fails."""
     write_map(folder, measurements.map_product)
-    content = {
-        "task": "localisation",
-        "initial": encode_initial(measurements.initial),
-        "increments": encode_increments(measurements.increments),
-        "altitudes": [encode_altitude(altitude) for altitude in measurements.altitudes],
-        "images": write_images(folder, measurements.images, "png"),
-    }
-    write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, **content})
+    images = write_images(folder, measurements.images, "png")
+    content = encode(measurements, ["map_product", "images"])
+    write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, "task": "localisation", **content, "images": images})
 
 
 def read_descent(folder: Path) -> LocalisationMeasurements:
     """Read the descent that `write_descent` wrote. Raises ValueError if it is missing or has another version."""
     with open_json(folder / CASE_FILE, "case") as content:
         check_version(content)
-        return LocalisationMeasurements(
-            initial=read_initial(content["initial"]),
-            map_product=read_map(folder),
-            increments=read_increments(content["increments"]),
-            altitudes=tuple(read_altitude(record) for record in content["altitudes"]),
-            images=tuple(read_image(folder, record) for record in content["images"]),
-        )
+        images = tuple(read_image(folder, record) for record in content["images"])
+        return decode(LocalisationMeasurements, content, map_product=read_map(folder), images=images)
 
 
 def _join(estimates: Sequence[PositionEstimate]) -> StreamAnswers[PositionEstimate]:

@@ -158,23 +158,6 @@ def test_increments_and_altitudes_arrive_in_the_order_of_their_tags() -> None:
     assert record_events(measurements.select(())) == []
 
 
-def test_increments_before_an_image_end_at_the_next_boundary() -> None:
-    measurements = inputs.inertial_descent(5)
-    images = tuple(replace(image, time_s=image.time_s + 0.003) for image in measurements.images)
-    events = record_events(replace(measurements, images=images, altitudes=measurements.altitudes[:1] * 5))
-    for block, frame in zip(events[2::2], events[3::2], strict=True):
-        assert isinstance(block, ImuIncrements)
-        assert isinstance(frame, DescentFrame)
-        assert block.times_s[-1] - 0.01 < frame.image.time_s <= block.times_s[-1]
-    # an image after the last increment follows all of them
-    late = replace(images[-1], time_s=images[-1].time_s + 1.0)
-    *_, increments, frame = record_events(replace(measurements, images=(*images[:-1], late)))
-    assert isinstance(increments, ImuIncrements)
-    assert isinstance(frame, DescentFrame)
-    assert increments.times_s[-1] == measurements.increments.times_s[-1]  # type: ignore[union-attr]
-    assert frame.image is late
-
-
 def test_increments_of_the_conformance_suite_are_exact() -> None:
     measurements = inputs.inertial_descent(5)
     attitudes, increments, gravity = measurements.attitudes, measurements.increments, measurements.gravity_m_s2

@@ -14,18 +14,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
-from marsyard.algorithms.exchange.files import encode_increments, read_increments
 from marsyard.algorithms.exchange.serving import end_idle_programs, idle_processes
+from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.localisation.baselines import InertialEstimator
-from marsyard.algorithms.localisation.exchange import (
-    POSITION_FORM,
-    POSITION_STREAM,
-    encode_initial,
-    read_initial,
-    read_map,
-    write_map,
-)
+from marsyard.algorithms.localisation.exchange import POSITION_FORM, POSITION_STREAM, read_map, write_map
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.algorithm_run import hash_inputs, run_algorithm
@@ -99,10 +92,9 @@ def test_exchanged_values_are_restored_exactly(tmp_path: Path) -> None:
     )
     for letter in "cahvore":
         np.testing.assert_array_equal(getattr(image.camera, letter), getattr(IMAGE.camera, letter))
-    assert hash_inputs(read_increments(json.loads(json.dumps(encode_increments(INCREMENTS))))) == hash_inputs(
-        INCREMENTS
-    )
-    initial = read_initial(json.loads(json.dumps(encode_initial(INITIAL))))
+    increments = decode(ImuIncrements, json.loads(json.dumps(encode(INCREMENTS))))
+    assert hash_inputs(increments) == hash_inputs(INCREMENTS)
+    initial = decode(InitialState, json.loads(json.dumps(encode(INITIAL))))
     assert (initial.world_from_body.inv() * INITIAL.world_from_body).magnitude() < 1e-14
     same = replace(initial, world_from_body=INITIAL.world_from_body)
     assert hash_inputs(same) == hash_inputs(INITIAL)

@@ -367,7 +367,7 @@ class LateEstimator:
 
     start = imu = altitude = _ignore
 
-    def image(self, _: object) -> Any:
+    def process_image(self, _: object) -> Any:
         """Answer without a position."""
         return self.finish()
 
