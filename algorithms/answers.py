@@ -5,8 +5,8 @@ Used for algorithms in this process and in external programs (`marsyard.algorith
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,14 +14,8 @@ from jaxtyping import Float64
 
 from marsyard.algorithms import interface
 from marsyard.algorithms.faults import bad_answer
-from marsyard.algorithms.interface import VelocityEstimate, VelocityStream
-from marsyard.sim.measurements import (
-    AltitudeMeasurement,
-    DescentFrame,
-    DescentMeasurements,
-    ImuIncrements,
-    MastCalibration,
-)
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.sim.measurements import MastCalibration
 
 #: Largest asymmetry of a covariance due to rounding, as a fraction of its largest entry.
 _MAX_ASYMMETRY = 1e-9
@@ -35,6 +29,8 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     """
     check_type("the answer", answer, VelocityEstimate)
     check_type("outcome", answer.outcome, interface.VelocityOutcome)
+    if answer.after_images:
+        raise bad_answer("after_images is given; it must be empty: the caller sets it")
     if (answer.outcome is interface.VelocityOutcome.VALID) != (answer.velocity_m_s is not None):
         problem = "is missing" if answer.velocity_m_s is None else "is given"
         allowed = "a velocity if and only if the outcome is VALID"
@@ -59,9 +55,7 @@ def check_velocity(answer: Any, tags_s: Sequence[float] | None = None) -> Veloci
     elif tags_s is not None and len(tags_s) < 2 and velocity is not None:
         raise bad_answer("one image has no last interval; allowed: a velocity with a span_s, or a failure outcome")
     attitude_error = check_numbers("attitude_error_rad", answer.attitude_error_rad, (3,))
-    return VelocityEstimate(
-        answer.outcome, velocity, answer.details, covariance, span, answer.after_images, attitude_error
-    )
+    return VelocityEstimate(answer.outcome, velocity, answer.details, covariance, span, (), attitude_error)
 
 
 def check_site(answer: Any) -> interface.SiteEstimate:
@@ -141,44 +135,6 @@ def _type_name(value: object) -> str:
     return type(value).__name__
 
 
-#: Methods of a stream, in calling order.
-STREAM_METHODS = ("start", "process_image", "finish")
-#: Optional methods of a stream, by the type of measurement that they receive.
-OPTIONAL_STREAM_METHODS: Mapping[type, str] = {
-    ImuIncrements: "process_increments",
-    AltitudeMeasurement: "process_altitude",
-}
-
-
-@dataclass(frozen=True)
-class StreamedEstimator:
-    """`VelocityEstimator` that passes the measurements of a descent one by one to a `VelocityStream`."""
-
-    stream: VelocityStream
-
-    def estimate(self, measurements: DescentMeasurements) -> VelocityEstimate:
-        """Return the final estimate, with the answers after each image; raises AlgorithmError for an invalid answer."""
-        tags = measurements.tags_s
-        self.stream.start()
-        answers: list[VelocityEstimate | None] = []
-        for event in measurements.events():
-            answer = self.process(event)
-            if isinstance(event, DescentFrame):
-                tags_so_far = tags[: len(answers) + 1]
-                answers.append(None if answer is None else _check_stream_answer(answer, tags_so_far))
-        final = _check_stream_answer(self.stream.finish(), tags)
-        return replace(final, after_images=tuple(answers))
-
-    def process(self, event: ImuIncrements | AltitudeMeasurement | DescentFrame) -> object:
-        """Pass a measurement to the stream's method for its type, if it has one; return the answer, unchecked."""
-        if isinstance(event, DescentFrame):
-            return self.stream.process_image(event)
-        method = getattr(self.stream, OPTIONAL_STREAM_METHODS[type(event)], None)
-        if method is not None:
-            method(event)
-        return None
-
-
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
     """Validate an estimate; a missing time span becomes the last image interval.
 
@@ -188,10 +144,3 @@ def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstim
     if estimate.span_s is not None or len(tags_s) < 2:
         return estimate
     return replace(estimate, span_s=(tags_s[-2], tags_s[-1]))
-
-
-def _check_stream_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """Validate one answer of a stream. Raises the same error as `check_velocity`."""
-    if isinstance(answer, VelocityEstimate) and answer.after_images:
-        raise bad_answer("after_images is given; it must be empty: the caller sets it")
-    return check_and_set_span(answer, tags_s)

@@ -95,16 +95,16 @@ class NoImage:
         """Reset the state for a new descent."""
         self._navigation.start(initial, map_product)
 
-    def imu(self, increments: ImuIncrements) -> None:
+    def process_increments(self, increments: ImuIncrements) -> None:
         """Propagate the initial state."""
-        self._navigation.imu(increments)
+        self._navigation.process_increments(increments)
 
-    def altitude(self, measurement: AltitudeMeasurement) -> None:
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Ignore altitudes."""
 
-    def image(self, image: DetectorImage) -> PositionEstimate:
+    def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Return the answer at the time of an image."""
-        return self._position(self._navigation.image(image))
+        return self._position(self._navigation.process_image(image))
 
     def finish(self) -> PositionEstimate:
         """Return the answer at the time of the last increment."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import ParamSpec, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,10 @@ from marsyard.sim.measurements import (
     RoverMeasurements,
     TargetDesignation,
 )
+
+StartInputs = ParamSpec("StartInputs")
+Image = TypeVar("Image", contravariant=True)
+Answer = TypeVar("Answer", covariant=True)
 
 
 class VelocityOutcome(Enum):
@@ -63,29 +67,31 @@ class VelocityEstimator(Protocol):
         """Estimate the velocity; never raises for an image, attitude or altitude that an instrument can deliver."""
 
 
-@runtime_checkable
-class VelocityStream(Protocol):
-    """Protocol: estimate the horizontal velocity from any number of descent images, received one by one.
-
-    `marsyard.algorithms.answers.StreamedEstimator` converts it to a `VelocityEstimator`.
+class ImageStream(Protocol[StartInputs, Image, Answer]):
+    """Protocol of a stream: an estimator that receives any number of images of a descent one by one.
 
     A stream can also have one or both of two optional methods, which are called in descents with inertial increments.
-    All measurements then arrive in the order of their time tags, up to the last image:
+    All measurements arrive in the order of their time tags:
 
     - ``process_increments(increments: ImuIncrements) -> None``: receives the increments since the last call. Before an
       altitude or an image, they end at the first boundary that is not earlier than its time tag.
-    - ``process_altitude(measurement: AltitudeMeasurement) -> None``: receives each altitude once. The frame of the next
-      image contains it again.
+    - ``process_altitude(measurement: AltitudeMeasurement) -> None``: receives each altitude once.
+
+    No method raises for a measurement that an instrument can deliver.
     """
 
-    def start(self) -> None:
+    def start(self, *inputs: StartInputs.args, **named: StartInputs.kwargs) -> None:
         """Reset the state for a new descent."""
 
-    def process_image(self, frame: DescentFrame) -> VelocityEstimate | None:
-        """Process the next image; return an estimate, or None. Like `VelocityEstimator.estimate`, never raises."""
+    def process_image(self, image: Image) -> Answer | None:
+        """Process the next image; return an estimate, or None."""
 
-    def finish(self) -> VelocityEstimate:
+    def finish(self) -> Answer:
         """Return the final estimate of the descent; a failure outcome if there were too few images."""
+
+
+#: Stream that estimates the horizontal velocity. `start` has no arguments; the last increments end at the last image.
+VelocityStream = ImageStream[[], DescentFrame, VelocityEstimate]
 
 
 class TrackingState(Enum):

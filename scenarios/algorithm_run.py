@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails
+from marsyard.algorithms.exchange import ExecutableLimits, ProgramDetails, answer_time_s
 from marsyard.algorithms.faults import AlgorithmError, Fault, describe_error
 from marsyard.scenarios.estimators import Task, check_algorithms
 from marsyard.scenarios.interface import Failure, Scalar
@@ -165,12 +165,6 @@ def run_on_measurements(
         return check(answer)
 
     return run_algorithm(create_and_call, check_inputs_and_answer)
-
-
-def answer_time_s(answer: object, processor_s: float) -> float:
-    """Return the computation time: the processor time, or the wall-clock time that an external program reports."""
-    details = getattr(answer, "details", None)
-    return details.time_s if isinstance(details, ProgramDetails) else processor_s
 
 
 class AlgorithmSelection(Parameters):

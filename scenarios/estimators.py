@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 from marsyard.algorithms import exchange
-from marsyard.algorithms.answers import STREAM_METHODS
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.isolation.host import construct, reset
 from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, describe
 from marsyard.scenarios.offline import AnswerFormat, answers_file, create_offline, is_offline, read_answers
+from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
 from marsyard.scenarios.systems import systems
 
 #: Entry point group of other packages' algorithms.
@@ -68,13 +68,14 @@ class Task(Generic[Algorithm, Options]):
 
     - name: name on the command line and in the exchange with programs
     - what: noun for an algorithm of the task in messages, such as "velocity estimator"
-    - methods: required methods of an algorithm
+    - methods: required methods of an algorithm that receives all measurements at once; empty if all receive them one by
+      one (streams)
     - answers: data classes and enumerations of its answers
     - shipped: functions that create Marsyard's algorithms from the options of the published algorithm
     - options: class of the options of the published algorithm
     - executable: function that wraps an external program; None if programs are not accepted
     - offline: format of the answers in a table; None if an answer determines the next inputs
-    - streamed: function that wraps an algorithm that receives images one by one; None if streams are not accepted
+    - accepts_streams: whether algorithms can be streams (`marsyard.algorithms.interface.ImageStream`)
     - suite: ``module:Class`` of the conformance suite, a `marsyard.scenarios.conformance.checks.Suite`; empty without
       one
     """
@@ -85,9 +86,9 @@ class Task(Generic[Algorithm, Options]):
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     options: type[Options]
     answers: tuple[type, ...] = ()
-    executable: Callable[[exchange.Command, exchange.ExecutableLimits], Algorithm] | None = None
+    executable: Callable[[exchange.Command, exchange.ExecutableLimits], Any] | None = None
     offline: AnswerFormat[Any] | None = None
-    streamed: Callable[[Any], Algorithm] | None = None
+    accepts_streams: bool = False
     suite: str = ""
 
     def check(self, spec: str) -> None:
@@ -98,7 +99,7 @@ class Task(Generic[Algorithm, Options]):
         if command is not None:
             if self.executable is None:
                 raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a name, module:Class")
-            if command.stream and self.streamed is None:
+            if command.stream and not self.accepts_streams:
                 raise ValueError(f"'{spec}': a {self.what} does not accept a stream of images; allowed: exec:, serve:")
             return
         if is_offline(spec):
@@ -107,7 +108,8 @@ class Task(Generic[Algorithm, Options]):
                 read_answers(file, answer_format)
             return
         factory = describe_custom(spec, self.shipped)
-        methods = STREAM_METHODS if self._is_stream(factory.members) else self.methods
+        is_stream = self._is_stream(factory.members) or not self.methods
+        methods = STREAM_METHODS if is_stream else self.methods
         missing = [method for method in methods if method not in factory.members]
         if not factory.is_callable:
             raise ValueError(f"'{spec}' is not a valid {self.what}: {factory.kind}, not a class or function")
@@ -119,22 +121,24 @@ class Task(Generic[Algorithm, Options]):
 
         The case number selects the answer of algorithms that run outside of Marsyard.
         """
-        if spec in self.shipped:
-            return self.shipped[spec](options)
         if is_offline(spec):
             return cast(Algorithm, create_offline(spec, self._answer_format(spec), case))
+        algorithm = self._create(spec, options, limits)
+        return cast(Algorithm, StreamedEstimator(algorithm) if self._is_stream(dir(algorithm)) else algorithm)
+
+    def _create(self, spec: str, options: Options, limits: exchange.ExecutableLimits) -> Any:
+        """Create an algorithm by name; a stream is not wrapped."""
+        if spec in self.shipped:
+            return self.shipped[spec](options)
         command = exchange.parse_command(spec)
         if command is not None and self.executable is not None:
             return self.executable(command, limits)
         path = custom_path(spec, self.shipped)
         if limits.isolated:
-            algorithm: Any = RemoteAlgorithm(path, limits, {item.__qualname__: item for item in self.answers})
-        else:
-            algorithm = construct(_import(path), limits.device)
-            reset(algorithm)
-        if self.streamed is not None and self._is_stream(dir(algorithm)):
-            return self.streamed(algorithm)
-        return cast(Algorithm, algorithm)
+            return RemoteAlgorithm(path, limits, {item.__qualname__: item for item in self.answers})
+        algorithm = construct(_import(path), limits.device)
+        reset(algorithm)
+        return algorithm
 
     def accepts_stream(self, spec: str) -> bool | None:
         """Return whether an algorithm accepts any number of images; None if unknown before its creation."""
@@ -150,9 +154,8 @@ class Task(Generic[Algorithm, Options]):
 
     def _is_stream(self, members: Container[str]) -> bool:
         """Return whether an algorithm with these members receives images one by one; methods may be missing."""
-        is_complete = all(method in members for method in STREAM_METHODS)
-        is_partial = "process_image" in members and not any(method in members for method in self.methods)
-        return self.streamed is not None and (is_complete or is_partial)
+        receives_all = bool(self.methods) and all(method in members for method in self.methods)
+        return self.accepts_streams and "process_image" in members and not receives_all
 
     def _answer_format(self, spec: str) -> AnswerFormat[Any]:
         if self.offline is None:

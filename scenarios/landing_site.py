@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.exchange import ExecutableSiteEstimator
+from marsyard.algorithms import exchange
 from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchStatus, Safety
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
@@ -27,7 +28,7 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
         "essential-matrix": lambda options: EssentialMatrixEstimator(replace(options, **IMPROVEMENTS)),
         "semi-global": lambda options: SemiGlobalEstimator(replace(options, **IMPROVEMENTS)),
     },
-    executable=ExecutableSiteEstimator,
+    executable=partial(exchange.ExecutableAlgorithm, requests=exchange.SITE_REQUESTS),
     options=HdaOptions,
     offline=SITE_FORMAT,
 )

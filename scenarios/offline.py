@@ -19,13 +19,11 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from marsyard.algorithms.answers import check_site, check_velocity
-from marsyard.algorithms.exchange import write_case
+from marsyard.algorithms.exchange import SITE_FORM, VELOCITY_FORM, AnswerForm, write_case
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.user_files import check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular
-from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor.compression import compress
 
 EXPORT, ANSWERS = "export:", "answers:"
@@ -43,28 +41,25 @@ _MAX_MAGNITUDE = {"_m_s": 1e3, "_m2_s2": 1e6, "_m": 1e6, "_s": 1e6}
 Answer = TypeVar("Answer")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class AnswerFormat(Generic[Answer]):
     """Format of a task's answers in a table.
 
-    - required: numeric columns in addition to `case` and `outcome`; a row contains all their values, or none
-    - optional: groups of further numeric columns; a row contains all values of a group, or none
-    - outcomes: allowed outcomes; an empty outcome with numbers means the first outcome
-    - create_answer: creates and checks an answer from outcome and numbers. Raises AlgorithmError.
+    - form: form of the answers, as in the exchange with programs
+    - numbers: columns of each key of the form. A square matrix is symmetric, and its columns are those of its upper
+      triangle, row by row. A row contains all numbers of a key, or none.
+    - required: keys whose columns each table contains
     - create_empty: creates the refusal that an export returns
-    - add_inputs: adds inputs of the case that the table does not contain, such as the a-priori site, to an answer
     - note: explanation of the columns for the user
     - write_inputs: writes the inputs of a case into an existing folder. Raises OSError.
     - join: joins the answers in the lines of a case, in the order of the table; None: a case has one line. Raises
       ValueError.
     """
 
+    form: AnswerForm[Answer]
+    numbers: Mapping[str, tuple[str, ...]]
     required: tuple[str, ...]
-    optional: tuple[tuple[str, ...], ...]
-    outcomes: type[Enum]
-    create_answer: Callable[[Enum, Mapping[str, float]], Answer]
-    create_empty: Callable[[Any], Answer]
-    add_inputs: Callable[[Answer, Any], Answer] = lambda answer, _: answer
+    create_empty: Callable[[Any], Any]
     note: str = ""
     write_inputs: Callable[[Path, Any], None] = lambda folder, inputs: write_case(folder, inputs, image_format="png")
     join: Callable[[Sequence[Answer]], Any] | None = None
@@ -72,51 +67,48 @@ class AnswerFormat(Generic[Answer]):
     @property
     def columns(self) -> tuple[str, ...]:
         """All columns."""
-        return ("case", "outcome", *self.required, *(name for group in self.optional for name in group))
+        return ("case", "outcome", *(name for group in self.numbers.values() for name in group))
+
+    @property
+    def required_columns(self) -> tuple[str, ...]:
+        """Columns that each table contains."""
+        return ("case", *(name for key in self.required for name in self.numbers[key]))
+
+    def create_answer(self, outcome: Enum, numbers: Mapping[str, float]) -> Answer:
+        """Create and check an answer from its outcome and the numbers by column. Raises AlgorithmError."""
+        check_column_groups(tuple(self.numbers.values()), numbers)
+        arrays = {
+            key: _arrange([numbers[name] for name in columns], self.form.shapes[key]) if columns[0] in numbers else None
+            for key, columns in self.numbers.items()
+        }
+        return self.form.create(outcome=outcome, details=None, **arrays)
 
 
-def _create_velocity(outcome: Enum, numbers: Mapping[str, float]) -> VelocityEstimate:
-    """Create a velocity estimate; the columns of the covariance are its elements (0, 0), (0, 1) and (1, 1)."""
-    groups = (VELOCITY_FORMAT.required, *VELOCITY_FORMAT.optional)
-    velocity, covariance, span = ([numbers[name] for name in group if name in numbers] for group in groups)
-    estimate = VelocityEstimate(
-        outcome=VelocityOutcome(outcome),
-        velocity_m_s=np.array(velocity) if velocity else None,
-        covariance_m2_s2=np.array([covariance[:2], covariance[1:]]) if covariance else None,
-        span_s=(span[0], span[1]) if span else None,
-    )
-    return check_velocity(estimate)
+def _arrange(values: Sequence[float], shape: tuple[int, ...]) -> np.ndarray:
+    """Arrange the numbers of a key in their shape; see `AnswerFormat.numbers`."""
+    if len(shape) < 2:
+        return np.array(values, dtype=np.float64).reshape(shape)
+    matrix, upper = np.zeros(shape), np.triu_indices(shape[0])
+    matrix[upper] = matrix.T[upper] = values
+    return matrix
 
 
-def _create_site(outcome: Enum, numbers: Mapping[str, float]) -> SiteEstimate:
-    """Create a site estimate; outcomes without convergence need no position."""
-    position = [numbers[name] for name in SITE_FORMAT.required if name in numbers]
-    estimate = SiteEstimate(SiteOutcome(outcome), np.array(position) if position else None)
-    return check_site(estimate) if position or estimate.outcome.converged else estimate
-
-
-def _add_apriori_site(estimate: SiteEstimate, measurements: LandingMeasurements) -> SiteEstimate:
-    """Return the estimate with the a-priori site if the algorithm did not converge."""
-    if estimate.outcome.converged or estimate.site_world is not None:
-        return estimate
-    return SiteEstimate(estimate.outcome, measurements.apriori_site_world)
-
-
-VELOCITY_FORMAT: AnswerFormat[VelocityEstimate] = AnswerFormat(
-    required=("velocity_east_m_s", "velocity_north_m_s"),
-    optional=(("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"), ("start_s", "end_s")),
-    outcomes=VelocityOutcome,
-    create_answer=_create_velocity,
+VELOCITY_FORMAT = AnswerFormat(
+    form=VELOCITY_FORM,
+    numbers={
+        "velocity_m_s": ("velocity_east_m_s", "velocity_north_m_s"),
+        "covariance_m2_s2": ("covariance_east_m2_s2", "covariance_east_north_m2_s2", "covariance_north_m2_s2"),
+        "span_s": ("start_s", "end_s"),
+    },
+    required=("velocity_m_s",),
     create_empty=lambda _: VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None),
     note="A velocity is the mean between the last two images, or between the time tags `start_s` and `end_s`.",
 )
-SITE_FORMAT: AnswerFormat[SiteEstimate] = AnswerFormat(
-    required=("site_east_m", "site_north_m", "site_up_m"),
-    optional=(),
-    outcomes=SiteOutcome,
-    create_answer=_create_site,
+SITE_FORMAT = AnswerFormat(
+    form=SITE_FORM,
+    numbers={"site_world": ("site_east_m", "site_north_m", "site_up_m")},
+    required=("site_world",),
     create_empty=lambda measurements: SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world),
-    add_inputs=_add_apriori_site,
 )
 
 
@@ -178,7 +170,7 @@ class RecordedAnswer(Generic[Answer]):
         """Return the answer. Raises AlgorithmError if the table has none."""
         if self.answer is None:
             raise AlgorithmError(Fault.BAD_ANSWER, self.error_message)
-        return self.answer_format.add_inputs(self.answer, measurements)
+        return self.answer_format.form.complete(self.answer, measurements)
 
 
 def read_answers(file: Path, answer_format: AnswerFormat[Answer]) -> Mapping[int, Answer]:
@@ -203,8 +195,8 @@ def _read(file: Path, answer_format: AnswerFormat[Any], _modified_ns: int, _size
         return case, answer
 
     hint = f"allowed: {', '.join(answer_format.columns)}; the suffix of a name is its unit"
-    required = ("case", *answer_format.required)
-    answers, problems = parse_table(file, MAX_ROWS, required, answer_format.columns, hint, parse)
+    columns, required = answer_format.columns, answer_format.required_columns
+    answers, problems = parse_table(file, MAX_ROWS, required, columns, hint, parse)
     lines_by_case: dict[int, list[Any]] = {}
     for case, answer in answers:
         lines_by_case.setdefault(case, []).append(answer)
@@ -231,8 +223,7 @@ def _parse_answer(cells: Mapping[str, str], answer_format: AnswerFormat[Any]) ->
         unit, limit = next(limits, ("", math.inf))
         if abs(value) > limit:
             raise ValueError(f"{name} is {text}, beyond {limit:g}; the suffix of the name is the unit ({unit})")
-    check_column_groups((answer_format.required, *answer_format.optional), numbers)
-    outcome, outcomes = cells.get("outcome", ""), answer_format.outcomes.__members__
+    outcome, outcomes = cells.get("outcome", ""), answer_format.form.outcomes.__members__
     if not outcome and not numbers:
         raise ValueError("neither an outcome nor numbers are given")
     if outcome and outcome not in outcomes:

@@ -7,12 +7,13 @@ answer is the true mean velocity over the same span.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64, UInt16
 
 from marsyard.algorithms import exchange
-from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span
+from marsyard.algorithms.answers import check_and_set_span
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, dimes_products
 from marsyard.algorithms.dimes.baselines import HomographyEstimator, PhaseCorrelationEstimator
 from marsyard.algorithms.dimes.options import IMPROVEMENTS
@@ -22,6 +23,7 @@ from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.estimators import Task, configurations
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline import VELOCITY_FORMAT, CaseExporter, RecordedAnswer
+from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
@@ -43,14 +45,12 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
         "homography": lambda _: HomographyEstimator(),
     },
     # a program receives three images at once, or all images one by one
-    executable=lambda command, limits: (
-        StreamedEstimator(exchange.ExecutableVelocityStream(command, limits))
-        if command.stream
-        else exchange.ExecutableVelocityEstimator(command, limits)
+    executable=lambda command, limits: exchange.ExecutableAlgorithm(
+        command, limits, exchange.VELOCITY_STREAM.requests if command.stream else exchange.VELOCITY_REQUESTS
     ),
     options=DimesOptions,
     offline=VELOCITY_FORMAT,
-    streamed=StreamedEstimator,
+    accepts_streams=True,
 )
 
 
@@ -78,8 +78,22 @@ def run_estimator(
         return estimator.estimate(triple_inputs)
 
     return run_on_measurements(
-        create_estimator, lambda answer: check_and_set_span(answer, tags), measurements, estimate
+        create_estimator, lambda answer: check_velocity_answer(answer, tags), measurements, estimate
     )
+
+
+def check_velocity_answer(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
+    """Validate the answer of an estimator, or those of a stream, which become the final answer's `after_images`.
+
+    `tags_s` are the time tags of the images; missing time spans become the last interval. Raises AlgorithmError.
+    """
+    if not isinstance(answer, StreamAnswers):
+        return check_and_set_span(answer, tags_s)
+    after_images = tuple(
+        None if estimate is None else check_and_set_span(estimate, tags_s[:number])
+        for number, estimate in enumerate(answer.after_images, start=1)
+    )
+    return replace(check_and_set_span(answer.final, tags_s), after_images=after_images)
 
 
 def check_last_interval(answer: object, measurements: DescentMeasurements) -> VelocityEstimate:
@@ -88,7 +102,7 @@ def check_last_interval(answer: object, measurements: DescentMeasurements) -> Ve
     These scenarios have one true velocity per case: the mean over this interval. `DescentScenario` computes the truth
     of any span and does not call this function. Raises AlgorithmError for another span.
     """
-    estimate = check_and_set_span(answer, measurements.tags_s)
+    estimate = check_velocity_answer(answer, measurements.tags_s)
     if estimate.span_s not in (None, measurements.last_interval_s):
         raise AlgorithmError(
             Fault.BAD_ANSWER,

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float, UInt16
@@ -17,6 +18,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid_from_axes
+
+Measurement = TypeVar("Measurement")
 
 
 @dataclass(frozen=True)
@@ -89,27 +92,25 @@ class ImuIncrements:
     delta_angles_rad: Float[np.ndarray, "n 3"]
     delta_velocities_m_s: Float[np.ndarray, "n 3"]
 
-    def split(self, tags_s: Sequence[float]) -> list[ImuIncrements]:
-        """Split at ascending time tags; return one part more than tags. A part can have no sample.
+    def merge(self, tagged: Sequence[tuple[float, Measurement]]) -> list[ImuIncrements | Measurement]:
+        """Merge with other measurements, each given with its time tag, into the order of their time tags.
 
-        A part ends with the first boundary that is not earlier than its tag. The next part begins with this boundary.
-        Raises ValueError for a tag outside the increments.
+        The increments before a measurement end with the first boundary that is not earlier than its tag. Measurements
+        outside of the increments come before or after all of them.
         """
-        first_s, last_s = self.times_s[0], self.times_s[-1]
-        outside = [tag for tag in tags_s if not first_s <= tag <= last_s]
-        if outside:
-            allowed = f"allowed: {first_s:.6f} to {last_s:.6f} s"
-            raise ValueError(f"the time tag {outside[0]:.6f} s is outside of the increments; {allowed}")
-        boundaries = [0, *np.searchsorted(self.times_s, tags_s, side="left").tolist(), self.times_s.size - 1]
-        return [
-            ImuIncrements(
-                times_s=self.times_s[first : last + 1],
-                period_s=self.period_s,
-                delta_angles_rad=self.delta_angles_rad[first:last],
-                delta_velocities_m_s=self.delta_velocities_m_s[first:last],
-            )
-            for first, last in pairwise(boundaries)
-        ]
+        first, last = 0, self.times_s.size - 1
+        merged: list[ImuIncrements | Measurement] = []
+        for tag, measurement in sorted(tagged, key=lambda item: item[0]):
+            end = min(int(np.searchsorted(self.times_s, tag)), last)
+            merged += [self._part(first, end)] if end > first else []
+            merged.append(measurement)
+            first = end
+        return [*merged, self._part(first, last)] if last > first else merged
+
+    def _part(self, first: int, last: int) -> ImuIncrements:
+        """Return the increments between two boundaries."""
+        angles, velocities = self.delta_angles_rad[first:last], self.delta_velocities_m_s[first:last]
+        return ImuIncrements(self.times_s[first : last + 1], self.period_s, angles, velocities)
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,8 @@ class DescentMeasurements:
     inertial_velocities_m_s: Float[np.ndarray, "images 3"] | None = None
     increments: ImuIncrements | None = None
     gravity_m_s2: float | None = None
+    #: Arguments of the method `start` of an algorithm that receives the measurements one by one.
+    start_inputs: ClassVar[tuple[()]] = ()
 
     @property
     def tags_s(self) -> tuple[float, ...]:
@@ -199,13 +202,9 @@ class DescentMeasurements:
             *((tag, reading) for tag, reading in readings.items() if start_s <= tag <= end_s),
             *((frame.image.time_s, frame) for frame in frames),
         ]
-        tagged.sort(key=lambda item: item[0])
-        *parts, _ = self.increments.split([tag for tag, _ in tagged])
-        events: list[ImuIncrements | AltitudeMeasurement | DescentFrame] = []
-        for part, (_, measurement) in zip(parts, tagged, strict=True):
-            events += [part] if part.times_s.size > 1 else []
-            events.append(measurement)
-        return events
+        events = self.increments.merge(tagged)
+        # increments after the last image
+        return events[:-1] if isinstance(events[-1], ImuIncrements) else events
 
     def select(self, indices: tuple[int, ...]) -> DescentMeasurements:
         """Select images by ascending indices; the mean velocities are those between the selected images."""

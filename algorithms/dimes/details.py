@@ -17,7 +17,7 @@ from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, Validi
 
 
 @dataclass(frozen=True)
-class Track:
+class DimesTrack:
     """Template tracked from the earlier to the later image of a pair.
 
     - pair, index: Pair (0: images 1 and 2; 1: images 2 and 3) and number of the template in it, best contrast first
@@ -68,7 +68,7 @@ class PairDetails:
     zero_phase_pixels: Float[np.ndarray, "2 2"]
     gsd_m: float
     candidates: int
-    tracks: tuple[Track, ...]
+    tracks: tuple[DimesTrack, ...]
     views: tuple[View, View]
 
 
@@ -88,7 +88,7 @@ class DimesDetails:
     ground: GroundFit | None = None
 
     @property
-    def tracks(self) -> tuple[Track, ...]:
+    def tracks(self) -> tuple[DimesTrack, ...]:
         """The tracks of both pairs."""
         return tuple(track for pair in self.pairs for track in pair.tracks)
 
@@ -138,8 +138,8 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
     `zero_phase_<pair>` (pixels of both images); `gsd_<pair>` (metres); `rectified_frame_<pair>` and
     `rectified_<pair>_<side>` (see `rectified_lattice`; side 0 is the earlier image); `combinations` (first, second,
     discrepancy_m_s) with `combinations_columns`, and `selected` (first, second; empty for none). Widths are in
-    rectified pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `Track`); `failed_...` are
-    0 or 1.
+    rectified pixels, contrasts per binned pixel, pixels (u, v) binned, ground in metres (see `DimesTrack`);
+    `failed_...` are 0 or 1.
     """
     selected = () if details.selected is None else (details.selected.first, details.selected.second)
     rows = []

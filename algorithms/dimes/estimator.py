@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
 from marsyard.algorithms.dimes.binning import View, build_views, pixels_from_ground, rectify_patch
-from marsyard.algorithms.dimes.details import DimesDetails, PairDetails, Track
+from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
@@ -65,7 +65,7 @@ def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, opt
         metrics = track_metrics(float(contrast), surface, peak, options)
         displacement = camera_displacement(corner, geometry)
         match_pixel, _ = pixels_from_ground(second, ground - displacement)
-        track = Track(
+        track = DimesTrack(
             pair=pair,
             index=index,
             template_pixel=candidates.pixels[candidate],

@@ -1,18 +1,16 @@
 """External programs as algorithms under test: cases as files, answers as JSON (docs/custom-algorithms.md)."""
 
 from marsyard.algorithms.exchange.executable import (
-    ExecutableSiteEstimator,
+    SITE_REQUESTS,
+    VELOCITY_REQUESTS,
+    ExecutableAlgorithm,
     ExecutableTargetTracker,
-    ExecutableVelocityEstimator,
-    ExecutableVelocityStream,
 )
 from marsyard.algorithms.exchange.files import (
     FORMAT_VERSION,
     ImageFormat,
-    read_altitude,
     read_case,
     read_frame,
-    read_increments,
     read_mast,
     read_pose,
     read_stop,
@@ -20,10 +18,12 @@ from marsyard.algorithms.exchange.files import (
     write_case,
     write_frame,
 )
+from marsyard.algorithms.exchange.forms import SITE_FORM, VELOCITY_FORM, AnswerForm, ProgramDetails, answer_time_s
 from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, parse_command
-from marsyard.algorithms.exchange.serving import ProgramDetails
+from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 
-__all__ = ["FORMAT_VERSION", "PREFIXES", "Command", "ExecutableLimits", "ExecutableSiteEstimator"]
-__all__ += ["ExecutableTargetTracker", "ExecutableVelocityEstimator", "ExecutableVelocityStream", "ImageFormat"]
-__all__ += ["ProgramDetails", "parse_command", "read_altitude", "read_case", "read_frame", "read_increments"]
-__all__ += ["read_mast", "read_pose", "read_stop", "read_target", "write_case", "write_frame"]
+__all__ = ["FORMAT_VERSION", "PREFIXES", "SITE_FORM", "SITE_REQUESTS", "VELOCITY_FORM", "VELOCITY_REQUESTS"]
+__all__ += ["VELOCITY_STREAM", "AnswerForm", "Command", "ExecutableAlgorithm", "ExecutableLimits"]
+__all__ += ["ExecutableTargetTracker", "ImageFormat", "ProgramDetails", "StreamForm", "answer_time_s", "parse_command"]
+__all__ += ["read_case", "read_frame", "read_mast", "read_pose", "read_stop"]
+__all__ += ["read_target", "write_case", "write_frame"]

@@ -1,221 +1,129 @@
-"""Estimators and trackers that run external programs: measurements are written to files, answers are read as JSON."""
+"""External programs as algorithms: the arguments of a call are written to a request and to files, the answer is JSON.
+
+Each task declares the requests of its programs: `VELOCITY_REQUESTS`, `SITE_REQUESTS`, `TRACKER_REQUESTS`, and
+`marsyard.algorithms.exchange.streams.StreamForm.requests` for streams.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import Any
 
-from scipy.spatial.transform import RigidTransform
-
 from marsyard.algorithms import interface
-from marsyard.algorithms.answers import check_aim, check_site, check_update, check_velocity
-from marsyard.algorithms.exchange.files import (
-    encode_altitude,
-    encode_increments,
-    encode_pose,
-    encode_target,
-    write_frame,
-    write_mast,
-    write_stop,
-)
-from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
-from marsyard.algorithms.exchange.serving import (
-    AnswerReader,
+from marsyard.algorithms.answers import check_aim, check_update
+from marsyard.algorithms.exchange.files import encode_pose, write_case, write_mast, write_stop
+from marsyard.algorithms.exchange.forms import (
+    SITE_FORM,
+    VELOCITY_FORM,
+    AnswerForm,
     ProgramDetails,
-    Session,
     check_keys,
     read_member,
     read_numbers,
-    run_case,
 )
-from marsyard.algorithms.faults import bad_answer
-from marsyard.sim.measurements import (
-    AltitudeMeasurement,
-    DescentFrame,
-    DescentMeasurements,
-    ImuIncrements,
-    LandingMeasurements,
-    MastCalibration,
-    RoverMeasurements,
-    TargetDesignation,
-)
+from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
+from marsyard.algorithms.exchange.serving import KeptFolder, Session, run_once
+from marsyard.algorithms.exchange.values import encode
+from marsyard.algorithms.faults import AlgorithmError, bad_answer
+from marsyard.sim.measurements import MastCalibration, RoverMeasurements
+
+#: Method of an algorithm that receives all measurements of a case at once.
+ESTIMATE = "estimate"
 
 
 @dataclass(frozen=True)
-class ExecutableVelocityEstimator:
-    """Velocity estimator that runs an external program for each descent.
+class Request:
+    """Request to a program for one call of a method.
 
-    `estimate` raises AlgorithmError if the program fails, exceeds a limit, or its answer has the wrong form.
+    - encode: returns the values of the request from the arguments of the call; a value that is a function or a
+      `KeptFolder` writes files, and the request contains the path of their folder
+    - read: decodes the answer from its JSON object, the details, and the arguments of the call. Raises AlgorithmError
+      (BAD_ANSWER).
     """
 
-    command: Command
-    limits: ExecutableLimits
-
-    def estimate(self, measurements: DescentMeasurements) -> interface.VelocityEstimate:
-        """Write the measurements, run the program and return its estimate."""
-        return run_case(self.command, self.limits, measurements, _read_velocity)
+    encode: Callable[..., Mapping[str, Any]]
+    read: Callable[..., Any]
 
 
-class ExecutableVelocityStream:
-    """Velocity stream that runs an external program: one JSON request line per call (docs/custom-algorithms.md).
+class ExecutableAlgorithm:
+    """Algorithm that runs an external program; its methods are those of `requests` (docs/custom-algorithms.md).
 
-    Methods raise AlgorithmError if the program fails. One process of a `serve-stream:` program processes many descents.
-    Increments and altitudes are sent only if the program requests them in its answer to 'start'.
+    Methods raise AlgorithmError if the program fails, exceeds a limit, or its answer has the wrong form. The process of
+    a persistent program answers many cases; any other process ends with this object, or after the answer to `estimate`.
+    """
+
+    def __init__(self, command: Command, limits: ExecutableLimits, requests: Mapping[str, Request]) -> None:
+        self.command, self.limits = command, limits
+        self._requests = requests
+        self._session = Session(command, limits)
+        self._total = ProgramDetails("", 0.0)  # of all answers since `start`
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the method of a request."""
+        if name not in self.__dict__.get("_requests", {}):
+            raise AttributeError(f"the program has no request {name}")
+        return partial(self._call, name)
+
+    def __dir__(self) -> list[str]:
+        """Return the names of the requests."""
+        return sorted(self._requests)
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """Send a request and return the answer; the details of `finish` are those of all answers since `start`."""
+        request = self._requests[name]
+        values = request.encode(*arguments)
+        is_single = name == ESTIMATE and not self.command.persistent
+        if is_single:
+            answer, output = run_once(self.command, self.limits, values["case"])
+        else:
+            answer, output = self._session.send_request(name, values)
+        details = ProgramDetails(output.stderr, output.time_s)
+        total = ProgramDetails("", 0.0) if name == "start" else self._total
+        stderr = (total.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:]
+        self._total = ProgramDetails(stderr, total.time_s + details.time_s)
+        try:
+            return request.read(answer, self._total if name == "finish" else details, *arguments)
+        except AlgorithmError as error:
+            raise AlgorithmError(error.fault, str(error), output.stderr) from error
+
+
+class ExecutableTargetTracker(ExecutableAlgorithm):
+    """Target tracker that runs an external program.
+
+    - state: state of the tracker according to its last answer
     """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
-        self._session = Session(command, limits)
-        self._details = ProgramDetails("", 0.0)  # of all requests of the descent
-        self._accepts_inertial = False
+        super().__init__(command, limits, TRACKER_REQUESTS)
+        self.state = interface.TrackingState.NO_TARGET
 
-    def start(self) -> None:
-        """Start a new descent."""
-        self._details = ProgramDetails("", 0.0)
-        self._send_without_answer("start", {}, self._read_start)
-
-    def process_increments(self, increments: ImuIncrements) -> None:
-        """Send the next inertial increments."""
-        if self._accepts_inertial:
-            self._send_without_answer("imu", {"increments": encode_increments(increments)}, self._read_answer)
-
-    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
-        """Send the next altitude."""
-        if self._accepts_inertial:
-            self._send_without_answer("altitude", {"altitude": encode_altitude(measurement)}, self._read_answer)
-
-    def process_image(self, frame: DescentFrame) -> interface.VelocityEstimate | None:
-        """Send the next image and return the program's estimate, or None."""
-        files = {"frame": lambda folder: write_frame(folder, frame)}
-        # the exchange format defines the name of the request; a change would break existing programs
-        return self._session.send_request("picture", {}, self._read_answer, files)
-
-    def finish(self) -> interface.VelocityEstimate:
-        """Return the program's final estimate; its details contain the output and the time of the whole descent."""
-        answer = self._session.send_request("finish", {}, self._read_answer)
-        if answer is None:
-            allowed = ", ".join(interface.VelocityOutcome.__members__)
-            raise bad_answer(f"the answer to 'finish' has the outcome null; allowed: {allowed}")
+    def _call(self, name: str, *arguments: Any) -> Any:
+        """Send a request and store the state in its answer."""
+        answer = super()._call(name, *arguments)
+        if name != "aim":
+            self.state = getattr(answer, "state", answer)
         return answer
 
-    def _send_without_answer(
-        self, action: str, values: Mapping[str, Any], read: AnswerReader[interface.VelocityEstimate | None]
-    ) -> None:
-        """Send a request whose answer must contain no estimate."""
-        if self._session.send_request(action, values, read) is not None:
-            raise bad_answer(f"the answer to '{action}' has an outcome; it must be null")
 
-    def _read_start(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
-        """Decode the answer to 'start', whose key `inertial` requests increments and altitudes."""
-        accepts_inertial = answer.get("inertial", False)
-        if not isinstance(accepts_inertial, bool):
-            raise bad_answer(f"inertial is {accepts_inertial!r}; allowed: true, or false")
-        self._accepts_inertial = accepts_inertial
-        return self._read_answer({key: value for key, value in answer.items() if key != "inertial"}, details)
-
-    def _read_answer(self, answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate | None:
-        """Decode an estimate, or None for the outcome null; add output and time to those of the descent."""
-        self._details = ProgramDetails(
-            (self._details.stderr + details.stderr)[-MAX_STDERR_CHARACTERS:], self._details.time_s + details.time_s
-        )
-        if answer.get("outcome", "") is None:
-            check_keys(answer, {"outcome"})
-            return None
-        return _read_velocity(answer, self._details)
+def _estimate_requests(form: AnswerForm[Any]) -> Mapping[str, Request]:
+    """Return the request of an estimator, which receives the files of a case."""
+    return {ESTIMATE: Request(lambda case: {"case": lambda folder: write_case(folder, case)}, form.read)}
 
 
-@dataclass(frozen=True)
-class ExecutableSiteEstimator:
-    """Landing site estimator that runs an external program; `estimate` raises AlgorithmError if the program fails."""
-
-    command: Command
-    limits: ExecutableLimits
-
-    def estimate(self, measurements: LandingMeasurements) -> interface.SiteEstimate:
-        """Write the measurements, run the program and return its estimate."""
-        return run_case(self.command, self.limits, measurements, _read_site)
+# Functions that decode an answer of a tracker; they raise AlgorithmError (BAD_ANSWER) if it does not conform to the
+# exchange format.
 
 
-class ExecutableTargetTracker:
-    """Target tracker that runs an external program: one JSON request line per call (docs/custom-algorithms.md).
-
-    Methods raise AlgorithmError if the program fails. An `exec:` program ends with this tracker. A `serve:` program can
-    be used by several trackers, one after another; a designation resets it.
-    """
-
-    def __init__(self, command: Command, limits: ExecutableLimits) -> None:
-        self._state = interface.TrackingState.NO_TARGET
-        self._session = Session(command, limits)
-        self._mast: MastCalibration | None = None
-        self._mast_count = 0
-        self._folder: Path | None = None  # of the mast's files
-
-    @property
-    def state(self) -> interface.TrackingState:
-        """State of the tracker according to its last answer."""
-        return self._state
-
-    def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
-        """Send the target and the rover's pose."""
-        values = {"target": encode_target(target), "world_from_rover": encode_pose(world_from_rover)}
-        self._state = self._session.send_request("designate", values, _read_state)
-
-    def aim(self, world_from_rover: RigidTransform, mast: MastCalibration) -> interface.MastAim | None:
-        """Request the mast angles and the image regions of interest."""
-        values = {"world_from_rover": encode_pose(world_from_rover), "mast": self._write_mast(mast)}
-        return self._session.send_request("aim", values, lambda answer, _: check_aim(_read_aim(answer), mast))
-
-    def update(self, measurements: RoverMeasurements) -> interface.TargetUpdate:
-        """Send the images of a rover stop and return the program's answer."""
-        values = {"mast": self._write_mast(measurements.mast)}
-        files = {"stop": lambda folder: write_stop(folder, measurements)}
-        update = self._session.send_request("update", values, _read_update, files)
-        self._state = update.state
-        return update
-
-    def clear(self) -> None:
-        """Clear the target."""
-        self._state = self._session.send_request("clear", {}, _read_state)
-
-    def _write_mast(self, mast: MastCalibration) -> str:
-        """Write the mast's files if the mast differs from that of the last call; return their folder."""
-        if mast is not self._mast:
-            self._mast, self._mast_count = mast, self._mast_count + 1
-            self._folder = self._session.folder / f"mast_{self._mast_count}"
-            self._folder.mkdir()
-            write_mast(self._folder, mast)
-        return str(self._folder)
-
-
-# Functions that decode an answer; they raise AlgorithmError (BAD_ANSWER) if it does not conform to the exchange format.
-
-
-def _read_velocity(answer: Mapping[str, Any], details: ProgramDetails) -> interface.VelocityEstimate:
-    check_keys(answer, {"outcome", "velocity_m_s", "covariance_m2_s2", "span_s"})
-    span = read_numbers(answer, "span_s", (2,))
-    estimate = interface.VelocityEstimate(
-        outcome=read_member("outcome", answer.get("outcome"), interface.VelocityOutcome),
-        velocity_m_s=read_numbers(answer, "velocity_m_s", (2,)),
-        details=details,
-        covariance_m2_s2=read_numbers(answer, "covariance_m2_s2", (2, 2)),
-        span_s=None if span is None else (float(span[0]), float(span[1])),
-    )
-    return check_velocity(estimate)
-
-
-def _read_site(answer: Mapping[str, Any], details: ProgramDetails) -> interface.SiteEstimate:
-    check_keys(answer, {"outcome", "site_world"})
-    outcome = read_member("outcome", answer.get("outcome"), interface.SiteOutcome)
-    return check_site(interface.SiteEstimate(outcome, read_numbers(answer, "site_world", (3,)), details))
-
-
-def _read_state(answer: Mapping[str, Any], _details: ProgramDetails) -> interface.TrackingState:
+def _read_state(answer: Mapping[str, Any], _details: ProgramDetails, *_arguments: Any) -> interface.TrackingState:
     check_keys(answer, {"state"})
     return read_member("state", answer.get("state"), interface.TrackingState)
 
 
-def _read_aim(answer: Mapping[str, Any]) -> interface.MastAim | None:
+def _read_aim(
+    answer: Mapping[str, Any], _details: ProgramDetails, _pose: Any, mast: MastCalibration
+) -> interface.MastAim | None:
     check_keys(answer, {"aim"})
     aim = answer.get("aim")
     if aim is None:
@@ -225,7 +133,8 @@ def _read_aim(answer: Mapping[str, Any]) -> interface.MastAim | None:
     angles = [read_numbers(aim, name, ()) for name in ("azimuth_rad", "elevation_rad")]
     if angles[0] is None or angles[1] is None:
         raise bad_answer("an angle of aim is missing; expected azimuth_rad and elevation_rad")
-    return interface.MastAim(float(angles[0]), float(angles[1]), _read_box(aim, "left"), _read_box(aim, "right"))
+    boxes = _read_box(aim, "left"), _read_box(aim, "right")
+    return check_aim(interface.MastAim(float(angles[0]), float(angles[1]), *boxes), mast)
 
 
 def _read_box(aim: Mapping[str, Any], name: str) -> interface.PixelBox:
@@ -236,7 +145,9 @@ def _read_box(aim: Mapping[str, Any], name: str) -> interface.PixelBox:
     return interface.PixelBox((corner[0], corner[1]), (size[0], size[1]))
 
 
-def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> interface.TargetUpdate:
+def _read_update(
+    answer: Mapping[str, Any], details: ProgramDetails, _measurements: RoverMeasurements
+) -> interface.TargetUpdate:
     check_keys(answer, {"state", "losses", "position_rover"})
     losses = answer.get("losses", [])
     if not isinstance(losses, list):
@@ -245,3 +156,20 @@ def _read_update(answer: Mapping[str, Any], details: ProgramDetails) -> interfac
     state = read_member("state", answer.get("state"), interface.TrackingState)
     decoded_losses = tuple(read_member("a loss", loss, interface.TargetLoss) for loss in losses)
     return check_update(interface.TargetUpdate(state, decoded_losses, position, details))
+
+
+#: Requests of the tasks' programs, by method.
+VELOCITY_REQUESTS, SITE_REQUESTS = _estimate_requests(VELOCITY_FORM), _estimate_requests(SITE_FORM)
+TRACKER_REQUESTS: Mapping[str, Request] = {
+    "designate": Request(
+        lambda target, pose: {"target": encode(target), "world_from_rover": encode_pose(pose)}, _read_state
+    ),
+    "aim": Request(
+        lambda pose, mast: {"world_from_rover": encode_pose(pose), "mast": KeptFolder(mast, write_mast)}, _read_aim
+    ),
+    "update": Request(
+        lambda stop: {"mast": KeptFolder(stop.mast, write_mast), "stop": lambda folder: write_stop(folder, stop)},
+        _read_update,
+    ),
+    "clear": Request(dict, _read_state),
+}

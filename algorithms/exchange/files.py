@@ -8,7 +8,6 @@ quaternions are normalised when they are read.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
@@ -20,22 +19,19 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.sim.camera import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import (
-    AltitudeMeasurement,
-    AttitudeMeasurement,
     DescentFrame,
     DescentMeasurements,
     DetectorCalibration,
     DetectorImage,
-    ImuIncrements,
     LandingMeasurements,
     MastCalibration,
     MastGeometry,
     MastImage,
     PixelTarget,
-    PoseMeasurement,
     RoverMeasurements,
     RoverTarget,
     SiteTarget,
@@ -48,13 +44,10 @@ FORMAT_VERSION = 1
 ANSWER_VERSIONS = (1, 2)
 
 #: JSON files of a case and of a single descent image.
-CASE_FILE, FRAME_FILE = "case.json", "frame.json"
+CASE_FILE, IMAGE_FILE = "case.json", "image.json"
 
 #: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
-
-#: Arrays of `ImuIncrements`.
-_INCREMENT_KEYS = ("times_s", "delta_angles_rad", "delta_velocities_m_s")
 
 #: Image file format.
 ImageFormat = Literal["pgm", "png"]
@@ -64,89 +57,44 @@ def write_case(
     folder: Path, measurements: DescentMeasurements | LandingMeasurements, image_format: ImageFormat = "pgm"
 ) -> None:
     """Write the measurements of a case into an existing folder. Raises OSError if that fails."""
-    content: dict[str, Any]
-    if isinstance(measurements, DescentMeasurements):
-        content = {
-            "task": "velocity",
-            "attitudes": [_encode_attitude(attitude) for attitude in measurements.attitudes],
-            "altitudes": [encode_altitude(altitude) for altitude in measurements.altitudes],
-            "interval_velocities_m_s": measurements.interval_velocities_m_s.tolist(),
-            "inertial_velocities_m_s": _encode_vector(measurements.inertial_velocities_m_s),
-            "sun_direction": measurements.sun_direction.tolist(),
-            **_encode_gravity(measurements.gravity_m_s2),
-        }
-        if measurements.increments is not None:
-            content["increments"] = encode_increments(measurements.increments)
-    else:
-        content = {
-            "task": "landing",
-            "poses": [
-                {**encode_pose(pose.world_from_body, "body"), "time_s": pose.time_s} for pose in measurements.poses
-            ],
-            "slant_range_m": _encode_length(measurements.slant_range_m),
-            "up_body": measurements.up_body.tolist(),
-            "apriori_site_world": measurements.apriori_site_world.tolist(),
-        }
+    task = "velocity" if isinstance(measurements, DescentMeasurements) else "landing"
     images = write_images(folder, measurements.images, image_format)
-    write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, **content, "images": images})
+    content = {"exchange": FORMAT_VERSION, "task": task, **encode(measurements, ["images"]), "images": images}
+    write_json(folder / CASE_FILE, content)
+
+
+def write_image(folder: Path, image: DetectorImage, content: Mapping[str, Any] | None = None) -> None:
+    """Write one image and further values into an existing folder. Raises OSError if that fails."""
+    (record,) = write_images(folder, [image], "pgm")
+    write_json(folder / IMAGE_FILE, {"exchange": FORMAT_VERSION, "image": record, **(content or {})})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
     """Write one descent image and its measurements into an existing folder. Raises OSError if that fails."""
-    (image,) = write_images(folder, [frame.image], "pgm")
-    content = {
-        "exchange": FORMAT_VERSION,
-        "image": image,
-        "attitude": _encode_attitude(frame.attitude),
-        "altitude": encode_altitude(frame.altitude),
-        "sun_direction": frame.sun_direction.tolist(),
-        "inertial_velocity_m_s": _encode_vector(frame.inertial_velocity_m_s),
-        "interval_velocity_m_s": _encode_vector(frame.interval_velocity_m_s),
-        **_encode_gravity(frame.gravity_m_s2),
-    }
-    write_json(folder / FRAME_FILE, content)
+    write_image(folder, frame.image, encode(frame, ["image"]))
+
+
+def read_detector_image(folder: Path) -> DetectorImage:
+    """Read the image that `write_image` wrote. Raises ValueError if it is missing or has another version."""
+    with open_json(folder / IMAGE_FILE, "descent image") as content:
+        check_version(content)
+        return read_image(folder, content["image"])
 
 
 def read_frame(folder: Path) -> DescentFrame:
     """Read the frame that `write_frame` wrote. Raises ValueError if it is missing or has another version."""
-    with open_json(folder / FRAME_FILE, "descent image") as content:
-        check_version(content)
-        return DescentFrame(
-            image=read_image(folder, content["image"]),
-            attitude=_read_attitude(content["attitude"]),
-            altitude=read_altitude(content["altitude"]),
-            sun_direction=_read_vector(content["sun_direction"]),
-            inertial_velocity_m_s=_read_vector(content["inertial_velocity_m_s"]),
-            interval_velocity_m_s=_read_vector(content["interval_velocity_m_s"]),
-            gravity_m_s2=content.get("gravity_m_s2"),
-        )
+    with open_json(folder / IMAGE_FILE, "descent image") as content:
+        return decode(DescentFrame, content, image=read_detector_image(folder))
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
     """Read the case that `write_case` wrote. Raises ValueError if it is missing or has another version."""
     with open_json(folder / CASE_FILE, "case") as content:
         check_version(content)
-        images = [read_image(folder, record) for record in content["images"]]
+        images = tuple(read_image(folder, record) for record in content["images"])
         if content["task"] == "velocity":
-            increments = content.get("increments")
-            return DescentMeasurements(
-                images=tuple(images),
-                attitudes=tuple(_read_attitude(record) for record in content["attitudes"]),
-                altitudes=tuple(read_altitude(record) for record in content["altitudes"]),
-                interval_velocities_m_s=_read_vector(content["interval_velocities_m_s"]).reshape(-1, 3),
-                sun_direction=_read_vector(content["sun_direction"]),
-                inertial_velocities_m_s=_read_vector(content.get("inertial_velocities_m_s")),
-                increments=None if increments is None else read_increments(increments),
-                gravity_m_s2=content.get("gravity_m_s2"),
-            )
-        poses = [PoseMeasurement(read_pose(record, "body"), record["time_s"]) for record in content["poses"]]
-        return LandingMeasurements(
-            images=(images[0], images[1]),
-            poses=(poses[0], poses[1]),
-            slant_range_m=_read_length(content["slant_range_m"]),
-            up_body=_read_vector(content["up_body"]),
-            apriori_site_world=_read_vector(content["apriori_site_world"]),
-        )
+            return decode(DescentMeasurements, content, images=images)
+        return decode(LandingMeasurements, content, images=images)
 
 
 def write_json(path: Path, values: Mapping[str, Any]) -> None:
@@ -167,59 +115,6 @@ def check_version(content: Mapping[str, Any]) -> None:
     """Raise ValueError if the table of a file has another version."""
     if content["exchange"] != FORMAT_VERSION:
         raise ValueError(f"exchange format version {content['exchange']} is not supported; supported: {FORMAT_VERSION}")
-
-
-def _encode_attitude(attitude: AttitudeMeasurement) -> dict[str, Any]:
-    return {"world_from_body_xyzw": attitude.world_from_body.as_quat().tolist(), "time_s": attitude.time_s}
-
-
-def _read_attitude(content: Mapping[str, Any]) -> AttitudeMeasurement:
-    return AttitudeMeasurement(Rotation.from_quat(content["world_from_body_xyzw"]), content["time_s"])
-
-
-def encode_altitude(altitude: AltitudeMeasurement) -> dict[str, Any]:
-    """Encode an altitude for JSON; null without a reading."""
-    return {"altitude_m": _encode_length(altitude.altitude_m), "time_s": altitude.time_s}
-
-
-def read_altitude(content: Mapping[str, Any]) -> AltitudeMeasurement:
-    """Decode an altitude that `encode_altitude` encoded."""
-    return AltitudeMeasurement(_read_length(content["altitude_m"]), content["time_s"])
-
-
-def encode_increments(increments: ImuIncrements) -> dict[str, Any]:
-    """Encode inertial increments for JSON."""
-    return {"period_s": increments.period_s, **{name: getattr(increments, name).tolist() for name in _INCREMENT_KEYS}}
-
-
-def read_increments(content: Mapping[str, Any]) -> ImuIncrements:
-    """Decode the increments that `encode_increments` encoded."""
-    times, angles, velocities = (np.array(content[name], dtype=np.float64) for name in _INCREMENT_KEYS)
-    return ImuIncrements(times, content["period_s"], angles.reshape(-1, 3), velocities.reshape(-1, 3))
-
-
-def _encode_length(length_m: float) -> float | None:
-    """Encode a length for JSON; an infinite length or NaN becomes null."""
-    return length_m if math.isfinite(length_m) else None
-
-
-def _read_length(length_m: float | None) -> float:
-    return math.nan if length_m is None else length_m
-
-
-def _encode_gravity(gravity_m_s2: float | None) -> dict[str, float]:
-    """Return the JSON entry of the gravity; empty without gravity (cases without inertial increments)."""
-    return {} if gravity_m_s2 is None else {"gravity_m_s2": gravity_m_s2}
-
-
-def _encode_vector(value: Float[np.ndarray, "..."] | None) -> list[Any] | None:
-    """Encode an array of any shape for JSON; None becomes null."""
-    return None if value is None else value.tolist()
-
-
-def _read_vector(content: Any) -> Any:
-    """Decode an array; None for null."""
-    return None if content is None else np.array(content, dtype=np.float64)
 
 
 def write_images(folder: Path, images: Sequence[DetectorImage], image_format: ImageFormat) -> list[dict[str, Any]]:
@@ -294,7 +189,7 @@ def read_mast(folder: Path) -> MastCalibration:
     """Read the mast that `write_mast` wrote. Raises ValueError if it is missing."""
     with open_json(folder / MAST_FILE, "mast") as content:
         left, right = (read_cahvor(folder / content[name]["camera"]) for name in ("left", "right"))
-        base, elbow, head = (_read_vector(content[name]) for name in _OFFSET_KEYS)
+        base, elbow, head = (np.array(content[name], dtype=np.float64) for name in _OFFSET_KEYS)
         azimuths, elevations = ((content[name][0], content[name][1]) for name in _LIMIT_KEYS)
         return MastCalibration(MastGeometry(base, elbow, head, azimuths, elevations), left, right)
 
@@ -321,26 +216,22 @@ def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
         return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content["world_from_rover"]))
 
 
-def encode_pose(pose: RigidTransform, body: str = "rover") -> dict[str, Any]:
-    """Encode the pose of a rover or a body for JSON: position in the world and unit quaternion, scalar last."""
+def encode_pose(pose: RigidTransform) -> dict[str, Any]:
+    """Encode the pose of a rover for JSON: position in the world and unit quaternion, scalar last."""
     position, quaternion = np.asarray(pose.translation).tolist(), pose.rotation.as_quat().tolist()
-    return {"position_world_m": position, f"world_from_{body}_xyzw": quaternion}
+    return {"position_world_m": position, "world_from_rover_xyzw": quaternion}
 
 
-def read_pose(content: Mapping[str, Any], body: str = "rover") -> RigidTransform:
+def read_pose(content: Mapping[str, Any]) -> RigidTransform:
     """Decode a pose that `encode_pose` encoded."""
-    return rigid(Rotation.from_quat(content[f"world_from_{body}_xyzw"]), _read_vector(content["position_world_m"]))
-
-
-def encode_target(target: TargetDesignation) -> dict[str, Any]:
-    """Encode a target designation (pixel, rover or site coordinates) for JSON."""
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(target).items()}
+    position = np.array(content["position_world_m"], dtype=np.float64)
+    return rigid(Rotation.from_quat(content["world_from_rover_xyzw"]), position)
 
 
 def read_target(content: Mapping[str, Any]) -> TargetDesignation:
-    """Decode a target designation that `encode_target` encoded."""
+    """Decode a target designation: pixel, rover or site coordinates."""
     if "pixel" in content:
-        return PixelTarget(_read_vector(content["pixel"]), content["azimuth_rad"], content["elevation_rad"])
+        return decode(PixelTarget, content)
     if "position_rover" in content:
-        return RoverTarget(_read_vector(content["position_rover"]))
-    return SiteTarget(_read_vector(content["position_site"]))
+        return decode(RoverTarget, content)
+    return decode(SiteTarget, content)

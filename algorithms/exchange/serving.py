@@ -14,13 +14,10 @@ import tempfile
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import numpy as np
-
-from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, write_case
+from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
 from marsyard.algorithms.exchange.process import (
     Command,
     ExecutableLimits,
@@ -29,23 +26,15 @@ from marsyard.algorithms.exchange.process import (
     shorten,
     temporary_folder,
 )
-from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
-from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements
-
-Member = TypeVar("Member", bound=Enum)
-Answer = TypeVar("Answer")
+from marsyard.algorithms.faults import AlgorithmError, Fault
 
 
 @dataclass(frozen=True)
-class ProgramDetails:
-    """Standard error and wall-clock time of a program's answer."""
+class KeptFolder:
+    """Folder of files that a program can read during the whole session; written again only for another object."""
 
-    stderr: str
-    time_s: float
-
-
-#: Function that decodes an answer from its JSON object; the details become part of the decoded answer.
-AnswerReader = Callable[[Mapping[str, Any], ProgramDetails], Answer]
+    content: Any
+    write: Callable[[Path, Any], None]
 
 
 def parse_object(output: Output) -> Mapping[str, Any]:
@@ -59,49 +48,6 @@ def parse_object(output: Output) -> Mapping[str, Any]:
     if not isinstance(answer, dict):
         raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
     return answer
-
-
-def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
-    """Raise AlgorithmError (BAD_ANSWER) for an unsupported version of the exchange format or an unknown key."""
-    if type(answer.get("exchange")) is not int or answer["exchange"] not in ANSWER_VERSIONS:
-        versions = ", ".join(map(str, ANSWER_VERSIONS))
-        raise bad_answer(f"the answer's exchange is {answer.get('exchange')!r}; allowed: {versions}")
-    keys = allowed | {"exchange"}
-    if unknown := sorted(set(answer) - keys):
-        raise bad_answer(f"the answer has an unknown key '{unknown[0]}'; allowed: {', '.join(sorted(keys))}")
-
-
-def read_member(label: str, name: object, enumeration: type[Member]) -> Member:
-    """Look up a member of the `enumeration` by name; raises AlgorithmError (BAD_ANSWER). `label` is the key."""
-    if not isinstance(name, str) or name not in enumeration.__members__:
-        raise bad_answer(f"{label} is {name!r}; allowed: {', '.join(enumeration.__members__)}")
-    return enumeration[name]
-
-
-def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Read an array from the answer; None if it is null or absent. Raises AlgorithmError (BAD_ANSWER)."""
-    value = answer.get(name)
-    if value is None:
-        return None
-    if not _has_shape(value, shape):
-        value_text = shorten(json.dumps(value).encode())
-        raise bad_answer(f"{name} is {value_text}; allowed: numbers in the shape {list(shape)}")
-    return np.array(value, dtype=np.float64)
-
-
-def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
-    """Whether a value is a finite number (empty shape) or a nested list of finite numbers of this shape."""
-    if not shape:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
-    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(item, shape[1:]) for item in value)
-
-
-def read_answer(answer: Mapping[str, Any], output: Output, read: AnswerReader[Answer]) -> Answer:
-    """Decode an answer of a program; an AlgorithmError is raised again with the program's standard error."""
-    try:
-        return read(answer, ProgramDetails(output.stderr, output.time_s))
-    except AlgorithmError as error:
-        raise AlgorithmError(error.fault, str(error), output.stderr) from error
 
 
 @dataclass
@@ -199,6 +145,8 @@ class Session:
         # releases the program when this session is deleted
         self._release: weakref.finalize[Any, Any] | None = None
         self._folder: Path | None = None
+        self._kept: KeptFolder | None = None
+        self._kept_path = Path()
 
     @property
     def folder(self) -> Path:
@@ -215,56 +163,44 @@ class Session:
             self._release = weakref.finalize(self, release_server, self._command, self._limits, self._server)
         return self._server
 
-    def send_request(
-        self,
-        action: str,
-        values: Mapping[str, Any],
-        parse: AnswerReader[Answer],
-        files: Mapping[str, Callable[[Path], None]] | None = None,
-    ) -> Answer:
-        """Send the request `action` with `values` and return the program's answer, decoded by `parse`.
+    def send_request(self, action: str, values: Mapping[str, Any]) -> tuple[Mapping[str, Any], Output]:
+        """Send the request `action` with `values`; return the program's answer without its `id`, and its raw output.
 
-        `files` maps request keys to functions that write the files of a folder; the request contains the folder's path.
-        The folders are removed after the answer.
+        A value that is a function writes the files of a folder, which is removed after the answer. A value can also be
+        a `KeptFolder`. The request contains the paths of the folders.
         """
-        request, server = {"do": action, **values}, self._acquire()
+        server = self._acquire()
         with tempfile.TemporaryDirectory(prefix=f"{action}-", dir=self.folder) as request_folder:
-            for key, write in (files or {}).items():
-                folder = Path(request_folder) / key
-                folder.mkdir()
-                write(folder)
-                request[key] = str(folder)
+            request = {key: self._write(Path(request_folder, key), value) for key, value in values.items()}
             try:
-                answer, output = server.send_request(request)
+                return server.send_request({"do": action, **request})
             except AlgorithmError:
                 # the program has ended: do not return it to the idle programs
                 if self._release is not None:
                     self._release.detach()
                 raise
-        return read_answer(answer, output, parse)
+
+    def _write(self, folder: Path, value: Any) -> Any:
+        """Write the files of a value and return the path of their folder; return other values unchanged."""
+        if isinstance(value, KeptFolder):
+            if self._kept is None or self._kept.content is not value.content:
+                self._kept, self._kept_path = value, Path(tempfile.mkdtemp(dir=self.folder))
+                value.write(self._kept_path, value.content)
+            return str(self._kept_path)
+        if not callable(value):
+            return value
+        folder.mkdir()
+        value(folder)
+        return str(folder)
 
 
-def run_case(
-    command: Command,
-    limits: ExecutableLimits,
-    measurements: DescentMeasurements | LandingMeasurements,
-    read: AnswerReader[Answer],
-) -> Answer:
-    """Run a program on one case and return its answer, decoded by `read`.
-
-    A persistent program that fails is ended; the next case starts it again.
-    """
-    if command.persistent:
-        server = acquire_server(command, limits)
-        with tempfile.TemporaryDirectory(prefix="case-", dir=server.child.folder) as folder:
-            write_case(Path(folder), measurements)
-            answer, output = server.send_request({"case": folder})
-        release_server(command, limits, server)
-    else:
-        temporary = temporary_folder()
-        case = temporary / "case"
-        case.mkdir()
-        write_case(case, measurements)
-        output = RunningProgram((*command.words, str(case)), limits, temporary).read_all()
-        answer = parse_object(output)
-    return read_answer(answer, output, read)
+def run_once(
+    command: Command, limits: ExecutableLimits, write: Callable[[Path], None]
+) -> tuple[Mapping[str, Any], Output]:
+    """Run a program on the files of one case, with their folder as its last argument; return answer and raw output."""
+    temporary = temporary_folder()
+    case = temporary / "case"
+    case.mkdir()
+    write(case)
+    output = RunningProgram((*command.words, str(case)), limits, temporary).read_all()
+    return parse_object(output), output

@@ -16,8 +16,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.hda import structure
 from marsyard.algorithms.hda.estimator import find_site, match_structure
 from marsyard.algorithms.hda.motion import (
+    CameraMotion,
     LandingScene,
-    Motion,
     Views,
     assess_motion,
     build_scene,
@@ -74,7 +74,7 @@ class SemiGlobalEstimator:
         return find_site(build_scene(measurements), essential_motion, semi_global_structure, self.options)
 
 
-def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion | None:
+def essential_motion(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> CameraMotion | None:
     """Estimate the motion by essential matrices; return the motion with most tracks in front of both cameras.
 
     The motion is scaled so that the median depth of the tracks equals the laser range. None without a solution.
@@ -190,7 +190,7 @@ def match_disparities(
     return np.where(disparities >= max(min_disparity, 1), disparities, np.nan)
 
 
-def semi_global_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> structure.Matches:
+def semi_global_structure(scene: LandingScene, motion: CameraMotion, options: HdaOptions) -> structure.Matches:
     """Compute points for the pixel grid of `HdaEstimator` from the disparities of the rectified images."""
     first, second = scene.views
     bounds = structure.depth_bounds(motion.depth_range_m, options.depth_margin)

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
-from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, undistort
+from marsyard.algorithms.hda.motion import CameraMotion, CameraView, Views, points_at_depth, undistort
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks
 
@@ -24,7 +24,7 @@ STAGES = ("tracking", "motion", "structure", "hazards")
 
 
 @dataclass(frozen=True)
-class Ground:
+class MappedGround:
     """Maps of the ground, and the selected site.
 
     - surface_from_camera: Rotation from the first camera's frame to the surface frame; both origins are at that camera
@@ -55,9 +55,9 @@ class HdaDetails:
 
     views: Views
     tracks: Tracks | None = None
-    motion: Motion | None = None
+    motion: CameraMotion | None = None
     matches: Matches | None = None
-    ground: Ground | None = None
+    ground: MappedGround | None = None
     ends_s: tuple[float, ...] = field(default_factory=lambda: (time.process_time(),))
 
     def end_stage(self, **products: Any) -> HdaDetails:
@@ -110,7 +110,7 @@ def hda_products(details: HdaDetails) -> dict[str, Any]:
     return products
 
 
-def _ground_products(first: View, ground: Ground) -> dict[str, Any]:
+def _ground_products(first: CameraView, ground: MappedGround) -> dict[str, Any]:
     """Return the products of Figs. 4, 5 and 7."""
     elevation = ground.elevation
     shape = elevation.elevation_m.shape

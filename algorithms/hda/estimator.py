@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
 from marsyard.algorithms.hda import hazards
-from marsyard.algorithms.hda.details import Ground, HdaDetails
+from marsyard.algorithms.hda.details import HdaDetails, MappedGround
 from marsyard.algorithms.hda.motion import (
+    CameraMotion,
+    CameraView,
     LandingScene,
-    Motion,
     MotionStart,
-    View,
     build_scene,
     estimate_motion,
     plane_depths,
@@ -38,9 +38,9 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.sim.measurements import LandingMeasurements
 
 #: Function that estimates the camera motion from accepted tracks; None without a solution.
-MotionSolver = Callable[[LandingScene, Tracks, HdaOptions], Motion | None]
+MotionSolver = Callable[[LandingScene, Tracks, HdaOptions], CameraMotion | None]
 #: Function that computes points of the ground by stereo matching, from the motion at its final scale.
-StructureSolver = Callable[[LandingScene, Motion, HdaOptions], Matches]
+StructureSolver = Callable[[LandingScene, CameraMotion, HdaOptions], Matches]
 
 
 @final
@@ -122,7 +122,7 @@ def expected_pixels(scene: LandingScene, features: Points2, options: HdaOptions)
     return np.where(visible[:, None], pixels, features)
 
 
-def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> Motion:
+def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions) -> CameraMotion:
     """Solve for the motion by robust least squares.
 
     The published algorithm starts from the slant range alone (section II.B: "the altimetry measurement is used to set
@@ -138,7 +138,7 @@ def motion_from_tracks(scene: LandingScene, tracks: Tracks, options: HdaOptions)
     return estimate_motion(first, second, scene.views[1].focal_px, starts, options)
 
 
-def check_motion(motion: Motion | None, options: HdaOptions) -> SiteOutcome | None:
+def check_motion(motion: CameraMotion | None, options: HdaOptions) -> SiteOutcome | None:
     """Return the reason why a motion is rejected; None if it is accepted."""
     if motion is None:
         return SiteOutcome.NO_MOTION
@@ -151,7 +151,7 @@ def check_motion(motion: Motion | None, options: HdaOptions) -> SiteOutcome | No
     return SiteOutcome.NO_MOTION if not motion.converged or np.count_nonzero(motion.inliers) < min_inliers else None
 
 
-def match_structure(scene: LandingScene, motion: Motion, options: HdaOptions) -> Matches:
+def match_structure(scene: LandingScene, motion: CameraMotion, options: HdaOptions) -> Matches:
     """Compute points of the ground by matches along epipolar segments."""
     return dense_structure(scene.views, motion.second_from_first, motion.depth_range_m, options)
 
@@ -160,7 +160,7 @@ def match_structure(scene: LandingScene, motion: Motion, options: HdaOptions) ->
 PLANE_TRIALS = 200
 
 
-def up_direction(first: View, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:
+def up_direction(first: CameraView, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:
     """Unit vector upwards in the first camera's frame, from the source that the option `surface_frame` selects.
 
     `up_camera` is the inclinometers' measurement; `points` are in the first camera's frame, metres.
@@ -211,7 +211,7 @@ def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation
 
 def map_ground(
     scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
-) -> Ground | None:
+) -> MappedGround | None:
     """Compute the maps of `points_camera` (first camera's frame), and the site; None if the points cover no area."""
     first = scene.views[0]
     to_surface = surface_from_camera(up_direction(first, scene.up_camera, points_camera, options))
@@ -228,10 +228,10 @@ def map_ground(
     apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])
     site_cell = hazards.safe_site(maps.safety, apriori_cell)
-    return Ground(to_surface, to_world, points, elevation, maps, apriori_cell, site_cell)
+    return MappedGround(to_surface, to_world, points, elevation, maps, apriori_cell, site_cell)
 
 
-def site_world(scene: LandingScene, ground: Ground) -> Vector3 | None:
+def site_world(scene: LandingScene, ground: MappedGround) -> Vector3 | None:
     """Site in the world frame, metres, on the smooth surface; None if no cell is safe."""
     if ground.site_cell is None:
         return None

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int, UInt8
 
 from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector2
 from marsyard.algorithms.hda.kernels import elevation as kernels
-from marsyard.algorithms.hda.motion import Motion
+from marsyard.algorithms.hda.motion import CameraMotion
 from marsyard.algorithms.hda.options import HdaOptions
 
 #: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
@@ -276,7 +276,7 @@ class Resolution:
     position_m: float
 
 
-def map_resolution(motion: Motion, focal_px: float, options: HdaOptions) -> Resolution:
+def map_resolution(motion: CameraMotion, focal_px: float, options: HdaOptions) -> Resolution:
     """Estimate the resolution of a map at the features' median depth.
 
     The match error perpendicular to epipolar lines is estimated from the tracks' residuals. The same error is assumed

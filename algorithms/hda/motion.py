@@ -25,7 +25,7 @@ MIN_RESPONSE = 0.05
 
 
 @dataclass(frozen=True)
-class View:
+class CameraView:
     """One corrected image with its camera.
 
     - counts: Detector counts corrected for frame transfer, pixel response and lens fall-off
@@ -44,16 +44,16 @@ class View:
 
 
 #: The two images of an estimate.
-Views = tuple[View, View]
+Views = tuple[CameraView, CameraView]
 
 
-def build_view(image: DetectorImage, pose: PoseMeasurement) -> View:
+def build_view(image: DetectorImage, pose: PoseMeasurement) -> CameraView:
     """Build the view of an image taken at a pose. Raises ValueError if the image's size differs from its camera's."""
     if image.counts.shape != image.camera.size[::-1]:
         raise ValueError(f"the image has (rows, columns) {image.counts.shape}, its camera {image.camera.size[::-1]}")
     body_from_camera = camera_pose(image.camera)
     camera = image.camera.transform(body_from_camera.inv())
-    return View(apply_flat_field(image), camera, pose.world_from_body * body_from_camera)
+    return CameraView(apply_flat_field(image), camera, pose.world_from_body * body_from_camera)
 
 
 def apply_flat_field(image: DetectorImage) -> UInt16[np.ndarray, "rows columns"]:
@@ -135,7 +135,7 @@ MAX_INVERSE_DEPTH_FRACTION = 0.6
 
 
 @dataclass(frozen=True)
-class Motion:
+class CameraMotion:
     """Camera motion between two images, and the depths of the tracked features.
 
     - second_from_first: From the first to the second camera's frame, metres
@@ -153,7 +153,7 @@ class Motion:
     parallax_px: float
     converged: bool
 
-    def scale(self, factor: float) -> Motion:
+    def scale(self, factor: float) -> CameraMotion:
         """Return the motion with all lengths multiplied by a factor."""
         scaled_pose = rigid(self.second_from_first.rotation, factor * self.second_from_first.translation)
         return replace(self, second_from_first=scaled_pose, depths=factor * self.depths)
@@ -204,7 +204,7 @@ def range_starts(coordinates: Points2, range_m: float) -> tuple[MotionStart, ...
 
 def estimate_motion(
     first: Points2, second: Points2, focal_px: float, starts: tuple[MotionStart, ...], options: HdaOptions
-) -> Motion:
+) -> CameraMotion:
     """Estimate motion and depths by nonlinear least squares; return the best result of several starts.
 
     `first` and `second` are normalised image coordinates, `focal_px` the focal length. The depths of the starts (from
@@ -220,9 +220,9 @@ def estimate_motion(
         cost, converged = np.inf, False
         quaternion = start.second_from_first.rotation.as_quat(scalar_first=True)
         translation = start.second_from_first.translation / length_unit_m
-        motion = kernels.Motion(quaternion, translation, length_unit_m / start.depths)
+        motion = kernels.MotionArrays(quaternion, translation, length_unit_m / start.depths)
         for scale_px, with_depths, tolerance in stages:
-            matches = kernels.Matches(first, second, focal_px, scale_px)
+            matches = kernels.MatchArrays(first, second, focal_px, scale_px)
             motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
         candidates.append((motion, cost, converged))
     best, _, converged = min(candidates, key=lambda candidate: candidate[1])
@@ -240,15 +240,15 @@ def assess_motion(
     depths: Vector,
     converged: bool,
     options: HdaOptions,
-) -> Motion:
+) -> CameraMotion:
     """Compute residuals, inliers and parallax of a motion; `first` and `second` are normalised image coordinates."""
     quaternion = second_from_first.rotation.as_quat(scalar_first=True)
     inverse_depths = 1.0 / depths
     # with measurements of zero, residuals are the projections of the features, pixels
-    zero_matches = kernels.Matches(first, np.zeros_like(first), focal_px, 1.0)
+    zero_matches = kernels.MatchArrays(first, np.zeros_like(first), focal_px, 1.0)
     translations = (np.zeros(3), np.array(second_from_first.translation))
     without_translation, with_translation = (
-        kernels.residuals(zero_matches, kernels.Motion(quaternion, translation, inverse_depths))
+        kernels.residuals(zero_matches, kernels.MotionArrays(quaternion, translation, inverse_depths))
         for translation in translations
     )
     # points at infinity, or triangulated behind a camera, have no finite residual and are no inliers
@@ -256,7 +256,7 @@ def assess_motion(
         residuals = np.hypot(*(with_translation - focal_px * second).T)
     has_small_residual = residuals <= options.max_residual_px
     shifts_px = np.hypot(*(with_translation[has_small_residual] - without_translation[has_small_residual]).T)
-    return Motion(
+    return CameraMotion(
         second_from_first=second_from_first,
         depths=depths,
         residuals_px=residuals,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.hda.motion import View, Views
+from marsyard.algorithms.hda.motion import CameraView, Views
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
@@ -75,11 +75,11 @@ def resample_second(views: Views, second_from_first: RigidTransform, depth_m: fl
     grid = pixels.astype(np.float32).reshape(camera.size[1], camera.size[0], 2)
     # linear interpolation: OpenCV's cubic samples are displaced by up to 0.05 px
     counts = cv2.remap(second.counts.astype(np.float32), grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    resampled = View(np.rint(counts).astype(np.uint16), camera, second.world_from_camera)
+    resampled = CameraView(np.rint(counts).astype(np.uint16), camera, second.world_from_camera)
     return (first, resampled), rigid(Rotation.identity(), origin)
 
 
-def filter_view(view: View) -> View:
+def filter_view(view: CameraView) -> CameraView:
     """Smooth an image and subtract its local mean (band-pass filter); the counts are `FILTER_GAIN` times as large.
 
     The sum of absolute differences (Eq. 9) then does not depend on the exposure: the brightness of the same ground

@@ -14,7 +14,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Flags, Points2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import Motion, View, Views, points_at_depth, project_points, undistort
+from marsyard.algorithms.hda.motion import CameraMotion, CameraView, Views, points_at_depth, project_points, undistort
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.hda.preparation import prepare_views
 
@@ -69,7 +69,7 @@ def depth_bounds(depth_range_m: tuple[float, float], margin: float) -> tuple[flo
 GRID_POINTS_PER_HAZARD = 6
 
 
-def grid_spacing_px(view: View, depth_range_m: tuple[float, float], options: HdaOptions) -> int:
+def grid_spacing_px(view: CameraView, depth_range_m: tuple[float, float], options: HdaOptions) -> int:
     """Spacing of the grid, pixels: `grid_px`, or less if `refine_grid` requires it at the mean of the depth range."""
     if not options.refine_grid:
         return options.grid_px
@@ -88,7 +88,11 @@ def pixel_lattice(size: tuple[int, int], spacing_px: int, border_px: int) -> Poi
 
 
 def epipolar_segments(
-    second: View, second_from_first: RigidTransform, coordinates: Points2, bounds_m: tuple[float, float], border_px: int
+    second: CameraView,
+    second_from_first: RigidTransform,
+    coordinates: Points2,
+    bounds_m: tuple[float, float],
+    border_px: int,
 ) -> tuple[Points2, Points2, Flags]:
     """Compute the end points of epipolar segments (Eqs. 6-8), and whether both lie inside the border.
 
@@ -218,7 +222,9 @@ SPOT_OFFSETS_PX = np.arange(-4.0, 5.0, 2.0)
 MIN_SPOT_MATCHES = 5
 
 
-def scale_factor(views: Views, motion: Motion, coordinates: Points2, range_m: float, options: HdaOptions) -> float:
+def scale_factor(
+    views: Views, motion: CameraMotion, coordinates: Points2, range_m: float, options: HdaOptions
+) -> float:
     """Scale factor of the motion that makes the depth on the optical axis equal to the laser range.
 
     Pixels around the laser spot are matched along their epipolar segments. With too few matches the depth is that of

@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 
 from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Vector, Vector2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import View
+from marsyard.algorithms.hda.motion import CameraView
 from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
 from marsyard.algorithms.image.correlation import halve
 from marsyard.algorithms.image.interest import structure_tensor
-from marsyard.algorithms.image.registration import Limits, register_template
+from marsyard.algorithms.image.registration import RegistrationLimits, register_template
 
 #: Half width of the search window at all levels except the coarsest; minimum half width of all templates and windows
 #: (Eq. 5), pixels.
@@ -59,7 +59,7 @@ def feature_border_px(options: HdaOptions) -> int:
     return options.template_half_px + 1
 
 
-def expected_shift_px(view: View, options: HdaOptions) -> int:
+def expected_shift_px(view: CameraView, options: HdaOptions) -> int:
     """Largest expected displacement of a feature from the start of its search, whole pixels: w of Eqs. 4 and 5.
 
     It is the displacement of level ground on the optical axis by translation and tilt, plus that of an image corner by
@@ -79,7 +79,7 @@ def expected_shift_px(view: View, options: HdaOptions) -> int:
     return int(np.clip(np.ceil(shift_px), MIN_HALF_PX, max(columns, rows)))
 
 
-def window_half_px(view: View, options: HdaOptions) -> int:
+def window_half_px(view: CameraView, options: HdaOptions) -> int:
     """Half width of the search window: the option of this name, by default the expected displacement."""
     return expected_shift_px(view, options) if options.window_half_px is None else options.window_half_px
 
@@ -124,8 +124,8 @@ def select_features(counts: Counts, options: HdaOptions) -> Points2:
 
 
 #: Limits of an alignment: a height change of 20 % stretches the image by 25 %, and the first steps overshoot. The
-#: default limits of `Limits` rejected 20 % of the correct tracks after a descent by 20 % of the height.
-ALIGNMENT_LIMITS = Limits(shift_px=2.5, stretch=0.5, steps=30)
+#: default limits of `RegistrationLimits` rejected 20 % of the correct tracks after a descent by 20 % of the height.
+ALIGNMENT_LIMITS = RegistrationLimits(shift_px=2.5, stretch=0.5, steps=30)
 
 
 @dataclass(frozen=True)

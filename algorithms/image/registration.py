@@ -41,7 +41,7 @@ MIN_PIVOT = 1e-4
 
 
 @dataclass(frozen=True)
-class Limits:
+class RegistrationLimits:
     """Limits of a registration.
 
     - shift_px: Largest displacement of the template's centre from its start
@@ -55,7 +55,7 @@ class Limits:
 
 
 #: Default limits.
-LIMITS = Limits()
+LIMITS = RegistrationLimits()
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def build_spline(window: Raster, corner: Vector2, side: int, previous: WindowSpl
 
 
 def register_template(
-    template: Patch, window: Raster | WindowSpline, corner: Vector2, warp: Warp, limits: Limits = LIMITS
+    template: Patch, window: Raster | WindowSpline, corner: Vector2, warp: Warp, limits: RegistrationLimits = LIMITS
 ) -> Registration | None:
     """Register a template in a window, or in its spline around `corner`, starting from `corner` (row, column).
 

@@ -12,7 +12,7 @@ from marsyard.algorithms.arrays import Points2
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.map_sampling import sample_raster
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import FilterOptions, LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage, binning_factor
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
@@ -35,16 +35,16 @@ class InertialEstimator:
     def start(self, initial: InitialState, map_product: MapProduct) -> None:
         """Reset the state for a new descent."""
         self._map = map_product
-        self._filter = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._filter = LocalisationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
 
-    def imu(self, increments: ImuIncrements) -> None:
+    def process_increments(self, increments: ImuIncrements) -> None:
         """Propagate the state by inertial increments."""
         self._filter.propagate(increments)
 
-    def altitude(self, measurement: AltitudeMeasurement) -> None:
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Ignore altitudes."""
 
-    def image(self, image: DetectorImage) -> PositionEstimate:
+    def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Return the state at the time of the image."""
         if not self._filter.is_stored(image.time_s):
             return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)
@@ -76,7 +76,7 @@ class FeatureEstimator(InertialEstimator):
         self._is_valid = False  # whether a pose was found in this descent
         self._altitude_m: float | None = None
 
-    def altitude(self, measurement: AltitudeMeasurement) -> None:
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Store the altitude, which determines the scale at which an image is matched.
 
         An altitude is ignored if its time is outside the inertial data.
@@ -85,7 +85,7 @@ class FeatureEstimator(InertialEstimator):
             return
         self._altitude_m = measurement.altitude_m
 
-    def image(self, image: DetectorImage) -> PositionEstimate:
+    def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Estimate the pose from features, and update the position. Without a pose, return the propagated state."""
         if not self._filter.is_stored(image.time_s):
             return PositionEstimate(PositionOutcome.OUTSIDE_INERTIAL_DATA, self._filter.time_s)

@@ -22,7 +22,7 @@ from marsyard.algorithms.localisation.fine import match_landmarks
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.landmarks import Landmarks, select_landmarks
 from marsyard.algorithms.localisation.map_sampling import elevation_at
-from marsyard.algorithms.localisation.navigation_filter import FilterOptions, NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import FilterOptions, LocalisationFilter
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.algorithms.localisation.state_updates import GroundHeight, UpdateOutcome
@@ -43,7 +43,7 @@ class MapRelativeEstimator:
         self._map = map_product
         self._landmarks: Landmarks = select_landmarks(map_product, self.options)
         # pure inertial navigation: the filter returns to it when a coarse fix is discarded
-        self._inertial = NavigationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
+        self._inertial = LocalisationFilter.from_initial(initial, FilterOptions(imu=self.options.imu))
         self._filter = self._inertial
         self._has_fix = False
         self._increments_since_fix: list[ImuIncrements] = []
@@ -53,13 +53,13 @@ class MapRelativeEstimator:
         self._is_contradicted = False
         self._last_update_s: float | None = None
 
-    def imu(self, increments: ImuIncrements) -> None:
+    def process_increments(self, increments: ImuIncrements) -> None:
         """Propagate the state by inertial increments; pure inertial navigation follows if the fix is discarded."""
         self._filter.propagate(increments)
         if self._has_fix:
             self._increments_since_fix.append(increments)
 
-    def altitude(self, measurement: AltitudeMeasurement) -> None:
+    def process_altitude(self, measurement: AltitudeMeasurement) -> None:
         """Update the state by an altitude, if the position on the map is known; store it otherwise.
 
         An altitude outside of the stored inertial data is ignored.
@@ -70,7 +70,7 @@ class MapRelativeEstimator:
         if self._has_fix:
             self._update_altitude(measurement)
 
-    def image(self, image: DetectorImage) -> PositionEstimate:
+    def process_image(self, image: DetectorImage) -> PositionEstimate:
         """Match an image with the map, and return the state at its time.
 
         An image outside of the stored inertial data is refused with OUTSIDE_INERTIAL_DATA, and not used.

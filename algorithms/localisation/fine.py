@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector, Vector3
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak
-from marsyard.algorithms.image.registration import MARGIN_PX, Limits, register_template
+from marsyard.algorithms.image.registration import MARGIN_PX, RegistrationLimits, register_template
 from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.landmarks import Landmarks, visible_landmarks
 from marsyard.algorithms.localisation.map_sampling import (
@@ -225,7 +225,7 @@ def _match_template(
     ]
     position = np.array([low_row + peak.row, low_column + peak.column]) - start
     registration = register_template(
-        np.ascontiguousarray(centred, dtype=np.float64), region, position, "shift", Limits()
+        np.ascontiguousarray(centred, dtype=np.float64), region, position, "shift", RegistrationLimits()
     )
     if registration is None:
         return None

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
+from marsyard.algorithms.interface import ImageStream
+from marsyard.sim.measurements import DetectorImage
 
 
 @dataclass(frozen=True)
@@ -90,26 +90,8 @@ class PositionEstimate:
     details: object | None = None
 
 
-@runtime_checkable
-class PositionEstimator(Protocol):
-    """Protocol: estimate a lander's position on a map from a stream of measurements in the order of their arrival.
-
-    Between two images, all inertial increments up to the later image arrive before it. No method raises for a
-    measurement that an instrument can deliver. An image whose time tag lies outside of the inertial data is refused
-    with OUTSIDE_INERTIAL_DATA, at the time of the last increment; such an altitude is ignored.
-    """
-
-    def start(self, initial: InitialState, map_product: MapProduct) -> None:
-        """Reset the state for a new descent."""
-
-    def imu(self, increments: ImuIncrements) -> None:
-        """Process the next inertial increments; the first boundary is the last one of the previous call."""
-
-    def altitude(self, measurement: AltitudeMeasurement) -> None:
-        """Process an altitude above the ground below the lander."""
-
-    def image(self, image: DetectorImage) -> PositionEstimate:
-        """Process the next image; return the estimate at the image's time."""
-
-    def finish(self) -> PositionEstimate:
-        """Return the final estimate, at the time of the last increment."""
+#: Stream that estimates a lander's position on a map. `start` receives the initial state and the map. All increments
+#: up to an image arrive before it. `process_image` returns the estimate at the time of the image, and `finish` that at
+#: the time of the last increment. An image whose time tag lies outside of the inertial data is refused with
+#: OUTSIDE_INERTIAL_DATA, at the time of the last increment; such an altitude is ignored.
+PositionEstimator = ImageStream[[InitialState, MapProduct], DetectorImage, PositionEstimate]

@@ -37,13 +37,13 @@ from marsyard.algorithms.localisation.state_updates import (
     GroundModel,
     LandmarkMeasurement,
     LandmarkResult,
+    StateUpdate,
     UpdateOutcome,
-    UpdateResult,
 )
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import ImuIncrements
 
-Result = TypeVar("Result", UpdateResult, LandmarkResult)
+Result = TypeVar("Result", StateUpdate, LandmarkResult)
 #: Minimum time between two tags: equal tags are separated by it, far below the tags' jitter.
 _MIN_INTERVAL_S = 1e-9
 
@@ -80,7 +80,7 @@ class _Checkpoint:
     updates: int
 
 
-class NavigationFilter:
+class LocalisationFilter:
     """Error-state extended Kalman filter of 15 errors for map-relative localisation.
 
     Updates return a result with an outcome; a measurement that is rejected, not finite or outside the stored history
@@ -96,7 +96,7 @@ class NavigationFilter:
         self._updates: list[Callable[[NavigationState], NavigationState]] = []
 
     @classmethod
-    def from_initial(cls, initial: InitialState, options: FilterOptions | None = None) -> NavigationFilter:
+    def from_initial(cls, initial: InitialState, options: FilterOptions | None = None) -> LocalisationFilter:
         """Create the filter from a state of inertial navigation, with biases of zero."""
         options = FilterOptions() if options is None else options
         covariance = np.zeros((ERRORS, ERRORS))
@@ -167,7 +167,7 @@ class NavigationFilter:
 
     def update_position(
         self, time_s: float, horizontal_position_m: Float[np.ndarray, "2"], covariance: Float[np.ndarray, "2 2"]
-    ) -> UpdateResult:
+    ) -> StateUpdate:
         """Update by a horizontal position on the map (east, north), for example a coarse fix."""
         update = partial(
             updates.update_position,
@@ -175,11 +175,11 @@ class NavigationFilter:
             covariance=covariance,
             options=self._options.gates,
         )
-        return self._update(time_s, update, UpdateResult(UpdateOutcome.OUTSIDE_HISTORY))
+        return self._update(time_s, update, StateUpdate(UpdateOutcome.OUTSIDE_HISTORY))
 
     def update_altitude(
         self, time_s: float, altitude_m: float, ground_height: GroundModel, sd_m: float | None = None
-    ) -> UpdateResult:
+    ) -> StateUpdate:
         """Update by an altitude above the ground below the body frame's origin.
 
         `ground_height` is the map's height at the estimated position with its slope (east, north), or a function that
@@ -194,7 +194,7 @@ class NavigationFilter:
             sd_m=self._options.altitude_sd_m if sd_m is None else sd_m,
             options=self._options.gates,
         )
-        return self._update(time_s, update, UpdateResult(UpdateOutcome.OUTSIDE_HISTORY))
+        return self._update(time_s, update, StateUpdate(UpdateOutcome.OUTSIDE_HISTORY))
 
     def update_landmarks(
         self,

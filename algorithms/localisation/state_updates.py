@@ -60,7 +60,7 @@ class UpdateOutcome(Enum):
 
 
 @dataclass(frozen=True)
-class UpdateResult:
+class StateUpdate:
     """Result of an update of position or altitude; `normalised_square`: innovation' S^-1 innovation."""
 
     outcome: UpdateOutcome
@@ -148,7 +148,7 @@ def update_position(
     horizontal_position_m: Float[np.ndarray, "2"],
     covariance: Float[np.ndarray, "2 2"],
     options: GateOptions,
-) -> tuple[NavigationState, UpdateResult]:
+) -> tuple[NavigationState, StateUpdate]:
     """Update by a horizontal position (east, north) on the map."""
     residual = horizontal_position_m - state.position_m[:2]
     return _update_gated(state, np.eye(2, ERRORS), residual, covariance, options)
@@ -156,7 +156,7 @@ def update_position(
 
 def update_altitude(
     state: NavigationState, altitude_m: float, ground: GroundModel, sd_m: float, options: GateOptions
-) -> tuple[NavigationState, UpdateResult]:
+) -> tuple[NavigationState, StateUpdate]:
     """Update by the altitude above the map's ground below the body frame's origin.
 
     `sd_m` contains the error of the map's elevation and of the slope's linear extrapolation to the true position.
@@ -358,20 +358,20 @@ def _update_gated(
     residual: Float[np.ndarray, "m"],
     noise: Float[np.ndarray, "m m"],
     options: GateOptions,
-) -> tuple[NavigationState, UpdateResult]:
+) -> tuple[NavigationState, StateUpdate]:
     """Update by a measurement with this Jacobian, unless its innovation is improbable."""
     if not (np.isfinite(residual).all() and np.isfinite(jacobian).all() and np.isfinite(noise).all()):
-        return state, UpdateResult(UpdateOutcome.INVALID)
+        return state, StateUpdate(UpdateOutcome.INVALID)
     root = square_root(state.covariance)
     factor = jacobian @ root
     square = float(residual @ np.linalg.solve(noise + factor @ factor.T, residual))
     if not square < chdtri(len(residual), options.false_rejection):
-        return state, UpdateResult(UpdateOutcome.REJECTED, square)
+        return state, StateUpdate(UpdateOutcome.REJECTED, square)
     weighted = np.linalg.solve(noise, factor)
     lower = np.linalg.cholesky(symmetrise(np.eye(ERRORS) + factor.T @ weighted))
     half = linalg.solve_triangular(lower, root.T, lower=True)
     errors = half.T @ linalg.solve_triangular(lower, weighted.T @ residual, lower=True)
-    return state.correct(errors, half.T @ half), UpdateResult(UpdateOutcome.APPLIED, square)
+    return state.correct(errors, half.T @ half), StateUpdate(UpdateOutcome.APPLIED, square)
 
 
 def square_root(covariance: ErrorMatrix) -> ErrorMatrix:

@@ -1,7 +1,8 @@
 """Visual target tracker: the tracking loop of section 4.1, its states, and the loss criteria.
 
 The steps of the loop are functions in `pointing`, `matching`, `stereo` and `accuracy`. The tracker stores its state in
-an immutable `Track` and replaces it in each update. The "seed" is the first update, which extracts the first template.
+an immutable `TargetTrack` and replaces it in each update. The "seed" is the first update, which extracts the first
+template.
 
 Sections, equations and figures are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -51,7 +52,7 @@ class Distances:
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Maximum accepted corrections (see `Evidence`): of the target's distance and of its position, metres."""
+    """Maximum accepted corrections (see `MatchEvidence`): of the target's distance and of its position, metres."""
 
     distance_m: float
     position_m: float
@@ -78,7 +79,7 @@ def tolerances(distances: Distances, left: CameraModel, right: CameraModel, opti
 
 
 @dataclass(frozen=True)
-class Evidence:
+class MatchEvidence:
     """Input of the four loss criteria.
 
     - match_score, stereo_score: Normalised correlations of the template match and of the stereo match
@@ -92,7 +93,7 @@ class Evidence:
     position_correction_m: float
 
 
-def find_losses(evidence: Evidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
+def find_losses(evidence: MatchEvidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
     """Return the reasons for a loss: low scores, or corrections above their tolerances."""
     criteria = {
         TargetLoss.LOW_MATCH_SCORE: evidence.match_score < options.min_match_score,
@@ -152,12 +153,12 @@ class VttDetails:
     azimuth_change_rad: float = 0.0
     position_world: Vector3 | None = None
     step_m: float = 0.0
-    evidence: Evidence | None = None
+    evidence: MatchEvidence | None = None
     allowed: Tolerances | None = None
 
 
 @dataclass(frozen=True)
-class Track:
+class TargetTrack:
     """State of the tracker for its target.
 
     - designated: The designated pixel, or the target's position in the world, metres
@@ -194,7 +195,7 @@ class VisualTargetTracker:
     ) -> None:
         self.options = VttOptions() if options is None else options
         self.matcher = matcher
-        self.track: Track | None = None
+        self.track: TargetTrack | None = None
 
     @property
     def state(self) -> TrackingState:
@@ -204,9 +205,9 @@ class VisualTargetTracker:
     def designate(self, target: TargetDesignation, world_from_rover: RigidTransform) -> None:
         """Set the target, with the rover's estimated pose."""
         if isinstance(target, PixelTarget):
-            self.track = Track(target, world_from_rover)
+            self.track = TargetTrack(target, world_from_rover)
         else:
-            self.track = Track(matching.designated_position_world(target, world_from_rover), world_from_rover)
+            self.track = TargetTrack(matching.designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
         """Clear the target."""
@@ -240,7 +241,7 @@ class VisualTargetTracker:
 
 
 @dataclass(frozen=True)
-class UpdateResult:
+class TrackResult:
     """Result of one update: the losses, or the target's position (rover frame, metres) and the new reference."""
 
     losses: tuple[TargetLoss, ...]
@@ -250,7 +251,7 @@ class UpdateResult:
 
 
 @dataclass(frozen=True)
-class Stop:
+class StereoStop:
     """Measurements of a rover stop, and the estimated pose of the mast head; cameras are in the head's frame."""
 
     measurements: RoverMeasurements
@@ -258,7 +259,7 @@ class Stop:
     world_from_head: RigidTransform
 
     @classmethod
-    def from_measurements(cls, measurements: RoverMeasurements) -> Stop:
+    def from_measurements(cls, measurements: RoverMeasurements) -> StereoStop:
         """Compute the head poses of a stop from its measurements."""
         angles = (measurements.azimuth_rad, measurements.elevation_rad)
         rover_from_head = measurements.mast.geometry.rover_from_head(*angles)
@@ -279,7 +280,7 @@ class Stop:
         return float(np.linalg.norm(position_head - self.left.c))
 
 
-def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3 | None:
+def expected_position(track: TargetTrack, world_from_frame: RigidTransform) -> Vector3 | None:
     """Predict the target position in the rover or head frame of this pose; None for a pixel target before the seed."""
     last = track.sighting
     if last is not None:
@@ -289,9 +290,9 @@ def expected_position(track: Track, world_from_frame: RigidTransform) -> Vector3
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
 
 
-def seed_track(track: Track, measurements: RoverMeasurements, options: VttOptions) -> UpdateResult:
+def seed_track(track: TargetTrack, measurements: RoverMeasurements, options: VttOptions) -> TrackResult:
     """Extract the first template at the designated target, and triangulate it by point stereo."""
-    stop = Stop.from_measurements(measurements)
+    stop = StereoStop.from_measurements(measurements)
     if isinstance(track.designated, PixelTarget):
         pixel, ranges = track.designated.pixel, options.seed_range_m
     else:
@@ -299,7 +300,7 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
         pixel = stop.left.project(expected)[0]
         ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
     if not np.all(np.isfinite(pixel)) or not matching.window_fits(measurements.left, pixel, options.template_px):
-        return UpdateResult((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
+        return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(True, None))
     template = matching.extract_patch(measurements.left, pixel, options.template_px)
     window, window_corner = matching.search_window(measurements.left, pixel, options.search_px)
     match = matching.Match(pixel, 1.0, template)
@@ -307,24 +308,24 @@ def seed_track(track: Track, measurements: RoverMeasurements, options: VttOption
     result = triangulate_target(stop, pixel, template, ranges, details, options)
     stereo = result.details.stereo
     if result.sighting is not None and stereo is not None and stereo.score < options.min_stereo_score:
-        return UpdateResult((TargetLoss.LOW_STEREO_SCORE,), result.details)
+        return TrackResult((TargetLoss.LOW_STEREO_SCORE,), result.details)
     return result
 
 
 def follow_track(
-    track: Track,
+    track: TargetTrack,
     last: matching.Sighting,
     measurements: RoverMeasurements,
     options: VttOptions,
     matcher: matching.Matcher,
-) -> UpdateResult:
+) -> TrackResult:
     """Match and triangulate the target (actions 1 to 6 of section 4.1 without pointing); check the loss criteria."""
-    stop = Stop.from_measurements(measurements)
+    stop = StereoStop.from_measurements(measurements)
     new_from_old = matching.pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
     points = matching.roll_points(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
     if points is None:
-        return UpdateResult((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
+        return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = points[0]
     magnification = matching.magnification(last.position_head, last.camera.c, expected, stop.left.c)
     change = matching.ViewChange(magnification, matching.roll_angle(points))
@@ -334,7 +335,7 @@ def follow_track(
     applied_change = matching.ViewChange(applied_magnification, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied_change, options)
     if match is None:
-        return UpdateResult((TargetLoss.OUT_OF_VIEW,), details)
+        return TrackResult((TargetLoss.OUT_OF_VIEW,), details)
     template = matching.extract_patch(measurements.left, match.pixel, options.template_px)
     details = replace(details, match=match, template=template)
     ranges = search_ranges(stop.left, stop.right, stop.distance_m(expected), options.disparity_search_px)
@@ -345,17 +346,22 @@ def follow_track(
 
 
 def triangulate_target(
-    stop: Stop, pixel: Vector2, template: Patch, ranges_m: tuple[float, float], details: VttDetails, options: VttOptions
-) -> UpdateResult:
+    stop: StereoStop,
+    pixel: Vector2,
+    template: Patch,
+    ranges_m: tuple[float, float],
+    details: VttDetails,
+    options: VttOptions,
+) -> TrackResult:
     """Triangulate the target from its left pixel, by point stereo over the ranges `ranges_m`."""
     left_ray = stop.left.rays(pixel)
     curve = epipolar_pixels(left_ray, stop.left, stop.right, ranges_m)
     stereo = point_stereo(template, stop.measurements.right, curve, options)
     if stereo is None:
-        return UpdateResult((TargetLoss.OUT_OF_VIEW,), details)
+        return TrackResult((TargetLoss.OUT_OF_VIEW,), details)
     position = nearest_point(left_ray, stop.right.rays(stereo.pixel))
     if position is None:
-        return UpdateResult((TargetLoss.NO_RANGE,), replace(details, stereo=stereo))
+        return TrackResult((TargetLoss.NO_RANGE,), replace(details, stereo=stereo))
     rover_points = np.asarray(stop.rover_from_head.apply(np.stack([position, stop.left.c])))
     direction = rover_points[0] - rover_points[1]
     world_from_rover = stop.measurements.world_from_rover
@@ -369,12 +375,17 @@ def triangulate_target(
     sighting = matching.Sighting(
         stop.measurements.left, pixel, position, stop.left, stop.world_from_head, world_from_rover
     )
-    return UpdateResult((), details, rover_points[0], sighting)
+    return TrackResult((), details, rover_points[0], sighting)
 
 
 def check_losses(
-    track: Track, last: matching.Sighting, result: UpdateResult, stop: Stop, expected_m: float, options: VttOptions
-) -> UpdateResult:
+    track: TargetTrack,
+    last: matching.Sighting,
+    result: TrackResult,
+    stop: StereoStop,
+    expected_m: float,
+    options: VttOptions,
+) -> TrackResult:
     """Apply the four loss criteria to a match; `expected_m` is the predicted distance from the left camera."""
     details, sighting = result.details, result.sighting
     match, stereo, position = details.match, details.stereo, details.position_world
@@ -389,7 +400,7 @@ def check_losses(
         step_m=float(np.linalg.norm(motion_m)),
         driven_m=track.driven_m + float(np.linalg.norm(latest_motion_m)),
     )
-    evidence = Evidence(
+    evidence = MatchEvidence(
         match_score=match.score,
         stereo_score=stereo.score,
         distance_correction_m=details.distance_m - expected_m,
@@ -405,10 +416,12 @@ def check_losses(
         allowed=allowed,
     )
     losses = find_losses(evidence, allowed, options)
-    return UpdateResult(losses, details) if losses else replace(result, details=details)
+    return TrackResult(losses, details) if losses else replace(result, details=details)
 
 
-def advance_track(track: Track, result: UpdateResult, measurements: RoverMeasurements, options: VttOptions) -> Track:
+def advance_track(
+    track: TargetTrack, result: TrackResult, measurements: RoverMeasurements, options: VttOptions
+) -> TargetTrack:
     """Return the track after an update; a new match replaces the template."""
     pose, sighting, details = measurements.world_from_rover, result.sighting, result.details
     state, lost_updates = next_state(track.state, track.lost_updates, sighting is not None, options.max_lost_updates)

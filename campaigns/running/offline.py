@@ -68,7 +68,7 @@ def _write_manifest(campaign: Campaign, directory: Path) -> None:
     has_one_line = answer_format is None or answer_format.join is None
     lines = "one line for each case" if has_one_line else "the lines of each case in order"
     refusal = "A case without an answer has an\noutcome and no numbers; outcomes" if has_one_line else "Outcomes"
-    outcomes = ", ".join(answer_format.outcomes.__members__) if answer_format else ""
+    outcomes = ", ".join(answer_format.form.outcomes.__members__) if answer_format else ""
     manifest = {"schema": SCHEMA, "campaign": name, "task": task.name, "cases": cases, "columns": list(columns)}
     text = f"""# {cases} cases of {name}
 
@@ -131,7 +131,7 @@ def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, a
         raise CampaignError(f"{answers}: unknown case {_list_first(unknown_cases)}; allowed: 0 to {total - 1}")
     missing_cases = [case for case in range(total) if case not in answers_by_case]
     if missing_cases:
-        refusals = list(task.offline.outcomes.__members__)[1:]
+        refusals = list(task.offline.form.outcomes.__members__)[1:]
         advice = f"a case without an answer needs a line with its outcome, such as {refusals[0]}"
         raise CampaignError(
             f"{answers}: no answer to {len(missing_cases)} of {total} cases: {_list_first(missing_cases)}; {advice}"

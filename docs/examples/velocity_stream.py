@@ -17,17 +17,14 @@ answer is the inertial velocity at the last image minus its error, with a covari
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.exchange import read_frame, read_increments
+from marsyard.algorithms.exchange import VELOCITY_STREAM
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentFrame, ImuIncrements
 
@@ -62,15 +59,15 @@ class ChainedShifts:
             pair = compare_frames(self.previous_frame, frame)
             self.pairs += [] if pair is None else [pair]
         self.previous_frame = frame
-        return self.estimate(frame) if self.pairs else None
+        return self.correct_velocity(frame) if self.pairs else None
 
     def finish(self) -> VelocityEstimate:
         """Return the final estimate of the descent."""
         if self.previous_frame is None or not self.pairs:
             return VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
-        return self.estimate(self.previous_frame)
+        return self.correct_velocity(self.previous_frame)
 
-    def estimate(self, frame: DescentFrame) -> VelocityEstimate:
+    def correct_velocity(self, frame: DescentFrame) -> VelocityEstimate:
         """Correct the inertial velocity at an image by the mean of all pairs, weighted by their inverse variances."""
         errors = np.array([pair.error_m_s for pair in self.pairs])
         is_consistent = np.hypot(*(errors - np.median(errors, axis=0)).T) < MAX_DEVIATION_M_S
@@ -187,41 +184,6 @@ def rectify(frame: DescentFrame, height: float, centre: np.ndarray, gsd_m: float
     return patch if patch.std() > 1.0 else None
 
 
-def format_answer(estimate: VelocityEstimate | None) -> dict[str, Any]:
-    """Convert an estimate to an answer of the exchange format."""
-    if estimate is None or estimate.velocity_m_s is None:
-        return {"outcome": None if estimate is None else estimate.outcome.name}
-    return {
-        "outcome": estimate.outcome.name,
-        "velocity_m_s": estimate.velocity_m_s.tolist(),
-        "covariance_m2_s2": estimate.covariance_m2_s2.tolist(),
-        "span_s": estimate.span_s,
-    }
-
-
-def main() -> None:
-    """Answer the requests on standard input, one per line, until the input ends."""
-    uses_increments = "--increments" in sys.argv
-    stream = IntegratedShifts() if uses_increments else ChainedShifts()
-    # "exchange" is the version of the exchange format (docs/custom-algorithms.md)
-    print(json.dumps({"exchange": 2, "ready": True}), flush=True)
-    for line in sys.stdin:
-        request = json.loads(line)
-        fields: dict[str, Any] = {}
-        if request["do"] == "start":
-            # request the messages "imu" and "altitude"
-            fields = {"inertial": uses_increments}
-            answer = stream.start()
-        elif request["do"] == "imu":
-            answer = stream.process_increments(read_increments(request["increments"]))
-        elif request["do"] == "altitude":
-            answer = None  # the frame of the next image contains the altitude
-        elif request["do"] == "picture":
-            answer = stream.process_image(read_frame(Path(request["frame"])))
-        else:
-            answer = stream.finish()
-        print(json.dumps({"exchange": 2, "id": request["id"], **fields, **format_answer(answer)}), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    # answers the requests on standard input until the input ends (docs/custom-algorithms.md)
+    VELOCITY_STREAM.serve(IntegratedShifts() if "--increments" in sys.argv else ChainedShifts())

@@ -79,10 +79,10 @@ class Subject:
             return suite
         if task is TRACKING:
             return trackers.TrackerSuite(create, self.spec, is_program, self.limit_s)
-        protocol = estimators.VELOCITY if task is VELOCITY else estimators.LANDING
+        arguments = create, self.spec, is_program, self.limit_s
         if task.accepts_stream(self.spec):
-            protocol = estimators.STREAM
-        return estimators.EstimatorSuite(create, self.spec, is_program, self.limit_s, protocol)
+            return estimators.StreamSuite(*arguments, estimators.STREAM)
+        return estimators.EstimatorSuite(*arguments, estimators.VELOCITY if task is VELOCITY else estimators.LANDING)
 
     def prepare(self) -> None:
         """Check that the algorithm or part exists, import it, and create the inputs of its suite."""
@@ -134,8 +134,11 @@ def determine_task(spec: str) -> str:
     if hasattr(algorithm, "designate"):
         return TRACKING.name
     for task in tasks().values():
-        if task.suite and all(hasattr(algorithm, method) for method in task.methods):
+        if task.suite and task.methods and all(hasattr(algorithm, method) for method in task.methods):
             return task.name
+    if hasattr(algorithm, "process_image") and len(inspect.signature(algorithm.start).parameters) > 1:
+        # a stream that starts with inputs, in addition to `self`
+        return next(task.name for task in tasks().values() if not task.methods)
     annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)
     is_landing = any("Landing" in str(item) or "Site" in str(item) for item in annotations.values())
     return LANDING.name if is_landing else VELOCITY.name

@@ -231,5 +231,5 @@ def measure_time_s(call: Callable[[], object]) -> float:
 
 
 def fingerprint(answer: Any) -> str:
-    """Compute the hash of an answer without its details, which may contain times."""
-    return hash_inputs(answer, ("details",))
+    """Compute the hash of an answer without its details, which may contain times, and without computation times."""
+    return hash_inputs(answer, ("details", "image_times_s"))

@@ -1,106 +1,82 @@
-"""Conformance checks of velocity estimators, for three images or a stream of images, and of landing site estimators."""
+"""Conformance checks of estimators; each task declares its measurements and the rules for its answers (`Protocol`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from marsyard.algorithms.answers import check_site, check_velocity
+from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import copy_inputs
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
+from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint, measure_time_s
+from marsyard.scenarios.streamed import is_image
+from marsyard.scenarios.velocity import check_velocity_answer
 from marsyard.sim.measurements import DescentMeasurements
 
-#: Number of images of an ordinary stream, and of a long stream.
-_STREAM_LENGTH, _LONG_LENGTH = 5, 10
-#: Numbers of images of streams that are too short for a velocity, and of short but sufficient streams.
-_INSUFFICIENT_LENGTHS, _SHORT_LENGTHS = (0, 1), (2, 3)
+#: Number of images of an ordinary stream, of a long stream, and before the interruption of a stream.
+_STREAM_LENGTH, _LONG_LENGTH, _INTERRUPTED_LENGTH = 5, 10, 3
+
+
+@dataclass(frozen=True)
+class Unusual:
+    """Unusual cases of one check.
+
+    - text: description of the measurements
+    - cases: functions that create the measurements
+    - reason: why no answer can contain a result; empty if it can
+    """
+
+    text: str
+    cases: tuple[Callable[[], Any], ...]
+    reason: str = ""
 
 
 @dataclass(frozen=True)
 class Protocol:
     """Measurements of a task, and the rules for its answers.
 
-    - measurements: creates the input of an ordinary case
-    - check: returns a valid answer; raises AlgorithmError for an answer that does not conform to the interface
-    - is_valid: whether an answer contains a result (a velocity or a site)
+    - measurements: creates the measurements of an ordinary case
+    - check: returns the answer to measurements if it is valid; raises AlgorithmError or BreachError if not
+    - is_valid: whether an answer contains a result (a velocity, a site or a position)
     - describe: formats an answer
     - failures: outcomes without a result, as text
+    - unusual: unusual cases by name of their check
+    - interface: file that defines methods and answers
+    - interrupted: creates the measurements of a descent that is interrupted by an ordinary one; None without streams
     """
 
     measurements: Callable[[], Any]
-    check: Callable[[object], Any]
+    check: Callable[[Any, Any], Any]
     is_valid: Callable[[Any], bool]
     describe: Callable[[Any], str]
     failures: str
-
-
-def describe_velocity(estimate: VelocityEstimate) -> str:
-    """Return the outcome of an estimate, and its error relative to the truth of the suite's descents."""
-    if estimate.velocity_m_s is None:
-        return estimate.outcome.name
-    error = float(np.hypot(*(estimate.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2])))
-    return f"{estimate.outcome.name}, {error:.2f} m/s error"
-
-
-VELOCITY = Protocol(
-    measurements=inputs.descent,
-    check=check_velocity,
-    is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
-    describe=describe_velocity,
-    failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
-)
-STREAM = replace(VELOCITY, measurements=partial(inputs.inertial_descent, _STREAM_LENGTH))
-LANDING = Protocol(
-    measurements=inputs.landing,
-    check=check_site,
-    is_valid=lambda estimate: estimate.outcome.converged,
-    describe=lambda estimate: str(estimate.outcome.name),
-    failures=", ".join(outcome.name for outcome in SiteOutcome if not outcome.converged),
-)
+    unusual: Mapping[str, Unusual]
+    interface: str = "algorithms/interface.py"
+    interrupted: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True)
 class EstimatorSuite(Suite):
-    """Suite of one estimator; with the protocol `STREAM`, `make` constructs a `StreamedEstimator`."""
+    """Suite of one estimator; if the protocol has an interrupted descent, `make` constructs a `StreamedEstimator`."""
 
     protocol: Protocol
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         protocol = self.protocol
-        advice = "see algorithms/interface.py for the format of the answer"
+        advice = f"see {protocol.interface} for methods and answers"
         rule = "returns a well-formed answer to textured images"
         yield Check("answer", rule, advice, lambda: protocol.describe(self._answer(protocol.measurements())))
-        advice = f"return one of the failures: {protocol.failures}"
-        for name, blank in inputs.BLANKS.items():
-            rule = f"returns a failure if images are {name}"
-            yield Check(name, rule, advice, partial(self._check_blank_images, name, blank))
-        rule = "returns a well-formed answer to images of noise"
-        yield Check("noise", rule, advice, lambda: self._describe_outcome(inputs.make_noisy(protocol.measurements())))
-        if protocol is LANDING:
-            rule = "returns a well-formed answer without a range"
-            no_range = replace(inputs.landing(), slant_range_m=float("nan"))
-            yield Check("no-range", rule, advice, lambda: self._describe_outcome(no_range))
+        advice = f"without a result return one of the failures {protocol.failures}; raise no exception"
+        for name, unusual in protocol.unusual.items():
+            answer = "a failure" if unusual.reason else "a well-formed answer"
+            yield Check(name, f"returns {answer} to {unusual.text}", advice, partial(self._check_unusual, unusual))
         yield from self.common_checks()
-        if protocol is STREAM:
-            advice = f"return one of the failures from finish: {VELOCITY.failures}"
-            yield Check("few", "returns a failure for zero images and for one image", advice, self._check_short_streams)
-            rule = f"returns a well-formed answer to {', '.join(map(str, _SHORT_LENGTHS))} and {_LONG_LENGTH} images"
-            advice = "accept any number: see VelocityStream in algorithms/interface.py"
-            streams = (*map(_select_first_images, _SHORT_LENGTHS), inputs.inertial_descent(_LONG_LENGTH))
-            yield Check(
-                "number", rule, advice, lambda: "; ".join(describe_velocity(self._answer(stream)) for stream in streams)
-            )
-            rule, advice = "returns a well-formed answer without inertial increments", "use the inertial velocities"
-            yield Check("no-increments", rule, advice, lambda: describe_velocity(self._answer(_without_increments())))
-            rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
-            yield Check("start", rule, advice, self._check_restart)
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
@@ -113,41 +89,121 @@ class EstimatorSuite(Suite):
         return algorithm.estimate(case)
 
     def _check_answer(self, answer: Any, case: Any) -> Any:
-        return self.protocol.check(answer)
+        return self.protocol.check(answer, case)
 
-    def _describe_outcome(self, measurements: Any) -> str:
-        return str(self._answer(measurements).outcome.name)
+    def _check_unusual(self, unusual: Unusual) -> str:
+        descriptions = []
+        for create in unusual.cases:
+            answer = self._answer(create())
+            if unusual.reason and self.protocol.is_valid(answer):
+                raise BreachError(f"it answers {answer.outcome.name} to {unusual.text}: {unusual.reason}")
+            descriptions.append(self.protocol.describe(answer))
+        return "; ".join(descriptions)
 
-    def _check_blank_images(self, name: str, blank: inputs.Blank) -> str:
-        answer = self._answer(inputs.make_blank(self.protocol.measurements(), blank))
-        if self.protocol.is_valid(answer):
-            raise BreachError(f"it answers {answer.outcome.name} to images that are {name}: they contain no texture")
-        return str(answer.outcome.name)
 
-    def _check_short_streams(self) -> str:
-        outcomes = []
-        for number in _INSUFFICIENT_LENGTHS:
-            answer = self._answer(_select_first_images(number))
-            if VELOCITY.is_valid(answer):
-                raise BreachError(f"it answers {answer.outcome.name} to {number or 'no'} image: no motion is visible")
-            outcomes.append(answer.outcome.name)
-        return ", ".join(outcomes)
+class StreamSuite(EstimatorSuite):
+    """Suite of one stream; `make` constructs a `StreamedEstimator`."""
+
+    deterministic_advice = (
+        "use numpy.random.default_rng(a fixed seed), created in start; reset the whole state in start"
+    )
+    time_verb = "answers each image"
+    dependence_problem = "after another descent, its answers differ"
+
+    def checks(self) -> Iterator[Check]:
+        """See `Suite`."""
+        yield from super().checks()
+        rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
+        yield Check("start", rule, advice, self._check_restart)
 
     def _check_restart(self) -> str:
-        measurements = self.protocol.measurements()
-        expected_fingerprint = fingerprint(self._answer(measurements))
-        estimator = self.make()
-        estimator.stream.start()
-        for event in copy_inputs(inputs.make_noisy(measurements).select((0, 1))).events():
+        case = self.protocol.measurements()
+        expected_fingerprint = fingerprint(self._answer(case))
+        estimator, create_interrupted = self.make(), self.protocol.interrupted or self.protocol.measurements
+        interrupted = copy_inputs(create_interrupted())
+        estimator.stream.start(*interrupted.start_inputs)
+        images = 0
+        for event in interrupted.events():
             estimator.process(event)
-        if fingerprint(estimator.estimate(copy_inputs(measurements))) != expected_fingerprint:
-            raise BreachError("after a restart in the middle of a descent, its answer differs")
+            images += is_image(event)
+            if images == _INTERRUPTED_LENGTH:
+                break
+        answer = self._check_answer(estimator.estimate(copy_inputs(case)), case)
+        if fingerprint(answer) != expected_fingerprint:
+            raise BreachError("after a restart in the middle of a descent, its answers differ")
         return ""
 
+    def _answer_time_s(self) -> float:
+        """Measure the maximum time of an image in a second descent; the first descent compiles kernels."""
+        self._answer(self.protocol.measurements())
+        estimator, case = self.make(), copy_inputs(self.protocol.measurements())
+        estimator.stream.start(*case.start_inputs)
+        times = [(is_image(event), measure_time_s(partial(estimator.process, event))) for event in case.events()]
+        return max(elapsed_s for image, elapsed_s in times if image)
 
-def _select_first_images(number: int) -> DescentMeasurements:
+
+def unusual_images(
+    measurements: Callable[[], Any], blanks: Mapping[str, inputs.Blank], reason: str
+) -> dict[str, Unusual]:
+    """Return cases with blank images, in which a result is a violation for this reason, and with images of noise."""
+
+    def create_blank(blank: inputs.Blank) -> Any:
+        return inputs.make_blank(measurements(), blank)
+
+    cases = {
+        name: Unusual(f"images that are {name}", (partial(create_blank, blank),), reason)
+        for name, blank in blanks.items()
+    }
+    return {**cases, "noise": Unusual("images of noise", (lambda: inputs.make_noisy(measurements()),))}
+
+
+def describe_velocity(estimate: VelocityEstimate) -> str:
+    """Return the outcome of an estimate, and its error relative to the truth of the suite's descents."""
+    if estimate.velocity_m_s is None:
+        return estimate.outcome.name
+    error = float(np.hypot(*(estimate.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2])))
+    return f"{estimate.outcome.name}, {error:.2f} m/s error"
+
+
+def _first(number: int) -> DescentMeasurements:
+    """Return the descent of an ordinary stream with its first images only."""
     return inputs.inertial_descent(_STREAM_LENGTH).select(tuple(range(number)))
 
 
-def _without_increments() -> DescentMeasurements:
-    return inputs.descent(_STREAM_LENGTH)
+_NO_TEXTURE = "they contain no texture"
+_stream = partial(inputs.inertial_descent, _STREAM_LENGTH)
+VELOCITY = Protocol(
+    measurements=inputs.descent,
+    check=lambda answer, measurements: check_velocity_answer(answer, measurements.tags_s),
+    is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
+    describe=describe_velocity,
+    failures=", ".join(outcome.name for outcome in VelocityOutcome if outcome is not VelocityOutcome.VALID),
+    unusual=unusual_images(inputs.descent, inputs.BLANKS, _NO_TEXTURE),
+)
+STREAM = replace(
+    VELOCITY,
+    measurements=_stream,
+    unusual={
+        **unusual_images(_stream, inputs.BLANKS, _NO_TEXTURE),
+        "few": Unusual(
+            "zero images and to one image", (partial(_first, 0), partial(_first, 1)), "no motion is visible"
+        ),
+        "number": Unusual(
+            f"2, 3 and {_LONG_LENGTH} images",
+            (partial(_first, 2), partial(_first, 3), partial(inputs.inertial_descent, _LONG_LENGTH)),
+        ),
+        "no-increments": Unusual("a descent without increments", (partial(inputs.descent, _STREAM_LENGTH),)),
+    },
+    interrupted=lambda: inputs.make_noisy(_stream()),
+)
+LANDING = Protocol(
+    measurements=inputs.landing,
+    check=lambda answer, _: check_site(answer),
+    is_valid=lambda estimate: estimate.outcome.converged,
+    describe=lambda estimate: str(estimate.outcome.name),
+    failures=", ".join(outcome.name for outcome in SiteOutcome if not outcome.converged),
+    unusual={
+        **unusual_images(inputs.landing, inputs.BLANKS, _NO_TEXTURE),
+        "no-range": Unusual("a missing range", (lambda: replace(inputs.landing(), slant_range_m=float("nan")),)),
+    },
+)

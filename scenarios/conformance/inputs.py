@@ -31,7 +31,8 @@ from marsyard.sim.measurements import (
 from marsyard.sim.sensor import Detector, natural_fall_off, preset
 from marsyard.sim.sensor.presets import Preset
 
-Measurements = TypeVar("Measurements", DescentMeasurements, LandingMeasurements)
+#: Measurements with the field `images`.
+Measurements = TypeVar("Measurements", bound=Any)
 
 #: Mean radiance factor of the plane, and radiance factor outside the plane.
 MEAN, BACKGROUND = 0.2, 0.1
@@ -190,5 +191,7 @@ def make_noisy(measurements: Measurements) -> Measurements:
 
 
 def _replace_counts(measurements: Measurements, counts: Callable[[DetectorImage], np.ndarray]) -> Measurements:
-    images: Any = tuple(replace(image, counts=counts(image)) for image in measurements.images)
-    return replace(measurements, images=images)
+    changed: Measurements = replace(
+        measurements, images=tuple(replace(image, counts=counts(image)) for image in measurements.images)
+    )
+    return changed

@@ -17,8 +17,9 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
+from marsyard.algorithms.exchange.forms import read_member
 from marsyard.algorithms.exchange.process import Command, ExecutableLimits, RunningProgram, temporary_folder
-from marsyard.algorithms.exchange.serving import acquire_server, read_member, release_server
+from marsyard.algorithms.exchange.serving import acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
 from marsyard.algorithms.processes import children, processor_time_s
 from marsyard.scenarios.imports import source_root

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, UInt8, UInt16
 from scipy.ndimage import distance_transform_edt
 
-from marsyard.algorithms.hda import Ground, Safety
+from marsyard.algorithms.hda import MappedGround, Safety
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
 from marsyard.scenarios.exposure import Optics, camera_optics, draw_calibrated, render_state, sunlight_ratio
@@ -288,7 +288,9 @@ class SampledMap:
     slope_rad: Float[np.ndarray, "rows columns"]
 
     @classmethod
-    def sample(cls, ground: Ground, flight: Flight, truth: GroundTruth, limits: tuple[float, float]) -> SampledMap:
+    def sample(
+        cls, ground: MappedGround, flight: Flight, truth: GroundTruth, limits: tuple[float, float]
+    ) -> SampledMap:
         """Sample the map at the truth's positions; `limits`: the algorithm's slope (rad) and roughness (m) limits."""
         offsets = truth.positions - flight.states[0].position_m[:2]
         local = np.asarray(offsets @ ground.world_from_surface.as_matrix()[:2, :2])
@@ -307,7 +309,7 @@ class SampledMap:
         return cls(valid, safe, valid & flagged[rows, columns], slope)
 
 
-def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
+def count_hazards(ground: MappedGround, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
     """Count footprints by truth and map; sums over cases give rates.
 
     Footprints are classified by roughness / limit and slope / limit. For each class:
@@ -351,7 +353,7 @@ def count_hazards(ground: Ground, sampled: SampledMap, truth: GroundTruth) -> di
     return {column: int(np.count_nonzero(mask)) for column, mask in masks.items()}
 
 
-def map_errors(ground: Ground, flight: Flight, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
+def map_errors(ground: MappedGround, flight: Flight, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
     """Compute the errors of the map's elevation and slope.
 
     The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda import Ground, HdaDetails, Safety
+from marsyard.algorithms.hda import HdaDetails, MappedGround, Safety
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.scenarios.landing.flight import Flight
 from marsyard.scenarios.landing.helicopter import NavigatedLeg, Touchdown
@@ -124,7 +124,7 @@ def _images(case: RenderedFlight, details: HdaDetails | None) -> list[TimedImage
     return images
 
 
-def _landing_map(ground: Ground, camera_m: np.ndarray) -> SurfacePatch:
+def _landing_map(ground: MappedGround, camera_m: np.ndarray) -> SurfacePatch:
     """Return the landing map in the world, relative to the true position of the first camera."""
     shape = ground.elevation.elevation_m.shape
     local = ground.elevation.positions(np.moveaxis(np.indices(shape).astype(np.float64), 0, -1))

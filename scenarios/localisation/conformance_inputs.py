@@ -6,19 +6,18 @@ those of the conformance suites' textured plane, without terrain or renderer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import Float64
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct
 from marsyard.scenarios.conformance.inputs import BLANKS, MEAN, Blank, TexturedPlane, texture
 from marsyard.scenarios.localisation.instruments import CameraParameters, true_camera
-from marsyard.scenarios.localisation.stream import Event, merge
+from marsyard.scenarios.localisation.stream import LocalisationMeasurements
 from marsyard.sim.camera import Cahvore
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
@@ -44,97 +43,61 @@ _TAG_JITTER_S, _IMU_JITTER = 0.005, 0.4
 BLANK_COUNTS: dict[str, Blank] = {**BLANKS, "black": lambda _: 0}
 
 
-@dataclass(frozen=True)
-class Descent:
-    """Inputs of a position estimator: initial state, map, and measurements in the order of their arrival."""
-
-    initial: InitialState
-    map_product: MapProduct
-    events: list[Event]
-
-    @property
-    def end_s(self) -> float:
-        """Time of the last increment."""
-        return max(float(event.times_s[-1]) for event in self.events if isinstance(event, ImuIncrements))
-
-
 def true_position(time_s: float) -> Float64[np.ndarray, "3"]:
     """Return the true position at a time."""
     return np.asarray(START_M + time_s * VELOCITY_M_S)
 
 
 @cache
-def ordinary_descent() -> Descent:
+def ordinary_descent() -> LocalisationMeasurements:
     """Create an ordinary descent; only the initial position has an error."""
-    return _create_descent(_increments(), _altitudes(), _images())
+    variances = np.square([*_POSITION_SD_M, *[_VELOCITY_SD_M_S] * 3, *[_ATTITUDE_SD_RAD] * 3])
+    position = true_position(0.0) + _ERROR_M
+    initial = InitialState(0.0, position, VELOCITY_M_S, _attitude(0.0), np.diag(variances), _GRAVITY_M_S2)
+    return LocalisationMeasurements(initial, _map(), _increments(), _altitudes(), _images())
 
 
-@cache
-def descent_on_shifted_map() -> Descent:
+def descent_on_shifted_map() -> LocalisationMeasurements:
     """Create the ordinary descent on another map: the positions of map and lander are shifted by a kilometre."""
     case, shift = ordinary_descent(), np.array([1000.0, -500.0, 0.0])
     initial = replace(case.initial, position_m=case.initial.position_m + shift)
-    return Descent(initial, replace(case.map_product, origin_m=case.map_product.origin_m + shift[:2]), case.events)
+    map_product = replace(case.map_product, origin_m=case.map_product.origin_m + shift[:2])
+    return replace(case, initial=initial, map_product=map_product)
 
 
 @cache
-def descent_with_jitter() -> Descent:
+def descent_with_jitter() -> LocalisationMeasurements:
     """Create a descent with jitter of all time tags; the inertial increments remain in order.
 
     Two boundaries of increments have equal tags, and so have an image and an altitude.
     """
-    rng = np.random.default_rng(20210218)
-    increments, altitudes, images = _increments(), _altitudes(), _images()
+    rng, case = np.random.default_rng(20210218), ordinary_descent()
+    increments = case.increments
     tags = increments.times_s + _IMU_JITTER / _IMU_HZ * rng.uniform(-1.0, 1.0, increments.times_s.size)
     tags[[0, -1]] = increments.times_s[[0, -1]]
     tags = np.maximum.accumulate(tags)
     tags[50] = tags[51]
-    images = [replace(image, time_s=image.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for image in images]
-    altitudes = [replace(item, time_s=item.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for item in altitudes]
+    images = [replace(image, time_s=image.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for image in case.images]
+    altitudes = [replace(item, time_s=item.time_s + rng.uniform(-1.0, 1.0) * _TAG_JITTER_S) for item in case.altitudes]
     altitudes[1] = replace(altitudes[1], time_s=images[0].time_s)
-    return _create_descent(replace(increments, times_s=tags), altitudes, images)
+    return replace(case, increments=replace(increments, times_s=tags), altitudes=tuple(altitudes), images=tuple(images))
 
 
-def descent_without_altitudes() -> Descent:
+def descent_without_altitudes() -> LocalisationMeasurements:
     """Create a descent whose altimeter has no reading."""
-    return _create_descent(_increments(), [], _images())
+    return replace(ordinary_descent(), altitudes=())
 
 
-def descent_without_images() -> Descent:
+def descent_without_images() -> LocalisationMeasurements:
     """Create a descent whose images are all lost."""
-    return _create_descent(_increments(), _altitudes(), [])
+    return replace(ordinary_descent(), images=())
 
 
-def descent_with_repeated_images() -> Descent:
+def descent_with_repeated_images() -> LocalisationMeasurements:
     """Create a descent in which all images show the first scene, and each is delivered twice."""
-    first = _images()[0]
-    images = [replace(image, counts=first.counts) for image in _images() for _ in range(2)]
-    return _create_descent(_increments(), _altitudes(), images)
-
-
-def descent_with_noise_images() -> Descent:
-    """Create a descent whose images are noise."""
-    rng = np.random.default_rng(1)
-    return _change_counts(lambda image: rng.integers(0, _FULL_SCALE_DN + 1, image.counts.shape, dtype=np.uint16))
-
-
-def descent_with_blank_images(name: str) -> Descent:
-    """Create a descent whose images have one count, by name of `BLANK_COUNTS`."""
-    return _change_counts(lambda image: np.full_like(image.counts, BLANK_COUNTS[name](image.calibration)))
-
-
-def _change_counts(change: Callable[[DetectorImage], UInt16[np.ndarray, "rows columns"]]) -> Descent:
-    images = [replace(image, counts=change(image)) for image in _images()]
-    return _create_descent(_increments(), _altitudes(), images)
-
-
-def _create_descent(
-    increments: ImuIncrements, altitudes: Sequence[AltitudeMeasurement], images: Sequence[DetectorImage]
-) -> Descent:
-    variances = np.square([*_POSITION_SD_M, *[_VELOCITY_SD_M_S] * 3, *[_ATTITUDE_SD_RAD] * 3])
-    position = true_position(0.0) + _ERROR_M
-    initial = InitialState(0.0, position, VELOCITY_M_S, _attitude(0.0), np.diag(variances), _GRAVITY_M_S2)
-    return Descent(initial, _map(), merge(increments, altitudes, images))
+    case = ordinary_descent()
+    images = [replace(image, counts=case.images[0].counts) for image in case.images for _ in range(2)]
+    return replace(case, images=tuple(images))
 
 
 def _attitude(time_s: float) -> Rotation:
@@ -144,7 +107,6 @@ def _attitude(time_s: float) -> Rotation:
     )
 
 
-@cache
 def _increments() -> ImuIncrements:
     """Create exact increments: the specific force is constant in world axes, the angular rate in body axes."""
     times = np.arange(round(_END_S * _IMU_HZ) + 1) / _IMU_HZ
@@ -153,14 +115,12 @@ def _increments() -> ImuIncrements:
     return ImuIncrements(times, 1.0 / _IMU_HZ, np.tile(turn, (times.size - 1, 1)), np.array(force))
 
 
-@cache
-def _altitudes() -> list[AltitudeMeasurement]:
+def _altitudes() -> tuple[AltitudeMeasurement, ...]:
     times = np.arange(1, round(_END_S * _ALTIMETER_HZ)) / _ALTIMETER_HZ
-    return [AltitudeMeasurement(float(true_position(time_s)[2]), float(time_s)) for time_s in times]
+    return tuple(AltitudeMeasurement(float(true_position(time_s)[2]), float(time_s)) for time_s in times)
 
 
-@cache
-def _images() -> list[DetectorImage]:
+def _images() -> tuple[DetectorImage, ...]:
     """Take the images of the ground at the height 0."""
     camera: Cahvore = true_camera(CameraParameters(pixels=192, pixel_mrad=8.7))
     shape = camera.size[::-1]
@@ -172,24 +132,12 @@ def _images() -> list[DetectorImage]:
         radiance = ground.radiance(camera.transform(rigid(_attitude(time_s), true_position(time_s))))
         counts = np.clip(np.rint(_OFFSET_DN + _MEAN_DN / MEAN * radiance), 0, _FULL_SCALE_DN).astype(np.uint16)
         images.append(DetectorImage(counts, float(time_s), camera, calibration))
-    return images
+    return tuple(images)
 
 
-@cache
 def _map() -> MapProduct:
     """Create the exact map, centred at the world's origin; it states standard deviations of 1 m."""
     offsets = _MAP_PIXEL_M * (np.arange(_MAP_PX) - _MAP_PX // 2)
     samples = np.stack(np.meshgrid(offsets, offsets, indexing="ij")) / _TEXTURE_STEP_M
     appearance = map_coordinates(texture(), samples, order=1, mode="grid-wrap").astype(np.float32)
     return MapProduct(appearance, np.zeros_like(appearance), np.full(2, offsets[0]), _MAP_PIXEL_M, 1.0, 1.0, 1.0)
-
-
-#: Unusual descents by the name of their check: function that creates the descent, and its description.
-UNUSUAL: dict[str, tuple[Callable[[], Descent], str]] = {
-    **{name: (partial(descent_with_blank_images, name), f"images that are {name}") for name in BLANK_COUNTS},
-    "noise": (descent_with_noise_images, "images of noise"),
-    "repeated": (descent_with_repeated_images, "images that repeat the first, each delivered twice"),
-    "no-altitudes": (descent_without_altitudes, "a descent without altitudes"),
-    "no-images": (descent_without_images, "a descent without images"),
-    "jitter": (descent_with_jitter, "time tags with jitter, some of them equal"),
-}

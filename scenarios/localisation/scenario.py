@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
 
 import numpy as np
 from jaxtyping import UInt16
 from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.localisation.answers import check_estimate
-from marsyard.algorithms.localisation.interface import InitialState, PositionEstimator, PositionOutcome
+from marsyard.algorithms.localisation.interface import InitialState, PositionEstimate, PositionOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
@@ -25,12 +23,12 @@ from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
 from marsyard.scenarios.localisation.map_product import MapTruth, make_map
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements, StreamAnswers, feed
+from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.localisation.world import LocalisationWorld
-from marsyard.scenarios.offline import CaseExporter, RecordedAnswer
 from marsyard.scenarios.parts.named import PartKind
+from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.render.renderer import return_freed_memory
@@ -72,17 +70,11 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             **image_columns(p.render.backend, hash_images(image.counts for image in descent.images)),
         }
 
-        def run(algorithm: str) -> AlgorithmRun[StreamAnswers]:
-            tags = descent.measurements.increments.times_s
-            span_s = (float(tags[0]), float(tags[-1]))
-            return run_on_measurements(
-                partial(p.make, algorithm, streams.case),
-                lambda answers: _check_answers(answers, span_s),
-                descent.measurements,
-                _run_estimator,
-            )
+        def run(algorithm: str) -> AlgorithmRun[StreamAnswers[PositionEstimate]]:
+            make = partial(p.make, algorithm, streams.case)
+            return run_on_measurements(make, descent.measurements.check, descent.measurements)
 
-        def score_answers(algorithm: str, runs: Runs[StreamAnswers]) -> Score:
+        def score_answers(algorithm: str, runs: Runs[StreamAnswers[PositionEstimate]]) -> Score:
             answers = runs[algorithm].answer
             timeline = partial(localisation_timeline, descent, answers)
             if answers is None:
@@ -92,21 +84,6 @@ class LocalisationScenario(TerrainScenario[LocalisationScenarioParameters]):
             return Score(is_answered, row, products, timeline=timeline)
 
         return evaluate_case(p, shared, run, score_answers)
-
-
-def _run_estimator(algorithm: object, inputs: LocalisationMeasurements) -> object:
-    """Run an estimator over the stream; an export and a table of answers receive all measurements at once."""
-    if isinstance(algorithm, CaseExporter | RecordedAnswer):
-        return algorithm.estimate(inputs)
-    return feed(cast(PositionEstimator, algorithm), inputs.initial, inputs.map_product, inputs.events)
-
-
-def _check_answers(answers: Any, span_s: tuple[float, float]) -> StreamAnswers:
-    """Validate the answers of a stream. Raises AlgorithmError."""
-    checked: StreamAnswers = replace(
-        answers, estimates=tuple(check_estimate(answer, span_s) for answer in answers.estimates)
-    )
-    return checked
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 from marsyard.scenarios.conditions import attitude_rate_deg_s, contrast_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.localisation.map_product import MapTruth
-from marsyard.scenarios.localisation.stream import StreamAnswers
 from marsyard.scenarios.localisation.world import sun_at
+from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ class EstimateErrors:
         )
 
 
-def compute_errors(descent: LocalisedDescent, answers: StreamAnswers) -> list[EstimateErrors | None]:
+def compute_errors(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> list[EstimateErrors | None]:
     """Compute the errors of each estimate, None for a refusal.
 
     Estimates have time tags of the inertial unit, whose offset is subtracted for the true time.
@@ -130,14 +130,14 @@ def compute_errors(descent: LocalisedDescent, answers: StreamAnswers) -> list[Es
     ]
 
 
-def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, Scalar]:
+def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> dict[str, Scalar]:
     """Return the columns of one algorithm's answers."""
     errors = compute_errors(descent, answers)
     valid = [error for error in errors if error is not None]
     final = errors[-1]
     early = [error for error in valid if error.time_s <= REQUIRED_S]
-    times = answers.processor_times
-    details = [estimate.details for estimate in answers.estimates[:-1]]
+    times_s = answers.image_times_s
+    details = [estimate.details for estimate in answers.after_images]
     inliers = [item.inliers for item in details if isinstance(item, LocalisationDetails) and item.inliers is not None]
     horizontal = [error.horizontal_m for error in valid]
     coarse = [
@@ -158,8 +158,8 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, S
         **_final_columns(final),
         "inliers_median": float(np.median(inliers)) if inliers else _NAN,
         "inliers_min": float(min(inliers)) if inliers else _NAN,
-        "image_time_max_s": max(times.image_s, default=0.0),
-        "image_time_median_s": float(np.median(times.image_s)) if times.image_s else 0.0,
+        "image_time_max_s": max(times_s, default=0.0),
+        "image_time_median_s": float(np.median(times_s)) if times_s else 0.0,
     }
 
 
@@ -192,7 +192,7 @@ def _final_columns(error: EstimateErrors | None) -> dict[str, Scalar]:
     }
 
 
-def products(descent: LocalisedDescent, answers: StreamAnswers) -> Mapping[str, Any]:
+def products(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> Mapping[str, Any]:
     """Return the arrays for a case's figures.
 
     ::

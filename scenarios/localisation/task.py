@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
+
+from marsyard.algorithms.exchange import ExecutableAlgorithm
 from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
-from marsyard.algorithms.localisation.exchange import ExecutablePositionEstimator
+from marsyard.algorithms.localisation.exchange import POSITION_STREAM
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionEstimator, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.estimators import Task
@@ -13,11 +16,12 @@ from marsyard.scenarios.localisation.offline import POSITION_FORMAT
 LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
     what="position estimator",
-    methods=("start", "imu", "altitude", "image", "finish"),
+    methods=(),
     answers=(PositionEstimate, PositionOutcome),
     shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},
-    executable=ExecutablePositionEstimator,
+    executable=partial(ExecutableAlgorithm, requests=POSITION_STREAM.requests),
     options=LvsOptions,
     offline=POSITION_FORMAT,
-    suite="marsyard.scenarios.localisation.conformance:PositionSuite",
+    accepts_streams=True,
+    suite="marsyard.scenarios.localisation.conformance:position_suite",
 )

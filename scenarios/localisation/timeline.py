@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
+from marsyard.algorithms.localisation.interface import PositionEstimate
 from marsyard.scenarios.localisation.instruments import true_camera
 from marsyard.scenarios.localisation.score import compute_errors
-from marsyard.scenarios.localisation.stream import StreamAnswers
+from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.scenarios.timeline import (
     CameraPose,
     Ellipsoids,
@@ -34,7 +35,7 @@ _HALF_WIDTH_RATIO = 1.2
 _STEP_S, _MAP_PX = 0.1, 384
 
 
-def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers | None) -> Timeline:
+def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> Timeline:
     """Create the timeline of a descent: images with landmarks, estimates with covariance, map and ground.
 
     Estimates are relative to the map. Here they are in the world: the displacement of the map is subtracted, so that
@@ -74,7 +75,7 @@ def _to_world(descent: LocalisedDescent, positions_m: Float64[np.ndarray, "n 3"]
     return np.column_stack([descent.map_truth.world_position(positions_m[:, :2]), positions_m[:, 2]])
 
 
-def _estimated_path(descent: LocalisedDescent, answers: StreamAnswers | None) -> dict[str, Path]:
+def _estimated_path(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> dict[str, Path]:
     """Return the path through the reported states; empty without one."""
     reported = [
         (answer.time_s, answer.position_m, answer.world_from_body.as_quat())
@@ -87,7 +88,7 @@ def _estimated_path(descent: LocalisedDescent, answers: StreamAnswers | None) ->
     return {"estimated": Path(times - descent.imu_offset_s, _to_world(descent, positions), quaternions)}
 
 
-def _covariances(descent: LocalisedDescent, answers: StreamAnswers | None) -> dict[str, Ellipsoids]:
+def _covariances(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> dict[str, Ellipsoids]:
     """Return the reported positions with their covariances; empty without one."""
     reported = [
         (answer.time_s, answer.position_m, answer.covariance[:3, :3])
@@ -100,7 +101,7 @@ def _covariances(descent: LocalisedDescent, answers: StreamAnswers | None) -> di
     return {"estimated position": Ellipsoids(times - descent.imu_offset_s, _to_world(descent, centres), covariances)}
 
 
-def _error_series(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str, Series]:
+def _error_series(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> dict[str, Series]:
     """Return horizontal error and its standard deviation at the reported states, and the inliers of each image."""
     errors = [error for error in compute_errors(descent, answers) if error is not None]
     times = np.array([error.time_s for error in errors], dtype=np.float64) - descent.imu_offset_s
@@ -119,11 +120,11 @@ def _error_series(descent: LocalisedDescent, answers: StreamAnswers) -> dict[str
     return named
 
 
-def _images(descent: LocalisedDescent, answers: StreamAnswers | None) -> list[TimedImage]:
+def _images(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> list[TimedImage]:
     """Return the delivered images at the true times of their exposures, with the landmarks that were matched."""
     camera, images = true_camera(descent.p.camera), []
     # an estimator receives the images in the order of their time tags; the last estimate belongs to no image
-    estimates = () if answers is None else answers.estimates[:-1]
+    estimates = () if answers is None else answers.after_images
     by_tag = np.argsort([image.time_s for image in descent.images], kind="stable")
     details_of = {int(index): estimate.details for index, estimate in zip(by_tag, estimates, strict=False)}
     for number, (image, state) in enumerate(zip(descent.images, descent.image_states, strict=True)):

@@ -19,13 +19,14 @@ from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.answers import check_aim, check_update
+from marsyard.algorithms.exchange import answer_time_s
 from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
 from marsyard.algorithms.navigation.planner import NavigationOutcome
 from marsyard.algorithms.navigation.visual_odometry import VisualOdometry, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.placement import Placement
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
-from marsyard.scenarios.algorithm_run import InputCopy, Inputs, answer_time_s
+from marsyard.scenarios.algorithm_run import InputCopy, Inputs
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.scenarios.rover.flight_software import (

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes.binning import View, build_view
-from marsyard.algorithms.dimes.details import PairDetails, Track
+from marsyard.algorithms.dimes.details import DimesTrack, PairDetails
 from marsyard.algorithms.dimes.estimator import combine_pairs
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import (
@@ -30,10 +30,10 @@ THRESHOLD = DimesOptions().imu_threshold_m_s
 METRICS = TrackMetrics(contrast=0.02, peak=0.9, peak_width_px=4.0, second_peak_ratio=0.3, on_border=False)
 
 
-def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[ValidityCheck, ...] = ()) -> Track:
+def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[ValidityCheck, ...] = ()) -> DimesTrack:
     """Create a track of which only number of pair and template, velocity and failed checks are used."""
     blank = np.zeros((3, 3))
-    return Track(
+    return DimesTrack(
         pair, index, *(np.zeros(2),) * 3, blank, blank, np.ones(2), blank, METRICS, failures, np.asarray(velocity)
     )
 
@@ -45,7 +45,7 @@ def make_nadir_view() -> View:
     return build_view(image, Rotation.identity(), 2000.0, (256, 256))
 
 
-def make_pair(*tracks: Track) -> PairDetails:
+def make_pair(*tracks: DimesTrack) -> PairDetails:
     """Create the details of a pair with these tracks; the images are not used."""
     nadir = make_nadir_view()
     return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))

@@ -15,8 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.answers import check_site, check_velocity
 from marsyard.algorithms.exchange import (
+    VELOCITY_REQUESTS,
+    ExecutableAlgorithm,
     ExecutableLimits,
-    ExecutableVelocityEstimator,
     ProgramDetails,
     parse_command,
     read_case,
@@ -54,9 +55,10 @@ def run_program(spec: str, measurements: DescentMeasurements, **limits: float) -
     """Estimate the velocity with a program; limits: those of `ExecutableLimits`."""
     command = parse_command(spec)
     assert command is not None
-    return ExecutableVelocityEstimator(command, ExecutableLimits.model_validate({"time_s": 60.0, **limits})).estimate(
-        measurements
-    )
+    program_limits = ExecutableLimits.model_validate({"time_s": 60.0, **limits})
+    answer = ExecutableAlgorithm(command, program_limits, VELOCITY_REQUESTS).estimate(measurements)
+    assert isinstance(answer, VelocityEstimate)
+    return answer
 
 
 @pytest.mark.parametrize("image_format", ["pgm", "png"])

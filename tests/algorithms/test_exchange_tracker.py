@@ -19,8 +19,9 @@ from marsyard.algorithms.exchange import (
     read_stop,
     read_target,
 )
-from marsyard.algorithms.exchange.files import encode_target, write_mast, write_stop
+from marsyard.algorithms.exchange.files import write_mast, write_stop
 from marsyard.algorithms.exchange.serving import end_idle_programs
+from marsyard.algorithms.exchange.values import encode
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import VisualTargetTracker, VttOptions
@@ -236,5 +237,5 @@ def test_tracker_inputs_round_trip(tmp_path: Path) -> None:
     ],
 )
 def test_all_three_target_designations_round_trip(target: TargetDesignation) -> None:
-    assert encode_target(read_target(encode_target(target))) == encode_target(target)
-    assert type(read_target(encode_target(target))) is type(target)
+    assert encode(read_target(encode(target))) == encode(target)
+    assert type(read_target(encode(target))) is type(target)

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.answers import StreamedEstimator, check_and_set_span, check_velocity
+from marsyard.algorithms.answers import check_and_set_span, check_velocity
 from marsyard.algorithms.dimes import DimesEstimator
 from marsyard.algorithms.exchange import (
+    VELOCITY_STREAM,
+    ExecutableAlgorithm,
     ExecutableLimits,
-    ExecutableVelocityStream,
     ProgramDetails,
     parse_command,
     read_case,
@@ -27,6 +28,8 @@ from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.streamed import StreamedEstimator
+from marsyard.scenarios.velocity import check_velocity_answer
 from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, DescentMeasurements, ImuIncrements
 from marsyard.sim.sensor import InertialSolution
 
@@ -40,6 +43,11 @@ def make_estimate(*span_s: float) -> VelocityEstimate:
     """Create a valid estimate for the time span (first, last), or without a span."""
     span = (span_s[0], span_s[1]) if span_s else None
     return VelocityEstimate(VelocityOutcome.VALID, np.array([1.0, 2.0]), span_s=span)
+
+
+def estimate(stream: object, measurements: DescentMeasurements) -> VelocityEstimate:
+    """Run a stream over a descent and check its answers."""
+    return check_velocity_answer(StreamedEstimator(stream).estimate(measurements), measurements.tags_s)
 
 
 class RecordingStream:
@@ -64,7 +72,7 @@ def test_stream_receives_measurements_of_each_image() -> None:
     measurements, stream = inputs.descent(5), RecordingStream()
     velocities = measurements.interval_velocities_m_s + np.arange(4.0)[:, None]
     measurements = replace(measurements, interval_velocities_m_s=velocities)
-    answer = StreamedEstimator(stream).estimate(measurements)
+    answer = estimate(stream, measurements)
     assert (stream.calls[0], stream.calls[-1]) == ("start", "finish")
     frames = [call for call in stream.calls if isinstance(call, DescentFrame)]
     assert [frame.image for frame in frames] == list(measurements.images)
@@ -78,7 +86,7 @@ def test_stream_receives_measurements_of_each_image() -> None:
     first, *later = answer.after_images
     assert first is None
     tags = measurements.tags_s
-    assert [estimate.span_s for estimate in later if estimate is not None] == list(pairwise(tags))
+    assert [item.span_s for item in later if item is not None] == list(pairwise(tags))
 
 
 def test_selection_averages_velocities_over_omitted_images() -> None:
@@ -150,19 +158,6 @@ def test_increments_and_altitudes_arrive_in_the_order_of_their_tags() -> None:
     assert record_events(measurements.select(())) == []
 
 
-def test_increments_before_an_image_end_at_the_next_boundary() -> None:
-    measurements = inputs.inertial_descent(5)
-    images = tuple(replace(image, time_s=image.time_s + 0.003) for image in measurements.images)
-    events = record_events(replace(measurements, images=images, altitudes=measurements.altitudes[:1] * 5))
-    for block, frame in zip(events[2::2], events[3::2], strict=True):
-        assert isinstance(block, ImuIncrements)
-        assert isinstance(frame, DescentFrame)
-        assert block.times_s[-1] - 0.01 < frame.image.time_s <= block.times_s[-1]
-    late = replace(images[-1], time_s=images[-1].time_s + 1.0)
-    with pytest.raises(ValueError, match=r"time tag 108\.503000 s is outside of the increments; allowed: 99\.0"):
-        record_events(replace(measurements, images=(*images[:-1], late)))
-
-
 def test_increments_of_the_conformance_suite_are_exact() -> None:
     measurements = inputs.inertial_descent(5)
     attitudes, increments, gravity = measurements.attitudes, measurements.increments, measurements.gravity_m_s2
@@ -216,7 +211,7 @@ def test_answer_of_a_stream_with_after_images_is_rejected() -> None:
             return replace(make_estimate(), after_images=(make_estimate(),))
 
     with pytest.raises(AlgorithmError, match="after_images is given"):
-        StreamedEstimator(StreamWithAfterImages()).estimate(inputs.descent())
+        estimate(StreamWithAfterImages(), inputs.descent())
 
 
 @pytest.mark.parametrize("altitude_m", [1500.0, float("nan")])
@@ -225,7 +220,7 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     frame = replace(measurements.frames()[1], altitude=replace(measurements.altitudes[1], altitude_m=altitude_m))
     write_frame(tmp_path, frame)
     names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["camera_1.cahvor", "flat_field_1.f64", "frame.json", "image_1.pgm"]
+    assert names == ["camera_1.cahvor", "flat_field_1.f64", "image.json", "image_1.pgm"]
     restored_frame = read_frame(tmp_path)
     np.testing.assert_array_equal(restored_frame.image.counts, frame.image.counts)
     for name in ("sun_direction", "inertial_velocity_m_s", "interval_velocity_m_s"):
@@ -233,7 +228,7 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     assert repr(restored_frame.altitude) == repr(frame.altitude)
     assert restored_frame.gravity_m_s2 == frame.gravity_m_s2 == 3.71
     assert (restored_frame.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
-    path = tmp_path / "frame.json"
+    path = tmp_path / "image.json"
     path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
     with pytest.raises(ValueError, match="is not a valid descent image file: exchange format version 2"):
         read_frame(tmp_path)
@@ -257,12 +252,12 @@ def test_cases_of_any_image_count_round_trip(tmp_path: Path, image_count: int) -
     assert not {"increments", "gravity_m_s2"} & set(json.loads((tmp_path / "case.json").read_text()))
 
 
-def make_stream(spec: str, time_s: float = 60.0) -> StreamedEstimator:
-    """Create the estimator of a streaming program with a time limit per answer."""
+def make_stream(spec: str) -> ExecutableAlgorithm:
+    """Create the stream of a program."""
     command = parse_command(spec)
     assert command is not None
     assert command.stream
-    return StreamedEstimator(ExecutableVelocityStream(command, ExecutableLimits(time_s=time_s)))
+    return ExecutableAlgorithm(command, ExecutableLimits(time_s=60.0), VELOCITY_STREAM.requests)
 
 
 def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,7 +266,7 @@ def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: p
     ChainedShifts = importlib.import_module("velocity_stream").ChainedShifts
 
     measurements = inputs.descent(5)
-    reference = StreamedEstimator(ChainedShifts()).estimate(measurements)
+    reference = estimate(ChainedShifts(), measurements)
     assert reference.velocity_m_s is not None
     error = reference.velocity_m_s - inputs.DESCENT_VELOCITY_M_S[:2]
     # Errors are within three standard deviations, which are below 1 m/s.
@@ -280,11 +275,11 @@ def test_example_returns_equal_estimates_in_python_and_as_program(monkeypatch: p
     assert np.all(np.diag(reference.covariance_m2_s2) < 1.0)
     program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'}")
     for _ in range(2):
-        actual = program.estimate(measurements)
+        actual = estimate(program, measurements)
         np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
         np.testing.assert_allclose(actual.covariance_m2_s2, reference.covariance_m2_s2, rtol=1e-12)  # type: ignore[arg-type]
         assert actual.span_s == reference.span_s == (107.5, 107.5)
-        assert [estimate is None for estimate in actual.after_images] == [True, False, False, False, False]
+        assert [item is None for item in actual.after_images] == [True, False, False, False, False]
         assert isinstance(actual.details, ProgramDetails)
         assert actual.details.time_s > 0.0
     end_idle_programs()
@@ -296,7 +291,7 @@ def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pyt
     monkeypatch.syspath_prepend(str(EXAMPLES))
     example = importlib.import_module("velocity_stream")
     measurements = inputs.inertial_descent(5)
-    expected = StreamedEstimator(example.ChainedShifts()).estimate(measurements)
+    expected = estimate(example.ChainedShifts(), measurements)
     # the inertial velocities of later frames are wrong and must not be used
     velocities = measurements.inertial_velocities_m_s
     assert velocities is not None
@@ -305,16 +300,16 @@ def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pyt
         inertial_velocities_m_s=velocities + 50.0 * (np.arange(5.0) > 0.0)[:, None],
         interval_velocities_m_s=measurements.interval_velocities_m_s + 50.0,
     )
-    reference = StreamedEstimator(example.IntegratedShifts()).estimate(wrong)
+    reference = estimate(example.IntegratedShifts(), wrong)
     np.testing.assert_allclose(reference.velocity_m_s, expected.velocity_m_s, atol=1e-6)  # type: ignore[arg-type]
     program = make_stream(f"serve-stream:{sys.executable} {EXAMPLES / 'velocity_stream.py'} --increments")
     for _ in range(2):
-        actual = program.estimate(wrong)
+        actual = estimate(program, wrong)
         np.testing.assert_allclose(actual.velocity_m_s, reference.velocity_m_s, rtol=0.0, atol=1e-9)  # type: ignore[arg-type]
     end_idle_programs()
 
 
-#: A program that writes the names of its requests to stderr; `START` is added to its answer to start.
+#: A program that writes the names of its requests to stderr.
 RECORDING_PROGRAM = """
 import json, sys
 print(json.dumps({"exchange": 2, "ready": True}), flush=True)
@@ -323,8 +318,6 @@ for line in sys.stdin:
     request = json.loads(line)
     seen.append(request["do"])
     answer = {"exchange": 2, "id": request["id"], "outcome": None}
-    if request["do"] == "start":
-        answer |= START
     if request["do"] == "finish":
         print(json.dumps(seen), file=sys.stderr, flush=True)
         answer["outcome"] = "NO_VALID_TRACK"
@@ -332,15 +325,16 @@ for line in sys.stdin:
 """
 
 
-@pytest.mark.parametrize("accepts", [True, False])
-def test_programs_receive_increments_on_request(tmp_path: Path, accepts: bool) -> None:
-    start = {"inertial": True} if accepts else {}
-    (tmp_path / "stream.py").write_text(RECORDING_PROGRAM.replace("START", repr(start)))
-    answer = make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.inertial_descent(2))
-    assert isinstance(answer.details, ProgramDetails)
-    # altitude and image have equal tags
-    events = ["imu", "altitude", "picture"] if accepts else ["picture"]
-    assert json.loads(answer.details.stderr) == ["start", *events, *events, "finish"]
+def test_programs_receive_the_calls_of_a_stream(tmp_path: Path) -> None:
+    (tmp_path / "stream.py").write_text(RECORDING_PROGRAM)
+    for measurements, names in (
+        # altitude and image have equal tags
+        (inputs.inertial_descent(2), ["process_increments", "process_altitude", "process_image"]),
+        (inputs.descent(2), ["process_image"]),
+    ):
+        answer = estimate(make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}"), measurements)
+        assert isinstance(answer.details, ProgramDetails)
+        assert json.loads(answer.details.stderr) == ["start", *names, *names, "finish"]
 
 
 def format_server(answers: list[str]) -> str:
@@ -355,15 +349,11 @@ NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        (['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'], "the answer to 'start' has an outcome"),
-        (['{"exchange": 1, "outcome": null, "inertial": 1}'], "inertial is 1; allowed: true, or false"),
         (
-            [
-                '{"exchange": 1, "outcome": null, "inertial": true}',
-                '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2]}',
-            ],
-            "the answer to 'imu' has an outcome; it must be null",
+            ['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'],
+            "outcome is 'NO_VALID_TRACK'; only process_image and finish",
         ),
+        (['{"exchange": 1, "outcome": null, "inertial": 1}'], "unknown key 'inertial'; allowed: exchange, outcome"),
         ([NO_VELOCITY_YET, "3"], "not one JSON object"),
         ([NO_VELOCITY_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
         ([NO_VELOCITY_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
@@ -372,15 +362,17 @@ NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
                 NO_VELOCITY_YET,
                 NO_VELOCITY_YET,
                 '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}',
+                NO_VELOCITY_YET,
+                '{"exchange": 1, "outcome": "NO_VALID_TRACK"}',
             ],
             r"span_s is \(0.0, 1.0\); allowed: within",
         ),
-        ([NO_VELOCITY_YET] * 5, "the answer to 'finish' has the outcome null"),
+        ([NO_VELOCITY_YET] * 5, "outcome is None; allowed: VALID"),
         ([NO_VELOCITY_YET] * 2, "its output ended without an answer|it closed its input"),
     ],
 )
 def test_invalid_answers_are_reported_as_faults(tmp_path: Path, answers: list[str], message: str) -> None:
     (tmp_path / "stream.py").write_text(format_server(answers))
     with pytest.raises(AlgorithmError, match=message) as error:
-        make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}").estimate(inputs.inertial_descent(3))
+        estimate(make_stream(f"exec-stream:{sys.executable} {tmp_path / 'stream.py'}"), inputs.descent(3))
     assert error.value.fault is (Fault.CRASHED if answers == [NO_VELOCITY_YET] * 2 else Fault.BAD_ANSWER)

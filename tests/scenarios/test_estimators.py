@@ -12,10 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.algorithms.answers import StreamedEstimator
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.dimes.baselines import HomographyEstimator
-from marsyard.algorithms.exchange import ExecutableLimits, ExecutableTargetTracker, ExecutableVelocityEstimator
+from marsyard.algorithms.exchange import ExecutableAlgorithm, ExecutableLimits, ExecutableTargetTracker
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.reports.comparison import select_algorithm
@@ -27,6 +26,7 @@ from marsyard.scenarios.evaluation import case_result
 from marsyard.scenarios.interface import CaseResult, Failure
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.velocity import VELOCITY, consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
@@ -64,7 +64,7 @@ def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pyt
 
 def test_programs_are_accepted_as_algorithms() -> None:
     algorithm = VELOCITY.make("exec:cat --number", DimesOptions(), LIMITS)
-    assert isinstance(algorithm, ExecutableVelocityEstimator)
+    assert isinstance(algorithm, ExecutableAlgorithm)
     assert algorithm.command.words == ("cat", "--number")
     LANDING.check("serve:cat")
     TRACKING.check("exec:cat")

@@ -21,7 +21,7 @@ START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-12, 1e12
 DEPTH_CURVATURE = 1e-14
 
 
-class Matches(NamedTuple):
+class MatchArrays(NamedTuple):
     """Features in both images, normalised image coordinates (n, 2); focal length and scale of Cauchy's cost, pixels."""
 
     first: Array
@@ -30,7 +30,7 @@ class Matches(NamedTuple):
     scale: float
 
 
-class Motion(NamedTuple):
+class MotionArrays(NamedTuple):
     """Rotation (unit quaternion w, x, y, z), translation, and the features' inverse depths in the first camera."""
 
     q: Array
@@ -67,7 +67,7 @@ def rotate_quaternion(q: Array, step: Array) -> Array:
 
 
 @njit(cache=True)
-def residuals(matches: Matches, motion: Motion) -> Array:
+def residuals(matches: MatchArrays, motion: MotionArrays) -> Array:
     """Reprojection minus measurement in the second image, pixels, shape (n, 2); inf behind the camera.
 
     A feature (x, y) with inverse depth rho is projected along R (x, y, 1) + rho t.
@@ -126,7 +126,9 @@ def _jacobian(x: float, y: float, rho: float, focal: float, R: Array, t: Array, 
 
 
 @njit(cache=True)
-def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, with_depths: bool) -> tuple[Array, Array]:
+def _compute_step(
+    matches: MatchArrays, r: Array, motion: MotionArrays, damping: float, with_depths: bool
+) -> tuple[Array, Array]:
     """Damped Gauss-Newton step of rotation and translation (6,) and of inverse depths, by the Schur complement.
 
     S and g are the Hessian and the gradient of rotation and translation after elimination of the inverse depths.
@@ -167,8 +169,8 @@ def _compute_step(matches: Matches, r: Array, motion: Motion, damping: float, wi
 
 @njit(cache=True)
 def solve(
-    matches: Matches, start: Motion, with_depths: bool, iterations: int, tolerance: float
-) -> tuple[Motion, float, bool, int]:
+    matches: MatchArrays, start: MotionArrays, with_depths: bool, iterations: int, tolerance: float
+) -> tuple[MotionArrays, float, bool, int]:
     """Minimise Cauchy's cost from the motion `start`; inverse depths have the inverse unit of the translation.
 
     Returns the motion with inverse depths, its cost, whether the iteration converged, and the number of steps. The
@@ -181,7 +183,9 @@ def solve(
     damping = START_DAMPING
     for iteration in range(iterations):
         step, depth_steps = _compute_step(matches, r, motion, damping, with_depths)
-        trial = Motion(rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps)
+        trial = MotionArrays(
+            rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps
+        )
         new_r = residuals(matches, trial)
         new_cost = cauchy_cost(new_r, matches.scale)
         step_length = math.sqrt(np.sum(step * step))

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.hda import ElevationMap, HdaOptions, SurfaceFrame
 from marsyard.algorithms.hda.estimator import plane_normal, surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.hazards import elevation_map
-from marsyard.algorithms.hda.motion import View
+from marsyard.algorithms.hda.motion import CameraView
 from marsyard.sim.camera import camera_pose
 from tests.algorithms.hda.relief_scene import make_camera, make_pose
 
@@ -85,11 +85,11 @@ def test_collinear_points_are_rejected() -> None:
     assert elevation_map(np.zeros((50, 3))) is None
 
 
-def make_view(yaw: float, pitch: float, roll: float) -> View:
+def make_view(yaw: float, pitch: float, roll: float) -> CameraView:
     """Create a black image from a body with this attitude, degrees."""
     body_from_camera = camera_pose(make_camera())
     counts = np.zeros((240, 320), dtype=np.uint16)
-    return View(
+    return CameraView(
         counts,
         make_camera().transform(body_from_camera.inv()),
         make_pose(3.0, 4.0, 10.0, yaw, pitch, roll) * body_from_camera,

@@ -8,11 +8,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import (
-    Ground,
+    CameraMotion,
     HdaDetails,
     HdaEstimator,
     HdaOptions,
-    Motion,
+    MappedGround,
     Safety,
     SurfaceFrame,
     TrackSeed,
@@ -72,13 +72,13 @@ def get_details(estimate: SiteEstimate) -> HdaDetails:
     return estimate.details
 
 
-def get_ground(estimate: SiteEstimate) -> Ground:
+def get_ground(estimate: SiteEstimate) -> MappedGround:
     ground = get_details(estimate).ground
     assert ground is not None
     return ground
 
 
-def get_motion(estimate: SiteEstimate) -> Motion:
+def get_motion(estimate: SiteEstimate) -> CameraMotion:
     motion = get_details(estimate).motion
     assert motion is not None
     return motion

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.hda import HdaOptions, Motion
+from marsyard.algorithms.hda import CameraMotion, HdaOptions
 from marsyard.algorithms.hda.estimator import check_motion
 from marsyard.algorithms.hda.kernels import motion as kernels
 from marsyard.algorithms.hda.motion import MotionStart, estimate_motion, plane_depths, range_starts
@@ -38,12 +38,12 @@ def project_points(points: np.ndarray, depths: np.ndarray, true_motion: RigidTra
     return second[:, :2] / second[:, 2:]
 
 
-def solve_motion(points: np.ndarray, second: np.ndarray, start: RigidTransform = NO_MOTION_START) -> Motion:
+def solve_motion(points: np.ndarray, second: np.ndarray, start: RigidTransform = NO_MOTION_START) -> CameraMotion:
     """Estimate the motion from tracks; the initial depths are 10 m."""
     return estimate_motion(points, second, FOCAL_PX, (MotionStart(start, np.full(len(points), 10.0)),), OPTIONS)
 
 
-def motion_errors(result: Motion, true_motion: RigidTransform, scale: float) -> tuple[float, float]:
+def motion_errors(result: CameraMotion, true_motion: RigidTransform, scale: float) -> tuple[float, float]:
     """Compute the rotation error, radians, and the translation error as a fraction of the baseline."""
     rotation_error = (result.second_from_first.rotation * true_motion.rotation.inv()).magnitude()
     translation_error = scale * result.second_from_first.translation - true_motion.translation
@@ -170,8 +170,10 @@ def test_residuals_are_reprojection_errors_in_pixels() -> None:
     points, depths = make_tracks(rng, 0.05)
     true_motion = draw_motion(rng)
     second = project_points(points, depths, true_motion) + 0.01
-    motion = kernels.Motion(true_motion.rotation.as_quat(scalar_first=True), true_motion.translation, 1.0 / depths)
-    residuals = kernels.residuals(kernels.Matches(points, second, FOCAL_PX, 1.0), motion)
+    motion = kernels.MotionArrays(
+        true_motion.rotation.as_quat(scalar_first=True), true_motion.translation, 1.0 / depths
+    )
+    residuals = kernels.residuals(kernels.MatchArrays(points, second, FOCAL_PX, 1.0), motion)
     np.testing.assert_allclose(residuals, -0.01 * FOCAL_PX, rtol=1e-9)
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchStatus
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import LandingScene, Motion, build_scene, undistort
+from marsyard.algorithms.hda.motion import CameraMotion, LandingScene, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,
@@ -131,7 +131,7 @@ def test_plane_of_features_determines_scale_without_local_matches(scene: Pass, l
     depths = 1.0 / (0.1 + positions @ np.array([0.02, -0.03]))  # a plane at 10 m on the axis
     inliers = np.arange(30) != 4
     depths[4] = 3.0
-    motion = Motion(scene.second_from_first, depths, np.zeros(30), inliers, 20.0, converged=True)
+    motion = CameraMotion(scene.second_from_first, depths, np.zeros(30), inliers, 20.0, converged=True)
     blank = np.full((240, 320), 1000, dtype=np.uint16)
     views = (replace(landing_scene.views[0], counts=blank), replace(landing_scene.views[1], counts=blank))
     assert scale_factor(views, motion, positions, 12.0, OPTIONS) == pytest.approx(1.2, rel=1e-9)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import View
+from marsyard.algorithms.hda.motion import CameraView
 from marsyard.algorithms.hda.tracking import (
     LevelSize,
     eigenvalue_test,
@@ -90,10 +90,10 @@ def test_pyramid_levels_of_the_papers_window() -> None:
     assert sizes == (LevelSize(5, 2), LevelSize(3, 2), *[LevelSize(2, 2)] * 2, LevelSize(2, 40))
 
 
-def make_view(columns: int = 320) -> View:
+def make_view(columns: int = 320) -> CameraView:
     camera = make_camera(columns)
     counts = np.zeros(camera.size[::-1], dtype=np.uint16)
-    return View(counts, camera, rigid(Rotation.identity(), np.zeros(3)))
+    return CameraView(counts, camera, rigid(Rotation.identity(), np.zeros(3)))
 
 
 def test_window_contains_the_expected_displacement() -> None:

@@ -18,13 +18,7 @@ from marsyard.algorithms.localisation.coarse import CoarseFix, CoarseMatches, Co
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.fine import LandmarkMatches
-from marsyard.algorithms.localisation.interface import (
-    InitialState,
-    MapProduct,
-    PositionEstimate,
-    PositionEstimator,
-    PositionOutcome,
-)
+from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
@@ -67,7 +61,7 @@ def _make_image(time_s: float, radiance: np.ndarray, camera: CameraModel = STUB_
 
 
 def _descend(
-    estimator: PositionEstimator,
+    estimator: InertialEstimator | MapRelativeEstimator,
     map_product: MapProduct,
     images: Sequence[DetectorImage],
     initial: InitialState | None = None,
@@ -78,13 +72,13 @@ def _descend(
     estimator.start(_make_initial() if initial is None else initial, map_product)
     previous_s = 0.0
     for image in images:
-        estimator.imu(_make_increments(previous_s, image.time_s))
+        estimator.process_increments(_make_increments(previous_s, image.time_s))
         previous_s = image.time_s
         position = _true_position(image.time_s)
         if with_altitudes:
             height = float(position[2]) - elevation_at(map_product, position[:2])
-            estimator.altitude(AltitudeMeasurement(height, image.time_s))
-        yield estimator.image(image)
+            estimator.process_altitude(AltitudeMeasurement(height, image.time_s))
+        yield estimator.process_image(image)
     yield estimator.finish()
 
 
@@ -305,7 +299,7 @@ def test_position_whose_covariance_grows_above_the_limit_is_uncertain(make_stage
 @pytest.mark.parametrize("make_estimator", [MapRelativeEstimator, InertialEstimator, FeatureEstimator])
 @pytest.mark.parametrize("has_fix", [False, True])
 def test_measurements_outside_of_the_inertial_data_are_not_used(
-    make_estimator: type[PositionEstimator], has_fix: bool, make_stages: Callable[..., Stages]
+    make_estimator: type[InertialEstimator | MapRelativeEstimator], has_fix: bool, make_stages: Callable[..., Stages]
 ) -> None:
     """Time tags before the initial state, older than the filter's memory of 5 s, and after the last increment."""
     make_stages([ERROR_M[:2]], [True, True])
@@ -314,16 +308,16 @@ def test_measurements_outside_of_the_inertial_data_are_not_used(
     images = [1.0, 2.0, 3.0] if has_fix else [1.0]
     previous_s = 0.0
     for time_s in images:
-        estimator.imu(_make_increments(previous_s, time_s))
+        estimator.process_increments(_make_increments(previous_s, time_s))
         previous_s = time_s
-        estimator.altitude(AltitudeMeasurement(float(_true_position(time_s)[2]), time_s))
-        estimator.image(_make_image(time_s, np.ones((64, 64))))
-    estimator.imu(_make_increments(previous_s, 8.0))
+        estimator.process_altitude(AltitudeMeasurement(float(_true_position(time_s)[2]), time_s))
+        estimator.process_image(_make_image(time_s, np.ones((64, 64))))
+    estimator.process_increments(_make_increments(previous_s, 8.0))
     before = estimator.finish()
     for time_s in (-0.5, 1.5, 8.5):
         # an altitude of 1 m would give a wrong scale and a wrong height
-        estimator.altitude(AltitudeMeasurement(1.0, time_s))
-        answer = estimator.image(_make_image(time_s, np.ones((64, 64))))
+        estimator.process_altitude(AltitudeMeasurement(1.0, time_s))
+        answer = estimator.process_image(_make_image(time_s, np.ones((64, 64))))
         assert answer.outcome is PositionOutcome.OUTSIDE_INERTIAL_DATA
         assert answer.position_m is None
         assert answer.time_s == 8.0
@@ -339,11 +333,11 @@ def test_ignored_altitude_does_not_set_the_scale_of_the_coarse_stage(make_stages
     estimator.start(_make_initial(), FLAT_MAP)
     previous_s = 0.0
     for image in _images(3):
-        estimator.imu(_make_increments(previous_s, image.time_s))
+        estimator.process_increments(_make_increments(previous_s, image.time_s))
         previous_s = image.time_s
-        estimator.altitude(AltitudeMeasurement(float(_true_position(image.time_s)[2]), image.time_s))
-        estimator.altitude(AltitudeMeasurement(1.0, image.time_s + 0.5))
-        estimator.image(image)
+        estimator.process_altitude(AltitudeMeasurement(float(_true_position(image.time_s)[2]), image.time_s))
+        estimator.process_altitude(AltitudeMeasurement(1.0, image.time_s + 0.5))
+        estimator.process_image(image)
     expected = [_true_position(image.time_s)[2] for image in _images(3)]
     np.testing.assert_allclose(stages.heights_m[0], expected, atol=1e-6)
 

@@ -12,7 +12,7 @@ from marsyard.algorithms.localisation import inertial_state as inertial
 from marsyard.algorithms.localisation import state_updates as updates
 from marsyard.algorithms.localisation.inertial_state import ImuErrorModel, IncrementHistory, NavigationState
 from marsyard.algorithms.localisation.interface import InitialState
-from marsyard.algorithms.localisation.navigation_filter import NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.algorithms.localisation.state_updates import UpdateOutcome
 from marsyard.sim.camera import Cahvore, mount_looking_down
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory, attitudes_and_body_rates
@@ -104,7 +104,7 @@ def draw_points(truth: Descent, time_s: float, count: int, rng: np.random.Genera
 
 def test_perfect_increments_reproduce_the_motion(truth: Descent, exact: ImuIncrements) -> None:
     # the increments are passed in blocks of irregular length; 59.9987 s is between two boundaries
-    navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
     for first, last in ((0, 1), (1, 700), (700, 701), (701, 24000)):
         navigation.propagate(slice_increments(exact, first, last))
     for time_s in (60.0, 59.9987, 57.0):
@@ -117,7 +117,7 @@ def test_perfect_increments_reproduce_the_motion(truth: Descent, exact: ImuIncre
 
 
 def test_state_is_extrapolated_by_a_few_milliseconds(truth: Descent, exact: ImuIncrements) -> None:
-    navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
     navigation.propagate(slice_increments(exact, 0, 4000))
     errors = state_errors(truth, navigation.state_at(10.002))
     # a constant rate is assumed over 2 ms plus the last interval of 2.5 ms; angular acceleration below 0.1 rad/s2
@@ -143,7 +143,7 @@ def state_difference(plus: NavigationState, minus: NavigationState) -> np.ndarra
 
 def test_transition_matches_numerical_differences(truth: Descent, exact: ImuIncrements) -> None:
     """One step of 0.1 s and 40 steps, element by element."""
-    start = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
+    start = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
     history = IncrementHistory(exact.times_s, exact.period_s, exact.delta_angles_rad, exact.delta_velocities_m_s)
     times, gravity, step = 0.1 * np.arange(1, 41), np.array([0.0, 0.0, -GRAVITY]), 0.1
 
@@ -188,7 +188,7 @@ def test_propagated_covariance_equals_that_of_the_transition(truth: Descent, exa
     noise_free = ImuErrorModel(
         **dict.fromkeys(ImuErrorModel.__dataclass_fields__, 0.0) | {"gyro_wander_s": 1.0, "accelerometer_wander_s": 1.0}
     )
-    start = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
+    start = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE)).state_at(0.0)
     history = IncrementHistory(exact.times_s, exact.period_s, exact.delta_angles_rad, exact.delta_velocities_m_s)
     times = 0.1 * np.arange(1, 41)
     for column, size in ((4, 1.0), (7, 1e-4), (9, 1e-4), (13, 1e-2)):
@@ -248,7 +248,7 @@ def test_updates_of_position_and_altitude_are_those_of_a_kalman_filter(truth: De
     start = initial_state(truth, scale[:, None] * (mixing @ mixing.T) * scale)
     slope, noise = np.array([0.1, -0.2]), np.array([[900.0, 200.0], [200.0, 400.0]])
     for kind in ("position", "altitude"):
-        navigation = NavigationFilter.from_initial(start)
+        navigation = LocalisationFilter.from_initial(start)
         prior = navigation.state_at(0.0)
         if kind == "position":
             jacobian, covariance, residual = np.eye(2, 15), noise, np.array([20.0, -30.0])
@@ -295,7 +295,7 @@ def test_delayed_updates_equal_updates_in_order_of_time(truth: Descent, exact: I
     start = initial_state(truth, SMALL_COVARIANCE, np.array([40.0, -30, 20, 0.3, 0.2, -0.4, 0.003, 0.004, -0.002]))
     states = []
     for delayed in (False, True):
-        navigation = NavigationFilter.from_initial(start)
+        navigation = LocalisationFilter.from_initial(start)
         # 493 increments end at 1.2325 s, 494 at 1.235 s
         first = 800 if delayed else (493 if pending else 494)
         navigation.propagate(slice_increments(exact, 0, first))
@@ -318,7 +318,7 @@ def test_delayed_updates_equal_updates_in_order_of_time(truth: Descent, exact: I
 
 
 def test_updates_outside_the_history_and_invalid_ones_are_ignored(truth: Descent, exact: ImuIncrements) -> None:
-    navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
     navigation.propagate(slice_increments(exact, 0, 4000))
     before = navigation.state_at(10.0)
     flat = (0.0, np.zeros(2))
@@ -346,7 +346,7 @@ def simulate(
     imu = Imu.draw(parameters, SPAN_S, rng)
     boundaries, angles, velocities = exact.times_s, exact.delta_angles_rad, exact.delta_velocities_m_s
     errors = np.linalg.cholesky(SMALL_COVARIANCE) @ rng.standard_normal(9)
-    navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE, errors))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE, errors))
     count = round(duration_s * RATE_HZ)
     measured = ImuIncrements(
         times_s=imu.clock.tags(boundaries[: count + 1], rng),
@@ -390,7 +390,7 @@ def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) 
     rng = np.random.default_rng([seed, 6])
     covariance = np.diag(np.repeat([100.0, 1.0, 0.005], 3) ** 2)
     errors = np.sqrt(np.diag(covariance)) * rng.standard_normal(9)
-    navigation = NavigationFilter.from_initial(initial_state(truth, covariance, errors))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, covariance, errors))
     navigation.propagate(slice_increments(exact, 0, 800))
     points, pixels = draw_points(truth, 2.0, 150, rng)
     pixels += 0.3 * rng.standard_normal(pixels.shape)
@@ -409,7 +409,7 @@ def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) 
 
 def test_systematically_wrong_landmarks_are_inconsistent(truth: Descent, exact: ImuIncrements) -> None:
     """A repetitive pattern: all landmarks agree on a position that is wrong by 400 m, 8 standard deviations."""
-    navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
     navigation.propagate(slice_increments(exact, 0, 800))
     points, pixels = draw_points(truth, 2.0, 80, np.random.default_rng(7))
     result = navigation.update_landmarks(2.0, CAMERA, points + np.array([400.0, 0.0, 0.0]), pixels, 0.3)
@@ -427,7 +427,7 @@ def test_landmarks_of_a_wrong_attitude_are_inconsistent(truth: Descent, exact: I
     tilt = np.radians([tilt_deg, 0.0, 0.0])
     height = truth.state(2.0).position_m[2]
     errors = np.concatenate([np.cross(tilt, [0.0, 0.0, height]), np.zeros(3), tilt])
-    navigation = NavigationFilter.from_initial(initial_state(truth, covariance, errors))
+    navigation = LocalisationFilter.from_initial(initial_state(truth, covariance, errors))
     navigation.propagate(slice_increments(exact, 0, 800))
     points, pixels = draw_points(truth, 2.0, 100, np.random.default_rng(7))
     before = navigation.state_at(2.0)
@@ -447,7 +447,7 @@ def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: Im
     """150 landmarks with a common error: the position's standard deviation is not below that of the common error."""
     deviations = []
     for common in (0.0, np.array([6.0, 6.0, 10.0])):
-        navigation = NavigationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
+        navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
         navigation.propagate(slice_increments(exact, 0, 800))
         points, pixels = draw_points(truth, 2.0, 150, np.random.default_rng(8))
         result = navigation.update_landmarks(2.0, CAMERA, points, pixels, 0.3, 1.0, common)

@@ -22,7 +22,7 @@ from marsyard.algorithms.vtt.accuracy import (
 )
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.placement import Instrument, PlacementOutcome, place_instrument, tool_overlap_m
-from marsyard.algorithms.vtt.tracker import Distances, Evidence, Tolerances, find_losses, next_state, tolerances
+from marsyard.algorithms.vtt.tracker import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 
@@ -47,12 +47,12 @@ TOLERANCES = Tolerances(distance_m=0.2, position_m=0.4)
     ],
 )
 def test_target_is_lost_if_one_criterion_is_exceeded(criterion: str, value: float, expected: TargetLoss | None) -> None:
-    result = find_losses(Evidence(**(GOOD | {criterion: value})), TOLERANCES, OPTIONS)
+    result = find_losses(MatchEvidence(**(GOOD | {criterion: value})), TOLERANCES, OPTIONS)
     assert result == (() if expected is None else (expected,))
 
 
 def test_all_violated_criteria_are_reported() -> None:
-    assert find_losses(Evidence(0.1, 0.1, 9.0, 9.0), TOLERANCES, OPTIONS) == (
+    assert find_losses(MatchEvidence(0.1, 0.1, 9.0, 9.0), TOLERANCES, OPTIONS) == (
         TargetLoss.LOW_MATCH_SCORE,
         TargetLoss.LOW_STEREO_SCORE,
         TargetLoss.DISTANCE_JUMP,

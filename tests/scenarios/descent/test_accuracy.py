@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, Track
+from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesTrack
 from marsyard.algorithms.dimes.binning import altitudes_at_images
 from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import create_flight, mean_velocities, states_at_images
@@ -22,7 +22,7 @@ RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"re
 N_CASES = 5
 
 
-def _run_descent(case: int, **tables: Any) -> tuple[list[Track], list[State], DescentMeasurements, Surface]:
+def _run_descent(case: int, **tables: Any) -> tuple[list[DimesTrack], list[State], DescentMeasurements, Surface]:
     """Run a descent with the full dispersion of motions and return the tracks that passed DIMES' checks."""
     rng = np.random.default_rng(case)
     motion = {
@@ -48,7 +48,7 @@ def _run_descent(case: int, **tables: Any) -> tuple[list[Track], list[State], De
     return [track for track in details.tracks if track.valid], states, measurements, world.surface
 
 
-def _compute_velocity_errors(tracks: list[Track], states: list[State]) -> np.ndarray:
+def _compute_velocity_errors(tracks: list[DimesTrack], states: list[State]) -> np.ndarray:
     """Return estimated minus true horizontal velocity of each track, m/s, shape (n, 2)."""
     true_velocities = mean_velocities(states)[:, :2]
     return np.array([track.velocity_m_s - true_velocities[track.pair] for track in tracks]).reshape(-1, 2)
@@ -86,7 +86,7 @@ def test_relief_errors_match_geometric_prediction() -> None:
     assert np.sqrt(np.mean(np.sum(simulated_errors**2, axis=1))) > 0.4
 
 
-def _predict(track: Track, states: list[State], measurements: DescentMeasurements, surface: Surface) -> np.ndarray:
+def _predict(track: DimesTrack, states: list[State], measurements: DescentMeasurements, surface: Surface) -> np.ndarray:
     """Return the predicted velocity error of a track, m/s; the test of relief errors defines the formula."""
     first, second = states[track.pair], states[track.pair + 1]
     altitude_1, altitude_2 = altitudes_at_images(measurements)[track.pair : track.pair + 2]

@@ -18,14 +18,13 @@ from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.scenarios.algorithm_run import run_on_measurements
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target
 from marsyard.scenarios.isolation.plain import decode, encode
 from marsyard.scenarios.isolation.remote import is_remote
 from marsyard.scenarios.objects import name_object
 from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.velocity import VELOCITY
+from marsyard.scenarios.velocity import VELOCITY, run_estimator
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run
 from tests.campaigns.fake_velocity import FakeVelocityParameters, FakeVelocityScenario
@@ -103,7 +102,7 @@ def test_stream_receives_images_one_by_one(log: Path) -> None:
     stream = VELOCITY.make(f"{MODULE}:Stream", DimesOptions(), ExecutableLimits())
     assert is_remote(stream)
     for _ in range(2):
-        estimate = run_on_measurements(lambda: stream, lambda answer: answer, measurements).answer
+        estimate = run_estimator(lambda: stream, measurements).answer
         assert isinstance(estimate, VelocityEstimate)
         assert estimate.velocity_m_s is not None
         assert estimate.velocity_m_s.tolist() == [4.0, 0.0]

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety
-from marsyard.algorithms.hda.details import Ground
+from marsyard.algorithms.hda.details import MappedGround
 from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
-from marsyard.algorithms.hda.motion import View
+from marsyard.algorithms.hda.motion import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
@@ -149,7 +149,9 @@ def test_relief_error_is_1_for_a_plane_and_0_for_an_exact_map(map_scale: float, 
     elevation = replace(cells, elevation_m=map_scale * exact + plane)
     zeros = np.zeros((8, 8))
     hazards = HazardMaps(np.zeros((8, 8, 3)), zeros, zeros, zeros, zeros.astype(np.uint8))
-    ground = Ground(Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, hazards, np.zeros(2), None)
+    ground = MappedGround(
+        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, hazards, np.zeros(2), None
+    )
     nothing = np.zeros_like(truth.covered)
     sampled = SampledMap(nothing, nothing, nothing, np.zeros(nothing.shape))
     row = map_errors(ground, flight, sampled, truth)
@@ -168,7 +170,7 @@ def test_matches_are_counted_by_outcome() -> None:
     pixels, no_values = np.zeros((59, 2)), np.zeros(59)
     matches = Matches(pixels, pixels, pixels, pixels, no_values, no_values, statuses, np.zeros((50, 3)))
     camera = preset("xc-55").cameras()[0]
-    view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
+    view = CameraView(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
     row = stage_row(HdaDetails((view, view), matches=matches))
     assert row == {
         "points": 50,
@@ -186,9 +188,11 @@ def test_unknown_cells_of_a_map_are_counted() -> None:
     safety = np.full((20, 30), Safety.SAFE, dtype=np.uint8)
     safety[:5], safety[-3:] = Safety.UNKNOWN, Safety.HAZARD
     maps = HazardMaps(np.zeros((1, 1, 3)), elevation_m, elevation_m, elevation_m, safety)
-    ground = Ground(Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), None)
+    ground = MappedGround(
+        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), None
+    )
     camera = preset("xc-55").cameras()[0]
-    view = View(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
+    view = CameraView(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
     row = stage_row(HdaDetails((view, view), ground=ground))
     assert row["empty_fraction"] == pytest.approx(2 / 20)
     assert row["unknown_fraction"] == pytest.approx(5 / 20)

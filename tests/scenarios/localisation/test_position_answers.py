@@ -25,9 +25,10 @@ from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.localisation.offline import POSITION_FORMAT, read_descent
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisedDescent
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements, feed
+from marsyard.scenarios.localisation.stream import LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.offline import read_answers
+from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.scenarios.localisation.test_scenario import COARSE, SMALL
@@ -75,7 +76,7 @@ def write_table(path: Path, lines: Sequence[str]) -> Path:
 
 def estimate_descent(measurements: LocalisationMeasurements) -> tuple[PositionEstimate, ...]:
     """Run inertial navigation, and refuse to answer the first image."""
-    answers = feed(InertialEstimator(), measurements.initial, measurements.map_product, measurements.events).estimates
+    answers = StreamedEstimator(InertialEstimator()).estimate(measurements).estimates
     return (PositionEstimate(PositionOutcome.NO_COARSE_FIX, answers[0].time_s), *answers[1:])
 
 
@@ -87,9 +88,9 @@ class RefusingOnceEstimator(InertialEstimator):
         super().start(*inputs)
         self._has_refused = False
 
-    def image(self, image: Any) -> PositionEstimate:
+    def process_image(self, image: Any) -> PositionEstimate:
         """Refuse to answer the first image."""
-        answer = super().image(image)
+        answer = super().process_image(image)
         if self._has_refused:
             return answer
         self._has_refused = True
@@ -114,7 +115,7 @@ def test_exported_descent_equals_the_measurements(tmp_path: Path) -> None:
     measurements = simulate()
     exporter: Any = LOCALISATION.make(f"export:{tmp_path}", LvsOptions(), ExecutableLimits(), 12)
     answers = exporter.estimate(measurements)
-    assert [estimate.outcome for estimate in answers.estimates] == [PositionOutcome.NO_COARSE_FIX]
+    assert {estimate.outcome for estimate in measurements.check(answers).estimates} == {PositionOutcome.NO_COARSE_FIX}
     folder = tmp_path / "cases" / "000012"
     exported = read_descent(folder)
     for name in ("map_product", "increments", "altitudes"):
@@ -130,7 +131,7 @@ def test_exported_descent_equals_the_measurements(tmp_path: Path) -> None:
     np.testing.assert_array_equal(exported.initial.covariance, measurements.initial.covariance)
     rotation_error = exported.initial.world_from_body * measurements.initial.world_from_body.inv()
     assert rotation_error.magnitude() < 1e-12
-    assert [type(event) for event in exported.events] == [type(event) for event in measurements.events]
+    assert [type(event) for event in exported.events()] == [type(event) for event in measurements.events()]
     # no other files: the export does not contain the truth
     assert {path.name for path in folder.iterdir() if path.suffix not in (".png", ".cahvor")} == {
         *("case.json", "map.json", "appearance.f32", "elevation.f32", "flat_field_1.f64")
@@ -172,7 +173,7 @@ def test_table_answers_every_image(tmp_path: Path) -> None:
         (["0,VALID,1.0{empty}"], r"line 2: outcome is VALID, but position_m is missing"),
         (["0,CRASHED,1.0{empty}"], r"outcome is 'CRASHED'; allowed: VALID, NO_COARSE_FIX"),
         (["0,UNCERTAIN,2.0{empty}", "0,UNCERTAIN,1.0{empty}"], r"case 0: time_s is 1 after 2; allowed: the order of"),
-        (["0,VALID,1.0,1,2,3{short}"], r"position_east_m is given, but velocity_east_m_s is not"),
+        (["0,VALID,1.0,1,2,3{short}"], r"outcome is VALID, but velocity_m_s is missing"),
         (["0,VALID,1.0,1,2,3,4,5,6,0,0,0,2{identity}"], r"world_from_body_xyzw is .*allowed: a unit quaternion"),
         (["0,VALID,1.0,1,2,3,4,5,6,0,0,0,1{zeros}"], r"covariance is not positive"),
         (["0,UNCERTAIN,1.0,1,2,3,4,5,6,0,0,0,1{identity}"], r"outcome is UNCERTAIN, but position_m is given"),
@@ -220,4 +221,4 @@ def test_export_and_score_equal_a_normal_run(tmp_path: Path) -> None:
     run_campaign(create_scoring_campaign(folder, truth, missing), tmp_path / "bad", ExecutorConfig(1), watch)
     (bad,) = read_case_rows(tmp_path / "bad")
     assert bad["outcome"] == "BAD_ANSWER"
-    assert "has 4 answers to this case; allowed: 5, one for each of its 4 images" in bad["error"]
+    assert "4 answers are given to this case; allowed: 5, one for each of its 4 images" in bad["error"]

@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.algorithms.localisation.navigation_filter import NavigationFilter
+from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.replay import create_subject
 from marsyard.scenarios.conformance import Subject, check_names, determine_task, subject_kinds
+from marsyard.scenarios.conformance.inputs import make_blank
 from marsyard.scenarios.localisation import conformance_inputs as inputs
+from marsyard.scenarios.localisation.stream import LocalisationMeasurements
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from tests.scenarios import suites
 
@@ -52,26 +54,26 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
 @pytest.mark.parametrize(
     ("check", "method", "problem"),
     [
-        ("answer", "def image(self, image): return None", "BAD_ANSWER: the answer is a NoneType; allowed: a PositionE"),
+        ("answer", "def process_image(self, image): return None", "BAD_ANSWER: the answer is a NoneType; allowed: a P"),
         ("answer", "def finish(self): return PositionEstimate(Outcome.VALID, 8.0)", "but position_m is missing"),
         (
             "answer",
-            "def image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s + 0.5)",
+            "def process_image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s + 0.5)",
             "the time_s of its answer to image 1 is 1.5 s; expected 1.0 s",
         ),
         ("answer", "def finish(self): return PositionEstimate(Outcome.UNCERTAIN, 99.0)", "time_s is 99.0; allowed"),
-        ("answer", "def image(self, image): image.counts[:] = 0", "it raised ValueError"),
-        ("black", "def image(self, image): return 1 // int(image.counts.max())", "it raised ZeroDivisionError"),
-        ("saturated", "def image(self, image): assert image.counts.min() < 255", "it raised AssertionError"),
+        ("answer", "def process_image(self, image): image.counts[:] = 0", "it raised ValueError"),
+        ("black", "def process_image(self, image): return 1 // int(image.counts.max())", "it raised ZeroDivisionError"),
+        ("saturated", "def process_image(self, image): assert image.counts.min() < 255", "it raised AssertionError"),
         # duplicated image
         (
             "repeated",
             """
             last = None
-            def image(self, image):
+            def process_image(self, image):
                 assert image.time_s != self.last
                 self.last = image.time_s
-                return super().image(image)
+                return super().process_image(image)
             """,
             "it raised AssertionError",
         ),
@@ -79,16 +81,16 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
         (
             "no-altitudes",
             """
-            def altitude(self, measurement): self.last = measurement
-            def image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s, self.last and None)
+            def process_altitude(self, measurement): self.last = measurement
+            def process_image(self, image): return PositionEstimate(Outcome.UNCERTAIN, image.time_s, self.last and None)
             """,
             "it raised AttributeError: 'Defective' object has no attribute 'last'",
         ),
         (
             "no-images",
             """
-            def image(self, image):
-                self.last = super().image(image)
+            def process_image(self, image):
+                self.last = super().process_image(image)
                 return self.last
             def finish(self): return self.last and super().finish()
             """,
@@ -96,15 +98,19 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
         ),
         (
             "jitter",
-            "def imu(self, increments): assert np.diff(increments.times_s).min() > 0; super().imu(increments)",
+            "def process_increments(self, item): assert np.diff(item.times_s).min() > 0",
             "it raised AssertionError",
         ),
-        ("inputs", "def image(self, image): image.counts[:] = 0; return super().image(image)", "it changed its input"),
+        (
+            "inputs",
+            "def process_image(self, image): image.counts[:] = 0; return super().process_image(image)",
+            "it changed its input",
+        ),
         ("inputs", "def start(self, i, m): super().start(i, m); m.appearance[0, 0] += 1", "it changed its input"),
         (
             "deterministic",
             """
-            def image(self, image):
+            def process_image(self, image):
                 return PositionEstimate(Outcome.UNCERTAIN, image.time_s + 1e-7 * np.random.random())
             """,
             "its answers to the same case differ between two calls",
@@ -114,7 +120,7 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
             "deterministic",
             """
             count = 0
-            def altitude(self, measurement): self.count += 1
+            def process_altitude(self, measurement): self.count += 1
             def finish(self): return PositionEstimate(list(Outcome)[1 + self.count // 20], self._filter.time_s)
             """,
             "after another descent, its answers differ",
@@ -123,7 +129,7 @@ def write_defective_module(folder: Path, monkeypatch: pytest.MonkeyPatch, body: 
             "start",
             """
             count = 0
-            def image(self, image):
+            def process_image(self, image):
                 self.count += 1
                 return PositionEstimate(list(Outcome)[1 + self.count % 2], image.time_s)
             """,
@@ -147,7 +153,7 @@ def test_defects_are_reported(
 
 
 def test_slow_estimator_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    body = "    def image(self, image): import time; time.sleep(0.02); return super().image(image)"
+    body = "    def process_image(self, image): import time; time.sleep(0.02); return super().process_image(image)"
     finding = run_suite(write_defective_module(tmp_path, monkeypatch, body), "time", limit_s=0.01)["time"]
     assert float(finding.problem.split()[2]) >= 0.02  # a loaded machine takes longer
     assert not finding.passed
@@ -162,9 +168,9 @@ time_s, images, body = 0.0, 0, sys.argv[1]
 for line in sys.stdin:
     request = json.loads(line)
     answer = {"outcome": None}
-    if request["do"] == "imu":
+    if request["do"] == "process_increments":
         time_s = request["increments"]["times_s"][-1]
-    if request["do"] in ("image", "finish"):
+    if request["do"] in ("process_image", "finish"):
         images += 1
         tag = json.load(open(request["image"] + "/image.json"))["image"]["time_s"] if "image" in request else time_s
         answer = {"outcome": "UNCERTAIN", "time_s": tag}
@@ -213,25 +219,26 @@ def test_estimators_and_programs_have_the_localisation_suite() -> None:
 def test_inertial_data_are_exact() -> None:
     """Propagation preserves the error of the initial position: the increments have no errors."""
     case = inputs.ordinary_descent()
-    navigation = NavigationFilter.from_initial(case.initial)
-    for event in case.events:
+    navigation = LocalisationFilter.from_initial(case.initial)
+    for event in case.events():
         if isinstance(event, ImuIncrements):
             navigation.propagate(event)
-    error = navigation.estimate(case.end_s)[0] - inputs.true_position(case.end_s)
+    error = navigation.estimate(float(case.increments.times_s[-1]))[0] - inputs.true_position(
+        float(case.increments.times_s[-1])
+    )
     # (160, -110, 20) m is the error of the initial position; the trapezoidal rule is exact for a constant force
     np.testing.assert_allclose(error, [160.0, -110.0, 20.0], atol=1e-3)
 
 
 def test_unusual_descents_differ_as_described() -> None:
-    def select(case: inputs.Descent, kind: type) -> list:
-        return [event for event in case.events if isinstance(event, kind)]
+    def select(case: LocalisationMeasurements, kind: type) -> list:
+        return [event for event in case.events() if isinstance(event, kind)]
 
     images = select(inputs.ordinary_descent(), DetectorImage)
     assert {float(image.counts.std()) > 5.0 for image in images} == {True}
     assert len(select(inputs.descent_with_repeated_images(), DetectorImage)) == 2 * len(images)
-    assert {
-        int(image.counts.max()) for image in select(inputs.descent_with_blank_images("saturated"), DetectorImage)
-    } == {255}
+    saturated = make_blank(inputs.ordinary_descent(), inputs.BLANK_COUNTS["saturated"])
+    assert {int(image.counts.max()) for image in saturated.images} == {255}
     assert (
         select(inputs.descent_without_altitudes(), AltitudeMeasurement)
         == select(inputs.descent_without_images(), DetectorImage)

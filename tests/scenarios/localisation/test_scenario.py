@@ -235,7 +235,7 @@ def test_inertial_data_contain_the_tags_of_a_wrong_clock(key: str, offset_s: flo
     clock = {"offset_s": offset_s}
     parameters = _make_parameters(**COARSE, **{key: clock if key == "clock" else {"clock": clock}})
     descent = LocalisedDescent.simulate(parameters, Streams(1, "loc tests", 0))
-    tags = [event.time_s for event in descent.measurements.events if not isinstance(event, ImuIncrements)]
+    tags = [event.time_s for event in descent.measurements.events() if not isinstance(event, ImuIncrements)]
     first, last = descent.measurements.increments.times_s[[0, -1]]
     assert first <= min(tags)
     assert max(tags) <= last
@@ -270,7 +270,7 @@ def _late_tags(_: Clock, times_s: np.ndarray, __: np.random.Generator) -> np.nda
 
 def test_altitude_error_scales_all_altitudes() -> None:
     clean, wrong = (
-        np.array([event.altitude_m for event in descent.measurements.events if hasattr(event, "altitude_m")])
+        np.array([event.altitude_m for event in descent.measurements.events() if hasattr(event, "altitude_m")])
         for descent in (_simulate(), _simulate(altitude_error=0.1))
     )
     assert clean.size >= 8
@@ -367,7 +367,7 @@ class LateEstimator:
 
     start = imu = altitude = _ignore
 
-    def image(self, _: object) -> Any:
+    def process_image(self, _: object) -> Any:
         """Answer without a position."""
         return self.finish()
 

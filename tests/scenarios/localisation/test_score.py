@@ -16,7 +16,7 @@ from marsyard.scenarios.columns import row_columns
 from marsyard.scenarios.localisation.fields import SmoothField
 from marsyard.scenarios.localisation.map_product import MapTruth
 from marsyard.scenarios.localisation.score import REQUIRED_M, EstimateErrors, answer_row, compute_errors, products
-from marsyard.scenarios.localisation.stream import ProcessorTimes, StreamAnswers
+from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 
 #: Shift of the map relative to the world, east and north, m.
@@ -87,10 +87,10 @@ def _refusal(time_s: float, outcome: PositionOutcome = PositionOutcome.NO_COARSE
     return PositionEstimate(outcome, time_s + IMU_OFFSET_S, details=LocalisationDetails("coarse"))
 
 
-def _answers(*estimates: PositionEstimate) -> StreamAnswers:
+def _answers(*estimates: PositionEstimate) -> StreamAnswers[PositionEstimate]:
     """Return the answers to images and the final one; the second image takes 0.7 s, the others 0.1 s."""
     image_s = tuple(0.7 if number == 1 else 0.1 for number in range(len(estimates) - 1))
-    return StreamAnswers(estimates, ProcessorTimes(0.0, (), (), image_s, 0.0))
+    return StreamAnswers(estimates[:-1], estimates[-1], image_s)
 
 
 def _row(*estimates: PositionEstimate, **changes: Any) -> dict[str, Any]:
