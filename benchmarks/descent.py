@@ -13,7 +13,7 @@ from benchmarks.timing import Measurement, core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
-from marsyard.scenarios.descent.parameters import CameraParameters
+from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.terrain import TerrainParameters, synthesise
@@ -23,7 +23,7 @@ from marsyard.sim.terrain.sites import sites
 def measure_frame(repeats: int) -> list[Measurement]:
     """Measure a frame of the descent scene with prepared terrain, mesh and shadows."""
     scene, surface = descent_scene()
-    optics = camera_optics(CameraParameters())
+    optics = camera_optics(DescentCameraParameters())
     renderer = process_renderer(default_backend())
     pose = descent_pose(surface)
     return [

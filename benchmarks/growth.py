@@ -34,7 +34,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.scenarios.descent.exposure import camera_optics
-from marsyard.scenarios.descent.parameters import CameraParameters
+from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.render import PixelRays, process_renderer
 from marsyard.sim.render.backend import default_backend
@@ -96,7 +96,7 @@ def measure_curves() -> list[Curve]:
 def _measure_image_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
     """Measure a frame cropped to squares with these sides, pixels."""
     scene, surface = descent_scene()
-    camera, pose = camera_optics(CameraParameters()).camera, descent_pose(surface)
+    camera, pose = camera_optics(DescentCameraParameters()).camera, descent_pose(surface)
     renderer = process_renderer(default_backend())
     points = []
     for side in sides:
@@ -109,7 +109,7 @@ def _measure_image_sizes(sides: Sequence[int]) -> list[tuple[float, float]]:
 def _measure_meshes(lines: Sequence[int]) -> list[tuple[float, float]]:
     """Measure a frame with square meshes of these numbers of grid lines per axis."""
     scene, surface = descent_scene()
-    rays, pose = camera_optics(CameraParameters()).rays, descent_pose(surface)
+    rays, pose = camera_optics(DescentCameraParameters()).rays, descent_pose(surface)
     renderer = process_renderer(default_backend())
     points = []
     for count in lines:

@@ -17,7 +17,7 @@ from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.processes import used_memory
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.flight import create_flight
-from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
+from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
 from marsyard.scenarios.views import SiteGround, Viewpoint, nadir_pose, site_scene
 from marsyard.sim.camera import Cahv, Cahvor
 from marsyard.sim.frames import direction, rigid
@@ -42,7 +42,7 @@ def descent_scene() -> tuple[Scene, Surface]:
 def prepare_descent_exposure() -> Callable[[], object]:
     """Return a function that renders and exposes the descent scene with prepared terrain and shadows."""
     scene, surface = descent_scene()
-    optics = camera_optics(CameraParameters())
+    optics = camera_optics(DescentCameraParameters())
     renderer = process_renderer(default_backend())
     pose = descent_pose(surface)
     detector = Detector.draw(optics.fall_off, DetectorParameters(), np.random.default_rng(0))
@@ -114,7 +114,7 @@ def measure_memory(frames: int) -> list[Measurement]:
     """
     renderer = process_renderer(default_backend())
     _, surface = descent_scene()
-    optics = camera_optics(CameraParameters())
+    optics = camera_optics(DescentCameraParameters())
     rocks = SiteGround.from_site(site("pisgah"), "descent")
     memory_gb = []
     scenes = frames // IMAGES_PER_SCENE

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.images import SUN, descent_pose, descent_scene, measure_all_cores, prepare_descent_exposure
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.scenarios.descent.exposure import camera_optics
-from marsyard.scenarios.descent.parameters import CameraParameters
+from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render.rays import VIEW_SIDE_PX
 from marsyard.sim.render.renderer import ground_mesh
 from marsyard.sim.render.scene import graded_offsets
@@ -75,7 +75,7 @@ def _make_descent_mesh() -> dict[str, Any]:
     return {
         "mesh": mesh,
         "pose": descent_pose(surface).as_matrix(),
-        "focal_px": float(camera_optics(CameraParameters()).rays.focal_px[0]),
+        "focal_px": float(camera_optics(DescentCameraParameters()).rays.focal_px[0]),
         "sun": np.asarray(SUN.direction),
     }
 

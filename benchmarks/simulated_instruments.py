@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.scenarios.descent.exposure import World, camera_optics
+from marsyard.scenarios.descent.exposure import DescentWorld, camera_optics
 from marsyard.scenarios.descent.flight import create_flight, states_at_images
-from marsyard.scenarios.descent.measurement import Instruments, measure
+from marsyard.scenarios.descent.measurement import DescentInstruments, measure
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import draw_detector
 from marsyard.scenarios.descent.score import instrument_errors
@@ -60,10 +60,10 @@ def _simulate_case(campaign: Campaign, case: int) -> Mapping[str, Scalar]:
     """Simulate the measurements of a case with empty images; return the columns of their errors."""
     p, streams = campaign.parameters(case), campaign.streams(case)
     assert isinstance(p, DescentScenarioParameters)
-    world = World.from_parameters(p)
+    world = DescentWorld.from_parameters(p)
     flight = create_flight(p, world.surface, streams)
     states = states_at_images(p, flight)
     detector = draw_detector(p, camera_optics(p.camera), streams)
-    instruments = Instruments.draw(p, world, flight, streams)
+    instruments = DescentInstruments.draw(p, world, flight, streams)
     images = [np.zeros((1, 1), dtype=np.uint16)] * len(states)
     return instrument_errors(world, states, measure(p, world, flight.motion, images, detector, instruments, streams))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, ground_from_pixels
+from marsyard.algorithms.dimes.binning import BinnedView, ground_from_pixels
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.overlap import best_candidates, search_geometry, template_candidates
 from marsyard.algorithms.dimes.validity import rank_combinations
@@ -82,7 +82,7 @@ class ThresholdInputs:
 #: Velocity errors of correct tracks in m/s, by pair and template, axes east and north.
 TrackErrors = Float[np.ndarray, "descents 2 2 2"]
 
-#: Image and calibration of `View`, which the geometric simulation does not use.
+#: Image and calibration of `BinnedView`, which the geometric simulation does not use.
 _EMPTY_IMAGE = np.zeros((256, 256), dtype=np.float32)
 _CALIBRATION = DetectorCalibration(_EMPTY_IMAGE, 1.0, 0.0, 0.0, 1, 0.0, 1)
 
@@ -138,8 +138,8 @@ def _draw_descent_errors(
 
 
 def _project_features(
-    first: View,
-    second: View,
+    first: BinnedView,
+    second: BinnedView,
     pixels: Float[np.ndarray, "n 2"],
     heights_m: Float[np.ndarray, " n"],
     displacement_m: Float[np.ndarray, "2"],
@@ -156,7 +156,7 @@ def _project_features(
 
 def _draw_views(
     inputs: ThresholdInputs, camera: CameraModel, rng: np.random.Generator
-) -> tuple[list[View], list[View]]:
+) -> tuple[list[BinnedView], list[BinnedView]]:
     """Draw three true views and three measured views of a descent."""
     common_error = np.radians(inputs.common_attitude_sd_deg) * rng.standard_normal(3)
     common_scale = 1.0 + inputs.common_altitude_sd * rng.standard_normal()
@@ -182,10 +182,12 @@ def _draw_attitude(inputs: ThresholdInputs, rng: np.random.Generator) -> Rotatio
     return cone * nod * Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True)
 
 
-def _create_view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> View:
+def _create_view(camera: CameraModel, attitude: Rotation, altitude_m: float, time_s: float) -> BinnedView:
     """Create a view without an image, from a camera in the body frame."""
     centre = np.array([0.0, 0.0, altitude_m])
-    return View(_EMPTY_IMAGE, _EMPTY_IMAGE, camera.transform(rigid(attitude, centre)), centre, time_s, _CALIBRATION, 1)
+    return BinnedView(
+        _EMPTY_IMAGE, _EMPTY_IMAGE, camera.transform(rigid(attitude, centre)), centre, time_s, _CALIBRATION, 1
+    )
 
 
 def _draw_direction(rng: np.random.Generator) -> Float[np.ndarray, "2"]:

@@ -55,7 +55,7 @@ WORKER_MEMORY_MIB = 512
 PROBE_TIMEOUT_S = 30.0
 
 
-class Verdict(Enum):
+class CheckResult(Enum):
     """Verdict of a check; its value is the colour on the terminal. Only FAIL prevents a campaign from running."""
 
     OK = "green"
@@ -64,19 +64,19 @@ class Verdict(Enum):
 
 
 @dataclass(frozen=True)
-class Check:
+class DoctorCheck:
     """Result of a check: name, finding, verdict, and the remedy of a problem (empty without a problem)."""
 
     name: str
     finding: str
-    verdict: Verdict = Verdict.OK
+    verdict: CheckResult = CheckResult.OK
     remedy: str = ""
 
 
 def run(console: Console, *, as_json: bool = False) -> int:
     """Print all checks as a table or JSON; return 0 if a campaign can run on this machine, else 1."""
     checks, version = list(run_checks()), importlib.metadata.version("marsyard")
-    failed_checks = [check.name for check in checks if check.verdict is Verdict.FAIL]
+    failed_checks = [check.name for check in checks if check.verdict is CheckResult.FAIL]
     table = Table(title=f"Marsyard {version} in {ROOT}", title_justify="left")
     for heading in ("check", "finding", "verdict"):
         table.add_column(heading, overflow="fold")
@@ -100,7 +100,7 @@ def run(console: Console, *, as_json: bool = False) -> int:
     return 0
 
 
-def run_checks() -> Iterator[Check]:
+def run_checks() -> Iterator[DoctorCheck]:
     """Run all checks in the order of the table; slow checks run in parallel."""
     with ThreadPoolExecutor() as pool:
         rendering = {backend: pool.submit(probe_backend, backend) for backend in BACKENDS}
@@ -119,24 +119,30 @@ def run_checks() -> Iterator[Check]:
     yield from check_systems()
 
 
-def check_python() -> Check:
+def check_python() -> DoctorCheck:
     """Check the interpreter and the operating system."""
     finding = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
     required = importlib.metadata.metadata("marsyard")["Requires-Python"]
     if platform.python_version() not in SpecifierSet(required):
-        return Check("python", f"{finding}; {required} is required", Verdict.FAIL, f"install Python {required}")
+        return DoctorCheck(
+            "python", f"{finding}; {required} is required", CheckResult.FAIL, f"install Python {required}"
+        )
     if sys.platform != "linux":
-        return Check("python", finding, Verdict.WARN, "Marsyard is tested on Linux only")
-    return Check("python", finding)
+        return DoctorCheck("python", finding, CheckResult.WARN, "Marsyard is tested on Linux only")
+    return DoctorCheck("python", finding)
 
 
-def check_optimisation(has_assertions: bool) -> Check:
+def check_optimisation(has_assertions: bool) -> DoctorCheck:
     """Check that assertions are enabled: pyrender makes GL calls inside `assert` statements."""
     remedy = "run Python without -O and unset PYTHONOPTIMIZE"
-    return Check("assertions", "on") if has_assertions else Check("assertions", "off (python -O)", Verdict.FAIL, remedy)
+    return (
+        DoctorCheck("assertions", "on")
+        if has_assertions
+        else DoctorCheck("assertions", "off (python -O)", CheckResult.FAIL, remedy)
+    )
 
 
-def check_shadowing() -> Iterator[Check]:
+def check_shadowing() -> Iterator[DoctorCheck]:
     """Check that Python imports this package, and that no distribution overwrites files of another distribution."""
     spec = importlib.util.find_spec(PACKAGE)
     origins = [] if spec is None else list(spec.submodule_search_locations or ())
@@ -145,21 +151,27 @@ def check_shadowing() -> Iterator[Check]:
     origin = Path(origins[0]).resolve() if origins else None
     if origin != ROOT / PACKAGE:
         remedy = "uninstall that package, unset PYTHONPATH, or change to another folder; then " + REINSTALL
-        yield Check("package shadowing", f"another package is imported: {PACKAGE} from {origin}", Verdict.FAIL, remedy)
+        yield DoctorCheck(
+            "package shadowing", f"another package is imported: {PACKAGE} from {origin}", CheckResult.FAIL, remedy
+        )
     else:
-        yield Check("package shadowing", f"{PACKAGE} is imported from {origin}")
+        yield DoctorCheck("package shadowing", f"{PACKAGE} is imported from {origin}")
     owners = importlib.metadata.packages_distributions().get(PACKAGE, [])
     other_owners = sorted({canonicalize_name(owner) for owner in owners} - {"marsyard"})
     if other_owners:
         finding = f"{', '.join(other_owners)} also installs a package named {PACKAGE}"
-        yield Check("package names", finding, Verdict.WARN, f"pip uninstall {' '.join(other_owners)}, then {REINSTALL}")
+        yield DoctorCheck(
+            "package names", finding, CheckResult.WARN, f"pip uninstall {' '.join(other_owners)}, then {REINSTALL}"
+        )
     for required, conflicting in CONFLICTS:
         if _find_version(conflicting) is not None:
             remedy = f"pip uninstall -y {conflicting} {required}, then {REINSTALL}"
-            yield Check("package names", f"{conflicting} overwrites files of {required}", Verdict.FAIL, remedy)
+            yield DoctorCheck(
+                "package names", f"{conflicting} overwrites files of {required}", CheckResult.FAIL, remedy
+            )
 
 
-def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
+def check_dependencies(failures: Mapping[str, str]) -> Iterator[DoctorCheck]:
     """Check the versions against pyproject.toml and constraints.txt; `failures` are those of `find_import_failures`."""
     pins = _read_pins()
     n_valid, pin_deviations = 0, []
@@ -167,18 +179,18 @@ def check_dependencies(failures: Mapping[str, str]) -> Iterator[Check]:
         name = canonicalize_name(requirement.name)
         version = _find_version(name)
         if version is None:
-            yield Check(name, "not installed", Verdict.FAIL, REINSTALL)
+            yield DoctorCheck(name, "not installed", CheckResult.FAIL, REINSTALL)
         elif not requirement.specifier.contains(version, prereleases=True):
-            yield Check(name, f"{version}, but {requirement} is required", Verdict.FAIL, REINSTALL)
+            yield DoctorCheck(name, f"{version}, but {requirement} is required", CheckResult.FAIL, REINSTALL)
         elif (error := failures.get(_import_name(name))) is not None:
-            yield Check(name, f"{version} cannot be imported: {error}", Verdict.FAIL, REINSTALL)
+            yield DoctorCheck(name, f"{version} cannot be imported: {error}", CheckResult.FAIL, REINSTALL)
         else:
             n_valid += 1
             if pins.get(name, version) != version:
                 pin_deviations.append(f"{name} {version} (pinned {pins[name]})")
-    yield Check("dependencies", f"{n_valid} distributions have supported versions and can be imported")
+    yield DoctorCheck("dependencies", f"{n_valid} distributions have supported versions and can be imported")
     if pin_deviations:
-        yield Check("pinned versions", ", ".join(pin_deviations), Verdict.WARN, REINSTALL)
+        yield DoctorCheck("pinned versions", ", ".join(pin_deviations), CheckResult.WARN, REINSTALL)
 
 
 def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
@@ -249,56 +261,61 @@ def probe_backend(backend: str) -> Probe:
         return Probe(None, _failure_reason(process))
 
 
-def check_rendering(probes: Mapping[str, Probe]) -> Iterator[Check]:
+def check_rendering(probes: Mapping[str, Probe]) -> Iterator[DoctorCheck]:
     """Check each backend, and the backend that a campaign would use."""
     checks = {backend: _check_backend(backend, probe) for backend, probe in probes.items()}
     yield from checks.values()
-    working = [backend for backend, check in checks.items() if check.verdict is Verdict.OK]
+    working = [backend for backend, check in checks.items() if check.verdict is CheckResult.OK]
     selected_backend = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
     if selected_backend not in BACKENDS:
         finding = f"MARSYARD_GL is '{selected_backend}'; allowed: {', '.join(BACKENDS)}"
-        yield Check("GL backend in use", finding, Verdict.FAIL, "unset MARSYARD_GL")
+        yield DoctorCheck("GL backend in use", finding, CheckResult.FAIL, "unset MARSYARD_GL")
     elif selected_backend in working:
-        yield Check("GL backend in use", selected_backend)
+        yield DoctorCheck("GL backend in use", selected_backend)
     elif working:
         remedy = f"export MARSYARD_GL={working[0]}, or install {BACKENDS[selected_backend]}"
-        yield Check("GL backend in use", f"{selected_backend} does not work; {working[0]} works", Verdict.WARN, remedy)
+        yield DoctorCheck(
+            "GL backend in use", f"{selected_backend} does not work; {working[0]} works", CheckResult.WARN, remedy
+        )
     else:
-        yield Check(
-            "GL backend in use", "no backend works", Verdict.FAIL, f"sudo apt-get install {BACKENDS[selected_backend]}"
+        yield DoctorCheck(
+            "GL backend in use",
+            "no backend works",
+            CheckResult.FAIL,
+            f"sudo apt-get install {BACKENDS[selected_backend]}",
         )
 
 
-def _check_backend(backend: str, probe: Probe) -> Check:
+def _check_backend(backend: str, probe: Probe) -> DoctorCheck:
     name = f"GL: {backend}"
     remedy = f"sudo apt-get install {BACKENDS[backend]}"
     if probe.measurements is None:
-        return Check(name, probe.error, Verdict.WARN, remedy)
+        return DoctorCheck(name, probe.error, CheckResult.WARN, remedy)
     values = probe.measurements
     finding = f"{values['renderer']}, {values['version']}"
     error_m, offset = values["depth_error_m"], values["offset_px"]
     if not values["has_colour"] or error_m > gl_probe.DEPTH_TOLERANCE_M:
         problem = f"; wrong image: depth error of the test plane {error_m:.3g} m"
-        return Check(name, finding + problem, Verdict.WARN, "use the other backend, or another driver")
+        return DoctorCheck(name, finding + problem, CheckResult.WARN, "use the other backend, or another driver")
     finding += f"; depth error {error_m * 1e3:.2g} mm at {gl_probe.DISTANCE_M:.0f} m"
     if max(map(abs, offset)) > gl_probe.OFFSET_TOLERANCE_PX:
         pixels = f"({offset[0]:+.3f}, {offset[1]:+.3f}) px"
         finding += f"; pyrender samples depth {pixels} from the pixel centre; Marsyard at the centre"
-    return Check(name, finding)
+    return DoctorCheck(name, finding)
 
 
-def check_numba_cache() -> Check:
+def check_numba_cache() -> DoctorCheck:
     """Check that compiled kernels can be cached; without a cache, each process compiles them again."""
     with contextlib.suppress(ImportError):
         importlib.import_module("marsyard.sim")  # sets NUMBA_CACHE_DIR, unless the user has set it
     folder = Path(os.environ.get("NUMBA_CACHE_DIR", Path.home() / ".cache" / "numba"))
     if _is_writable(folder):
-        return Check("numba cache", f"{folder} is writable")
+        return DoctorCheck("numba cache", f"{folder} is writable")
     remedy = "export NUMBA_CACHE_DIR=FOLDER, where FOLDER is writable"
-    return Check("numba cache", f"cannot write to {folder}", Verdict.WARN, remedy)
+    return DoctorCheck("numba cache", f"cannot write to {folder}", CheckResult.WARN, remedy)
 
 
-def check_disk() -> Iterator[Check]:
+def check_disk() -> Iterator[DoctorCheck]:
     """Check the disk space for campaigns and for terrains."""
     yield _check_disk_space("disk, this folder", Path.cwd(), "free disk space, or choose another disk with --out")
     remedy = "export MARSYARD_CACHE=FOLDER, where FOLDER is writable and has free space"
@@ -307,20 +324,22 @@ def check_disk() -> Iterator[Check]:
 
         cache = cache_directory("terrain")
     except (ImportError, OSError) as error:
-        yield Check("disk, cache", str(error), Verdict.FAIL, remedy)
+        yield DoctorCheck("disk, cache", str(error), CheckResult.FAIL, remedy)
         return
     yield _check_disk_space("disk, cache", cache, remedy)
 
 
-def _check_disk_space(name: str, folder: Path, remedy: str) -> Check:
+def _check_disk_space(name: str, folder: Path, remedy: str) -> DoctorCheck:
     free = shutil.disk_usage(folder).free // BYTES_PER_MIB
     if not _is_writable(folder):
-        return Check(name, f"cannot write to {folder}", Verdict.FAIL, remedy)
-    verdict = Verdict.OK if free >= SUFFICIENT_DISK_MIB else Verdict.FAIL if free < MIN_DISK_MIB else Verdict.WARN
-    return Check(name, f"{free} MiB free in {folder}", verdict, "" if verdict is Verdict.OK else remedy)
+        return DoctorCheck(name, f"cannot write to {folder}", CheckResult.FAIL, remedy)
+    verdict = (
+        CheckResult.OK if free >= SUFFICIENT_DISK_MIB else CheckResult.FAIL if free < MIN_DISK_MIB else CheckResult.WARN
+    )
+    return DoctorCheck(name, f"{free} MiB free in {folder}", verdict, "" if verdict is CheckResult.OK else remedy)
 
 
-def check_machine() -> Check:
+def check_machine() -> DoctorCheck:
     """Check cores and memory of the machine or of its control group."""
     cores, limits = _count_cores(), [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     group_limit = Path("/sys/fs/cgroup/memory.max")
@@ -329,34 +348,36 @@ def check_machine() -> Check:
     memory = min(limits) // BYTES_PER_MIB
     finding = f"{cores} cores, {memory} MiB of memory"
     if memory < WORKER_MEMORY_MIB * cores:
-        return Check(
-            "cores and memory", finding, Verdict.WARN, f"run with --jobs {max(1, memory // WORKER_MEMORY_MIB)}"
+        return DoctorCheck(
+            "cores and memory", finding, CheckResult.WARN, f"run with --jobs {max(1, memory // WORKER_MEMORY_MIB)}"
         )
-    return Check("cores and memory", finding)
+    return DoctorCheck("cores and memory", finding)
 
 
-def check_threads(environment: Mapping[str, str], cores: int) -> Check:
+def check_threads(environment: Mapping[str, str], cores: int) -> DoctorCheck:
     """Check the thread counts in environment variables; more threads than cores slow down the workers."""
     counts = {name: environment[name] for name in THREAD_VARIABLES if environment.get(name)}
     finding = ", ".join(f"{name}={value}" for name, value in counts.items()) or "not set; the libraries decide"
     if any(not value.isdigit() or int(value) > cores for value in counts.values()):
-        return Check("threads", finding, Verdict.WARN, f"unset {' '.join(counts)}")
-    return Check("threads", finding)
+        return DoctorCheck("threads", finding, CheckResult.WARN, f"unset {' '.join(counts)}")
+    return DoctorCheck("threads", finding)
 
 
-def check_systems() -> Iterator[Check]:
+def check_systems() -> Iterator[DoctorCheck]:
     """Check the definitions of the systems under test, built in and plug-ins."""
     try:
         from marsyard.scenarios.systems import own_paths, registry
 
         (systems, problems), own_systems = registry(), len(own_paths())
     except ImportError as error:
-        yield Check("systems", f"cannot be read: {error}", Verdict.FAIL, REINSTALL)
+        yield DoctorCheck("systems", f"cannot be read: {error}", CheckResult.FAIL, REINSTALL)
         return
     others = ", ".join(system.name for system in systems[own_systems:])
-    yield Check("systems", f"{own_systems} built in; plug-ins: {others or 'none'}")
+    yield DoctorCheck("systems", f"{own_systems} built in; plug-ins: {others or 'none'}")
     for problem in problems:
-        yield Check("systems", problem, Verdict.WARN, "correct or uninstall the package that defines the system")
+        yield DoctorCheck(
+            "systems", problem, CheckResult.WARN, "correct or uninstall the package that defines the system"
+        )
 
 
 def _count_cores() -> int:

@@ -47,7 +47,7 @@ _LEGEND_BELOW: Mapping[str, Any] = {"loc": "upper center", "ncols": 2, "handlete
 
 
 @dataclass(frozen=True)
-class Category:
+class CaseCategory:
     """A category of cases: name, mask, colour and marker."""
 
     name: str
@@ -56,7 +56,7 @@ class Category:
     marker: str
 
 
-def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Category]:
+def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[CaseCategory]:
     """Divide the cases into categories: by a column of few values, else within and beyond the bound."""
     column = category_column(frame)
     if column is not None:
@@ -69,7 +69,7 @@ def categories(frame: pd.DataFrame, metric: str, bound: float | None) -> list[Ca
         names, masks = [name for name, mask in pairs if mask.any()], [mask for _, mask in pairs if mask.any()]
     else:
         names, masks = ["cases"], [np.ones(len(frame), dtype=np.bool_)]
-    return [Category(name, masks[index], SERIES[index], MARKERS[index]) for index, name in enumerate(names)]
+    return [CaseCategory(name, masks[index], SERIES[index], MARKERS[index]) for index, name in enumerate(names)]
 
 
 @in_page_style
@@ -288,7 +288,7 @@ def _finite_magnitudes(
 
 
 def _draw_points(
-    axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: Category, *, hollow: bool = False
+    axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: CaseCategory, *, hollow: bool = False
 ) -> None:
     is_dense = x.size > section.MAX_VECTOR_POINTS
     axes.plot(

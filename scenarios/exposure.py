@@ -96,7 +96,7 @@ def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.rando
 
 
 @dataclass(frozen=True)
-class Sample:
+class ImageSample:
     """An image and the truth of each pixel.
 
     - image: counts of `bits` bits, as delivered
@@ -127,7 +127,7 @@ def select_middle_rows(rows_summed: int) -> slice:
 class ProvidesSamples(Protocol):
     """A scenario that provides images with ground truth, to train and test learned methods."""
 
-    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
+    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[ImageSample]:
         """Yield the images of one case that `run` passes to its algorithms."""
 
 
@@ -228,10 +228,10 @@ def pixel_sample(
     camera: CameraModel,
     metadata: Mapping[str, Any],
     hazard: UInt8[np.ndarray, "rows columns"] | None = None,
-) -> Sample:
+) -> ImageSample:
     """Assemble an image and the truth of its pixels; `camera` is that of the delivered image."""
     rows = select_middle_rows(detector.rows_summed)
-    return Sample(
+    return ImageSample(
         image=counts,
         bits=detector.bits,
         range_m=frame.range_m[rows].astype(np.float32),

@@ -87,7 +87,7 @@ Matcher = Callable[[PairPatches], PairMatch | None]
 
 
 def find_common_square(
-    first: binning.View, second: binning.View, options: CommonOptions
+    first: binning.BinnedView, second: binning.BinnedView, options: CommonOptions
 ) -> tuple[Vector2, int, float] | None:
     """Find the largest square of ground inside both views at zero motion.
 
@@ -107,7 +107,7 @@ def find_common_square(
     return (lattice[row, column], side, gsd) if side >= options.min_side_px else None
 
 
-def rectify_pair(first: binning.View, second: binning.View, options: CommonOptions) -> PairPatches | None:
+def rectify_pair(first: binning.BinnedView, second: binning.BinnedView, options: CommonOptions) -> PairPatches | None:
     """Rectify both images of a pair over their largest common square; None if the square is too small."""
     square = find_common_square(first, second, options)
     return square and PairPatches(

@@ -36,7 +36,7 @@ _IMAGE_COUNT = 3
 
 
 @dataclass(frozen=True)
-class View:
+class BinnedView:
     """One binned image, and its camera's position above the ground plane.
 
     - signal: Counts above the offset, averaged over the pixels binned by software; not corrected
@@ -112,14 +112,14 @@ def build_view(
     world_from_body: Rotation,
     altitude_m: float,
     binned_size: tuple[int, int],
-    previous: View | None = None,
-) -> View:
+    previous: BinnedView | None = None,
+) -> BinnedView:
     """Bin an image and place its camera above the ground; with the calibration of `previous`, reuse its flat field."""
     columns, rows = bin_factors(image.counts.shape, binned_size)
     detector = image.calibration
     camera, centre = place_camera(image.camera.bin(columns, rows), world_from_body, altitude_m)
     shared_flat_field = previous.flat_field if previous is not None and previous.calibration is detector else None
-    return View(
+    return BinnedView(
         signal=bin_mean(image.counts.astype(np.float32), columns, rows) - np.float32(detector.offset_dn),
         flat_field=bin_mean(detector.flat_field, columns, rows) if shared_flat_field is None else shared_flat_field,
         camera=camera,
@@ -144,7 +144,9 @@ def altitudes_at_images(measurements: DescentMeasurements) -> Float[np.ndarray, 
     return np.asarray(altitudes_m + rates * (image_times_s - altitude_times_s))
 
 
-def build_views(measurements: DescentMeasurements, binned_size: tuple[int, int]) -> tuple[View, View, View] | None:
+def build_views(
+    measurements: DescentMeasurements, binned_size: tuple[int, int]
+) -> tuple[BinnedView, BinnedView, BinnedView] | None:
     """Build the views of the three images, each above its own ground plane.
 
     None if altitudes or times are not finite, times do not increase, or a height is outside `HEIGHT_RANGE_M`. Raises
@@ -156,7 +158,7 @@ def build_views(measurements: DescentMeasurements, binned_size: tuple[int, int])
     times = np.array([image.time_s for image in measurements.images])
     if not (np.all(np.isfinite(altitudes)) and np.all(np.isfinite(times)) and np.all(np.diff(times) > 0.0)):
         return None
-    views: list[View] = []
+    views: list[BinnedView] = []
     for image, attitude, altitude in zip(measurements.images, measurements.attitudes, altitudes, strict=True):
         previous = views[-1] if views else None
         views.append(build_view(image, attitude.world_from_body, float(altitude), binned_size, previous))
@@ -164,7 +166,7 @@ def build_views(measurements: DescentMeasurements, binned_size: tuple[int, int])
     return (views[0], views[1], views[2]) if in_range else None
 
 
-def ground_from_pixels(view: View, pixels: Points2, max_off_nadir_rad: float) -> tuple[Points2, Flags]:
+def ground_from_pixels(view: BinnedView, pixels: Points2, max_off_nadir_rad: float) -> tuple[Points2, Flags]:
     """Intersect the rays of pixels (u, v) with the ground: (east, north) in the ground frame, metres.
 
     A ray farther from the nadir than `max_off_nadir_rad` is replaced by the ray at that angle with the same azimuth.
@@ -181,7 +183,7 @@ def ground_from_pixels(view: View, pixels: Points2, max_off_nadir_rad: float) ->
 
 
 def pixels_from_ground(
-    view: View, ground: Float[np.ndarray, "*shape 2"]
+    view: BinnedView, ground: Float[np.ndarray, "*shape 2"]
 ) -> tuple[Float[np.ndarray, "*shape 2"], Bool[np.ndarray, "*shape"]]:
     """Project ground points (east, north) to pixels (u, v), also outside the frame; False where projection fails."""
     points = np.zeros((*ground.shape[:-1], 3))
@@ -191,7 +193,7 @@ def pixels_from_ground(
 
 
 def inside_frame(
-    view: View, ground: Float[np.ndarray, "*shape 2"], border_px: float, max_off_nadir_rad: float
+    view: BinnedView, ground: Float[np.ndarray, "*shape 2"], border_px: float, max_off_nadir_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points lie at least `border_px` inside the image and within the off-nadir limit; False for NaN."""
     pixels, visible = pixels_from_ground(view, ground)
@@ -200,7 +202,7 @@ def inside_frame(
     return np.asarray(visible & in_frame & (off_nadir <= np.tan(max_off_nadir_rad)))
 
 
-def pixel_angle_rad(view: View) -> float:
+def pixel_angle_rad(view: BinnedView) -> float:
     """Mean angle of one pixel along columns and rows at the image centre."""
     centre = (np.array(view.size) - 1) / 2.0
     _, directions = view.camera.rays(centre + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
@@ -224,7 +226,7 @@ def square_outline(half_m: float, per_side: int) -> Points2:
 MIN_RESPONSE = 0.02
 
 
-def correct_patch(view: View, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:
+def correct_patch(view: BinnedView, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:
     """Correct part of a view for the frame-transfer smear and the flat field, counts, float64."""
     exposure_signal = remove_frame_transfer(view.signal[:, columns], view.calibration, view.rows_summed)
     return np.asarray(exposure_signal[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
@@ -251,7 +253,7 @@ def _pixel_range(smallest: float, largest: float, size: int) -> slice:
 
 
 def homography_lattice(
-    view: View, lattice: Float[np.ndarray, "side side 2"]
+    view: BinnedView, lattice: Float[np.ndarray, "side side 2"]
 ) -> tuple[Float[np.ndarray, "side side 2"], Bool[np.ndarray, "side side"]]:
     """Map a lattice of ground points to pixels by the homography of its corners, which are projected exactly.
 
@@ -270,7 +272,7 @@ def homography_lattice(
 
 
 def rectify_patch(
-    view: View, centre: Vector2, side_px: int, gsd_m: float, *, full_camera: bool = True
+    view: BinnedView, centre: Vector2, side_px: int, gsd_m: float, *, full_camera: bool = True
 ) -> Float[np.ndarray, "side side"]:
     """Rectify and correct a patch of `side_px` pixels around the ground point `centre` (east, north), counts.
 

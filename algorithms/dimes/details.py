@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import View, ground_from_pixels, pixels_from_ground
+from marsyard.algorithms.dimes.binning import BinnedView, ground_from_pixels, pixels_from_ground
 from marsyard.algorithms.dimes.tilt import GroundFit
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
 
@@ -69,7 +69,7 @@ class PairDetails:
     gsd_m: float
     candidates: int
     tracks: tuple[DimesTrack, ...]
-    views: tuple[View, View]
+    views: tuple[BinnedView, BinnedView]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
-from marsyard.algorithms.dimes.binning import View, build_views, pixels_from_ground, rectify_patch
+from marsyard.algorithms.dimes.binning import BinnedView, build_views, pixels_from_ground, rectify_patch
 from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
@@ -48,7 +48,9 @@ def camera_displacement(corner: Vector2, geometry: overlap.SearchGeometry) -> Ve
     return np.asarray(geometry.gsd_m * np.array([-shift[1], shift[0]]))
 
 
-def track_pair(pair: int, first: View, second: View, sun_direction: Vector3, options: DimesOptions) -> PairDetails:
+def track_pair(
+    pair: int, first: BinnedView, second: BinnedView, sun_direction: Vector3, options: DimesOptions
+) -> PairDetails:
     """Select and track the templates of one pair of views."""
     geometry = overlap.search_geometry(first, second, options)
     candidates = overlap.template_candidates(first, second, geometry, sun_direction, options)

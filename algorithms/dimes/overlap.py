@@ -50,7 +50,7 @@ class SearchGeometry:
         return 0.5 * self.window_px * self.gsd_m
 
 
-def search_geometry(first: binning.View, second: binning.View, options: DimesOptions) -> SearchGeometry:
+def search_geometry(first: binning.BinnedView, second: binning.BinnedView, options: DimesOptions) -> SearchGeometry:
     """Compute the sizes of template and search window from the second view, the image interval and the options."""
     gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
     max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
@@ -66,7 +66,7 @@ def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
     return np.column_stack([column_fractions * (size[0] - 1.0), row_fractions * (size[1] - 1.0)])
 
 
-def overlap_polygon(first: binning.View, second: binning.View, options: DimesOptions) -> Points2:
+def overlap_polygon(first: binning.BinnedView, second: binning.BinnedView, options: DimesOptions) -> Points2:
     """Project the second view's border into the first view at zero horizontal motion.
 
     Returns pixels (u, v) in order along the border, without invisible points.
@@ -88,7 +88,7 @@ def anti_solar_direction(sun_direction: Vector3) -> Vector3:
     return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
 
 
-def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
+def zero_phase_pixel(view: binning.BinnedView, sun_direction: Vector3) -> Vector2:
     """Pixel (u, v) of the centre of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
     # a point at 10 000 km represents infinity
     pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
@@ -96,7 +96,7 @@ def zero_phase_pixel(view: binning.View, sun_direction: Vector3) -> Vector2:
 
 
 def outside_zero_phase(
-    view: binning.View, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
+    view: binning.BinnedView, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
 ) -> Bool[np.ndarray, "*shape"]:
     """Whether ground points (east, north) are farther than `radius_rad` from the anti-solar direction."""
     spot = anti_solar_direction(sun_direction)
@@ -107,7 +107,7 @@ def outside_zero_phase(
 
 
 def overlap_width_m(
-    first: binning.View, second: binning.View, gsd_m: float, sun_direction: Vector3, options: DimesOptions
+    first: binning.BinnedView, second: binning.BinnedView, gsd_m: float, sun_direction: Vector3, options: DimesOptions
 ) -> float:
     """Compute the diameter of the largest circle of ground in both views at zero motion, outside the zero-phase spot.
 
@@ -148,7 +148,11 @@ class Candidates:
 
 
 def template_candidates(
-    first: binning.View, second: binning.View, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
+    first: binning.BinnedView,
+    second: binning.BinnedView,
+    geometry: SearchGeometry,
+    sun_direction: Vector3,
+    options: DimesOptions,
 ) -> Candidates:
     """Find all feasible template positions on the coarse grid.
 
@@ -162,7 +166,7 @@ def template_candidates(
     visible &= width_m >= geometry.max_displacement_m
     pixels, ground = pixels[visible], ground[visible]
 
-    def fits(view: binning.View, half_m: float) -> Flags:
+    def fits(view: binning.BinnedView, half_m: float) -> Flags:
         outline = binning.square_outline(half_m, 3)
         return np.asarray(binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1))
 
@@ -171,7 +175,7 @@ def template_candidates(
     feasible = fits(first, geometry.template_half_m)
     pixels, ground = pixels[feasible], ground[feasible]
 
-    def is_outside_spot(view: binning.View, half_m: float, per_side: int) -> Flags:
+    def is_outside_spot(view: binning.BinnedView, half_m: float, per_side: int) -> Flags:
         points = ground[:, None] + binning.square_lattice(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
@@ -184,7 +188,7 @@ def template_candidates(
 
 
 def searchable_positions(
-    second: binning.View, centre: Vector2, geometry: SearchGeometry, options: DimesOptions
+    second: binning.BinnedView, centre: Vector2, geometry: SearchGeometry, options: DimesOptions
 ) -> Bool[np.ndarray, "s s"]:
     """Whether the second view shows the complete template at each position of the search around `centre` (ground)."""
     lattice = binning.ground_lattice(centre, geometry.window_px, geometry.gsd_m)
@@ -197,7 +201,7 @@ def searchable_positions(
 MIN_SIGNAL_FRACTION = 0.01
 
 
-def template_contrasts(view: binning.View, pixels: Points2, support: int) -> Vector:
+def template_contrasts(view: binning.BinnedView, pixels: Points2, support: int) -> Vector:
     """Harris interest over squares of `support` pixels around whole pixels (u, v), divided by their mean signal.
 
     The image is not corrected: the frame-transfer smear is smooth along columns and its effect is negligible.
@@ -228,7 +232,7 @@ def best_candidates(
 
 
 def select_templates(
-    view: binning.View, candidates: Candidates, options: DimesOptions
+    view: binning.BinnedView, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
     contrasts, pixels = template_contrasts(view, candidates.pixels, options.template_px), candidates.pixels

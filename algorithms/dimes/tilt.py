@@ -58,7 +58,11 @@ class GroundTracks:
 
 
 def track_grid(
-    first: binning.View, second: binning.View, velocity_m_s: Vector2, sun_direction: Vector3, options: DimesOptions
+    first: binning.BinnedView,
+    second: binning.BinnedView,
+    velocity_m_s: Vector2,
+    sun_direction: Vector3,
+    options: DimesOptions,
 ) -> GroundTracks:
     """Track a grid of templates on the common ground, from the positions that a velocity (east, north) predicts.
 
@@ -100,7 +104,7 @@ def track_grid(
 
 
 def _is_usable(
-    view: binning.View, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions
+    view: binning.BinnedView, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions
 ) -> Flags:
     """Whether templates around ground points lie in a view and outside of its zero-phase spot."""
     outline = binning.square_outline((0.5 * options.grid_template_px + MARGIN_PX) * gsd_m, 3)

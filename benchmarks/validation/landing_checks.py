@@ -11,8 +11,8 @@ from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
 from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.landing.flight import Flight
-from marsyard.scenarios.landing.images import GroundTruth, World, measure, take_images
+from marsyard.scenarios.landing.flight import LandingFlight
+from marsyard.scenarios.landing.images import GroundTruth, LandingWorld, measure, take_images
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
@@ -82,8 +82,8 @@ def simulate_errors(number: int) -> dict[str, dict[str, Scalar]]:
     """Simulate the errors of one image pair with both sets of options; the sites alternate."""
     streams = Streams(SEED, "landing checks", number)
     parameters = draw_exact_parameters(SITES[number % len(SITES)], streams.generator("pair"))
-    world = World.from_parameters(parameters)
-    flight = Flight.from_parameters(parameters, world.ground.surface, streams)
+    world = LandingWorld.from_parameters(parameters)
+    flight = LandingFlight.from_parameters(parameters, world.ground.surface, streams)
     pair = take_images(parameters, world, flight, camera_optics(parameters.optics), streams)
     measurements = measure(parameters, flight, pair, streams)
     truth = GroundTruth.from_images(world, flight, pair, parameters.lander.limits)

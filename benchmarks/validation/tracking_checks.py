@@ -18,7 +18,7 @@ from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import Run, run_case
+from marsyard.scenarios.rover.run import RoverRun, run_case
 from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score_run
 from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
@@ -149,7 +149,7 @@ def _simulate_designation(number: int, camera: str) -> tuple[float, float] | Non
     return error, _expected_range_error_m(run, float(row["disparity_error_start_px"]))
 
 
-def _range_error_m(run: Run) -> float:
+def _range_error_m(run: RoverRun) -> float:
     """First reported position minus the designated point, along the line of sight."""
     stop = run.stops[0]
     eye = stop.stance.world_from_rover.inv().apply(run.rig.camera_positions(stop.world_from_head)[0])
@@ -157,7 +157,7 @@ def _range_error_m(run: Run) -> float:
     return float(stop.error_m() @ line_of_sight)
 
 
-def _expected_range_error_m(run: Run, disparity_error_px: float) -> float:
+def _expected_range_error_m(run: RoverRun, disparity_error_px: float) -> float:
     """Compute the range error of the first pair by Eq. 1 of the tracking paper, metres."""
     rig = run.rig.calibrated
     return stereo_range_error_m(run.stops[0].range_m, disparity_px_m(rig.left, rig.right), 1.0, disparity_error_px)

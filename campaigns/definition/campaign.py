@@ -26,8 +26,8 @@ from marsyard.campaigns.sampling.design import (
     locate_case,
 )
 from marsyard.campaigns.sampling.dispersion import Dispersion
-from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, Grid, Normal
-from marsyard.campaigns.sampling.points import Point, transform_to_uniform
+from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, GridDispersion, Normal
+from marsyard.campaigns.sampling.points import StudyPoint, transform_to_uniform
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.interface import Scenario
 from marsyard.sim.parameters import stream_name
@@ -73,7 +73,7 @@ class Campaign:
         """Create the random streams of a case."""
         return Streams(seed=self.configuration.seed, campaign=self.configuration.name, case=case)
 
-    def streams_at(self, point: Point) -> Streams:
+    def streams_at(self, point: StudyPoint) -> Streams:
         """Create the random streams of a case at a point of a study."""
         return replace(self.streams(point.stream), blend=point.blend)
 
@@ -85,7 +85,7 @@ class Campaign:
         """
         return self._evaluate(self.probabilities(case), case)
 
-    def draws_at(self, point: Point) -> dict[str, Any]:
+    def draws_at(self, point: StudyPoint) -> dict[str, Any]:
         """Compute the values of the dispersions at a point of a study. Raises ValueError like `draws`."""
         uniform = transform_to_uniform(point.coordinates, self.drawn_paths, self.configuration.correlations)
         return self._evaluate(uniform, point.stream, point.nominal)
@@ -160,7 +160,9 @@ class Campaign:
     def drawn_paths(self) -> tuple[str, ...]:
         """Paths of the dispersions that use a random number, in the order of the file."""
         dispersions = self.configuration.dispersions.items()
-        return tuple(path for path, item in dispersions if not isinstance(item, Grid | Fixed | Derived | CyclicInteger))
+        return tuple(
+            path for path, item in dispersions if not isinstance(item, GridDispersion | Fixed | Derived | CyclicInteger)
+        )
 
     @cached_property
     def cyclic_paths(self) -> tuple[str, ...]:
@@ -189,7 +191,7 @@ class Campaign:
         """Create the parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
         return self.with_values(self.draws(case))
 
-    def parameters_at(self, point: Point) -> BaseModel:
+    def parameters_at(self, point: StudyPoint) -> BaseModel:
         """Create the parameters of a case at a point of a study. Raises ValueError like `parameters`."""
         return self.with_values(self.draws_at(point), point.removed)
 

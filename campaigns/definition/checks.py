@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.configuration import POPULATIONS, Key, Requir
 from marsyard.campaigns.definition.identity import list_algorithms
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
-from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
+from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
 from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag, row_columns
 from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasParts
@@ -71,8 +71,8 @@ def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
     dispersions = campaign.configuration.dispersions
     problems: list[tuple[Key, str]] = []
     for path, dispersion in dispersions.items():
-        has_values = not isinstance(dispersion, Grid) or dispersion.values is not None
-        allows_tables = isinstance(dispersion, Choice | Fixed | Grid) and has_values
+        has_values = not isinstance(dispersion, GridDispersion) or dispersion.values is not None
+        allows_tables = isinstance(dispersion, Choice | Fixed | GridDispersion) and has_values
         if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
             problems.append((("dispersions", path), _describe_unknown(path, parameters)))
         elif path not in parameters and not allows_tables:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from marsyard.campaigns.errors import ConfigurationError, Problem, suggest_similar
 from marsyard.campaigns.sampling.design import Correlation, Design
-from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, Grid, Normal
+from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, GridDispersion, Normal
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters, list_alternatives, list_models
 
@@ -111,7 +111,7 @@ class Retain(Parameters):
     )
 
 
-class Limits(Parameters):
+class CaseLimits(Parameters):
     """Limits of one case. A case that exceeds a limit is terminated; its outcome identifies the limit."""
 
     case_time_s: _PositiveNumber = Field(default=600.0, description="wall-clock time of a case")
@@ -133,7 +133,7 @@ class CalibrationRun(Parameters):
     note: str = ""
 
 
-class Calibration(Parameters):
+class CalibrationRuns(Parameters):
     """Results that determined options of the algorithm; results on the same campaign and seed cannot be PASS."""
 
     runs: Annotated[tuple[CalibrationRun, ...], Field(strict=False)] = ()
@@ -153,8 +153,8 @@ class CampaignConfiguration(Parameters):
     correlations: tuple[Correlation, ...] = ()
     requirements: tuple[Requirement, ...] = ()
     retain: Retain = Retain()
-    limits: Limits = Limits()
-    calibration: Calibration | None = None
+    limits: CaseLimits = CaseLimits()
+    calibration: CalibrationRuns | None = None
     max_cases: _Cases | None = Field(
         default=None,
         description="cases at the last planned evaluation of a campaign that stops when its verdicts are decided; set "
@@ -178,9 +178,9 @@ class CampaignConfiguration(Parameters):
         return self
 
     @property
-    def grids(self) -> dict[str, Grid]:
+    def grids(self) -> dict[str, GridDispersion]:
         """Swept dispersions, in the order of the file."""
-        return {path: item for path, item in self.dispersions.items() if isinstance(item, Grid)}
+        return {path: item for path, item in self.dispersions.items() if isinstance(item, GridDispersion)}
 
     @property
     def grid_size(self) -> int:

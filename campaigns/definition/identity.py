@@ -24,7 +24,7 @@ from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits, parse_comma
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.configuration import CampaignConfiguration
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.sampling.dispersions import Choice, Fixed, Grid
+from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
 from marsyard.scenarios.estimators import algorithm_sources, custom_path, describe_custom
 from marsyard.scenarios.imports import relative_to, source_files
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
@@ -95,7 +95,9 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
     except ValidationError as error:
         reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors(include_url=False))
         raise CampaignError(f"the campaign's parameters are no longer valid: {reasons}") from error
-    dispersions = [item for item in configuration.dispersions.values() if isinstance(item, Choice | Fixed | Grid)]
+    dispersions = [
+        item for item in configuration.dispersions.values() if isinstance(item, Choice | Fixed | GridDispersion)
+    ]
     values = [value for item in dispersions for extreme in item.extremes() for _, value in leaves(extreme)]
     hashes: dict[str, str] = {}
     for name in dict.fromkeys((*input_files(parameters), *(value for value in values if isinstance(value, str)))):

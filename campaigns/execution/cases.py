@@ -16,12 +16,12 @@ from typing import Any
 
 from marsyard.algorithms.faults import describe_error
 from marsyard.campaigns.definition.campaign import Campaign, leaves
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, Requirement
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, CaseLimits, Requirement
 from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
-from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, recording_timelines
@@ -68,7 +68,9 @@ def create_loader(configuration: CampaignConfiguration) -> Callable[[], object]:
     return partial(_load_campaign, configuration_text(configuration))
 
 
-def run_case(configuration: str, selection: ProductSelection, points: Mapping[int, Point], case: int) -> CompletedCase:
+def run_case(
+    configuration: str, selection: ProductSelection, points: Mapping[int, StudyPoint], case: int
+) -> CompletedCase:
     """Run one case of the campaign of a `configuration_text`; the row of a failed case contains its exception.
 
     - selection: decides whether the products of the case are returned with the row
@@ -119,7 +121,7 @@ def run_cases(
     *,
     selection: ProductSelection,
     total: int | None = None,
-    points: Mapping[int, Point] = MappingProxyType({}),
+    points: Mapping[int, StudyPoint] = MappingProxyType({}),
 ) -> Iterator[list[CompletedCase]]:
     """Run cases; yield the results as the cases end, including cases whose worker died or was terminated.
 
@@ -146,13 +148,15 @@ def run_cases(
         yield completed_cases
 
 
-def work_limits(limits: Limits, time_s: float) -> WorkLimits:
+def work_limits(limits: CaseLimits, time_s: float) -> WorkLimits:
     """Create the limits of one case, or of the preparation of one shared input, with a time limit in seconds."""
     memory = None if limits.memory_gb is None else limits.memory_gb * 1e9
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
-def _build_terminated_row(configuration: CampaignConfiguration, result: TaskResult[Any], point: Point | None) -> Row:
+def _build_terminated_row(
+    configuration: CampaignConfiguration, result: TaskResult[Any], point: StudyPoint | None
+) -> Row:
     """Create the row of a case whose process ended early, with the sampled values of the case."""
     case, error, draws = result.item, result.error, {}
     campaign = Campaign(configuration, scenario(configuration.scenario))

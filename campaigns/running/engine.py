@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Limits, key_text
+from marsyard.campaigns.definition.configuration import CampaignConfiguration, CaseLimits, key_text
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
@@ -151,7 +151,7 @@ def resume_campaign(
         _reject_study(directory, configuration)
         if case_time_s is not None:
             try:
-                limits = Limits.model_validate({**configuration.limits.model_dump(), "case_time_s": case_time_s})
+                limits = CaseLimits.model_validate({**configuration.limits.model_dump(), "case_time_s": case_time_s})
             except ValidationError as error:
                 raise CampaignError(f"--case-time {case_time_s}: {error.errors()[0]['msg'].lower()}") from error
             configuration = configuration.model_copy(update={"limits": limits})

@@ -178,7 +178,7 @@ def _compile_item(compilations: Sequence[tuple[str, str, tuple[str, ...]]], numb
 
 
 @dataclass(frozen=True)
-class Estimate:
+class CampaignEstimate:
     """Estimated time and disk space of a campaign.
 
     - trials, unfinished: number of trial cases, and number of these that did not finish
@@ -202,7 +202,7 @@ class Estimate:
     products_bytes: float
 
 
-def estimate_campaign(campaign: Campaign, jobs: int) -> Estimate:
+def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
     """Estimate a campaign from evenly spaced trial cases in one worker; only their shared inputs remain on disk."""
     configuration, total = campaign.configuration, campaign.configuration.total_cases
     plan = plan_inputs(campaign, range(total))
@@ -229,7 +229,7 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> Estimate:
     # the number of failed cases is unknown before the campaign, so the upper bound (all cases) is used
     stored_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
     products = min(total, stored_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
-    return Estimate(
+    return CampaignEstimate(
         trials=len(trials),
         unfinished=sum(trial.row["outcome"] in ENGINE_FAILURES for trial in trials),
         case_s=case_s,

@@ -17,7 +17,7 @@ from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import Executor, Work, WorkLimits, accept_process_state
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
-from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import check_origin, check_rows
 from marsyard.campaigns.store.products import ALL_PRODUCTS, REPLAYED_PRODUCTS, PackedProducts
@@ -86,7 +86,7 @@ def replay_in_executor(
     timeline: whether the products contain the timeline of the case
     """
     text = None if stored is None else stored.get(POINT_COLUMN)
-    points = {case: Point.read(text)} if isinstance(text, str) else {}
+    points = {case: StudyPoint.read(text)} if isinstance(text, str) else {}
     selection = REPLAYED_PRODUCTS if timeline else ALL_PRODUCTS
     ((completed,),) = run_cases(executor, configuration, [case], selection=selection, points=points)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
@@ -133,7 +133,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
-def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject:
+def create_subject(spec: str, task: str | None, limit_s: float) -> suite.TestedAlgorithm:
     """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
     limit_s: time limit of one answer
@@ -147,10 +147,10 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> suite.Subject
         suite.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return suite.Subject(spec, task_name, limit_s)
+    return suite.TestedAlgorithm(spec, task_name, limit_s)
 
 
-def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
+def run_conformance_checks(subject: suite.TestedAlgorithm) -> Iterator[suite.Finding]:
     """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
     # the time limit of an answer, the same time for the other work of the check, and 5 s
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
@@ -178,7 +178,7 @@ def run_conformance_checks(subject: suite.Subject) -> Iterator[suite.Finding]:
                 return
 
 
-def _load_subject(subject: suite.Subject) -> None:
+def _load_subject(subject: suite.TestedAlgorithm) -> None:
     """Load and compile the subject of conformance checks in a worker."""
     subject.prepare()
     accept_process_state()

@@ -108,7 +108,7 @@ class Derived(base.Dispersion):
         return base.read_interval(self.formula, self.formula)
 
 
-class Grid(_Levels):
+class GridDispersion(_Levels):
     """Levels of a full factorial: every combination of the levels of all grids occurs equally often.
 
     Either `values`, or the range from `low` to `high`, both included, with a number of `levels` or a `step`.
@@ -333,7 +333,7 @@ _Dispersion = (
     | Annotated[CyclicInteger, Tag("in-turn")]
     | Annotated[Fixed, Tag("fixed")]
     | Annotated[Derived, Tag("derived")]
-    | Annotated[Grid, Tag("grid")]
+    | Annotated[GridDispersion, Tag("grid")]
     | Annotated[Scipy, Tag("scipy")]
 )
 #: Distributions implemented in this module; any other name is looked up in `scipy.stats`.

@@ -23,7 +23,7 @@ POINT_COLUMN = "standard_point"
 
 
 @dataclass(frozen=True)
-class Point:
+class StudyPoint:
     """A case as a point in standard normal space.
 
     - coordinates: independent standard normal numbers of the random dispersions, in the order of the campaign file

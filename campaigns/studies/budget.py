@@ -148,7 +148,7 @@ def start_budget(
     n_cases = settings.cases * len(list_configurations(sources)) if sources else 0
     n_cases += settings.sobol * (len(campaign.drawn_paths) + 3) if settings.sobol else 0
     session = StudySession(
-        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, settings, runner).run(observer)
     )
     return start_study(campaign, n_cases, directory, session, {"kind": KIND, **asdict(settings)})
 
@@ -160,7 +160,7 @@ def continue_budget(directory: Path, executor: ExecutorConfig, observer: Progres
         raise CampaignError(f"{directory} does not contain an error budget (marsyard budget)")
     settings = BudgetSettings(**{name: study[name] for name in BudgetSettings.__dataclass_fields__})
     session = StudySession(
-        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, settings, runner).run(observer)
     )
     return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
 
@@ -194,7 +194,7 @@ def list_configurations(sources: Sequence[ScenarioSource]) -> list[Configuration
     ]
 
 
-class _Study:
+class _BudgetStudy:
     """A running error budget."""
 
     def __init__(self, campaign: Campaign, settings: BudgetSettings, runner: PointRunner) -> None:

@@ -134,7 +134,7 @@ def start_rare(
     """
     check_margin(find_requirement(campaign, settings.requirement))
     session = StudySession(
-        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _RareStudy(campaign, settings, runner).run(observer)
     )
     total_cases = max_cases + sum(settings.random_cases)
     return start_study(campaign, total_cases, directory, session, {"kind": KIND, **asdict(settings)})
@@ -163,12 +163,12 @@ def continue_rare(
             settings, replicates=(*settings.replicates, replicates), random_cases=(*settings.random_cases, random_cases)
         )
     session = StudySession(
-        executor, observer, lambda campaign, runner: _Study(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _RareStudy(campaign, settings, runner).run(observer)
     )
     return continue_study(directory, session, {"kind": KIND, **asdict(settings)}, random_cases)
 
 
-class _Study:
+class _RareStudy:
     """State of a running study: number of violations, independent cases, and random cases that are not yet run."""
 
     def __init__(self, campaign: Campaign, settings: RareSettings, runner: PointRunner) -> None:

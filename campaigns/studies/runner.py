@@ -27,8 +27,8 @@ from marsyard.campaigns.running.engine import ProgressObserver, check_metrics, p
 from marsyard.campaigns.running.preparation import compile_kernels
 from marsyard.campaigns.running.replay import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
-from marsyard.campaigns.sampling.dispersions import CyclicInteger, Grid
-from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion
+from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.lock import folder_lock
@@ -73,7 +73,7 @@ class CaseLimitError(Exception):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.points.Point`).
+    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.points.StudyPoint`).
 
     - coordinates: standard normal numbers of the random dispersions
     - stream: number of the case's random streams; None for new streams
@@ -88,11 +88,11 @@ class Candidate:
     removed: tuple[str, ...] = ()
     blend: Blend = ()
 
-    def point(self, case: int) -> Point:
+    def point(self, case: int) -> StudyPoint:
         """Return the point of the candidate as a case; new streams have the number of the case."""
         stream = case if self.stream is None else self.stream
         blend = tuple((case if number == NEW_STREAM else number, weight) for number, weight in self.blend)
-        return Point(self.coordinates, stream, self.nominal, self.removed, blend)
+        return StudyPoint(self.coordinates, stream, self.nominal, self.removed, blend)
 
 
 class PointRunner:
@@ -168,7 +168,7 @@ def prepare_campaign(campaign: Campaign, max_cases: int) -> Campaign:
     configuration = campaign.configuration
     for path, dispersion in configuration.dispersions.items():
         remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
-        if isinstance(dispersion, Grid):
+        if isinstance(dispersion, GridDispersion):
             raise CampaignError(f"dispersions.{path}: is a distribution 'grid', which has no probabilities; {remedy}")
         if isinstance(dispersion, CyclicInteger):
             inputs = {name: value_at(configuration.parameters, name) for name in dispersion.names}

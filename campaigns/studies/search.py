@@ -30,7 +30,7 @@ from marsyard.campaigns.definition.margins import compute_margin, describe_margi
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver
-from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -88,7 +88,7 @@ class SearchSettings:
 
 
 @dataclass(frozen=True)
-class Failure:
+class FoundFailure:
     """A reduced violation.
 
     - case: number of the reduced case; original_case: number of the case before the reduction
@@ -120,7 +120,7 @@ class SearchResult:
     - first_violation: number of cases up to the first violation; None without a violation
     """
 
-    failures: tuple[Failure, ...]
+    failures: tuple[FoundFailure, ...]
     search_cases: int
     cases: int
     violations: int
@@ -136,11 +136,11 @@ class SearchResult:
 
 
 @dataclass
-class _Evaluated:
+class _EvaluatedPoint:
     """An evaluated case: its number, point, margin and outcome."""
 
     case: int
-    point: Point
+    point: StudyPoint
     margin: float
     outcome: str
 
@@ -183,12 +183,12 @@ class SearchStudy:
     def __init__(self, campaign: Campaign, settings: SearchSettings, runner: PointRunner) -> None:
         self.campaign, self.settings, self.runner = campaign, settings, runner
         self._requirement: Requirement = find_requirement(campaign, settings.requirement)
-        self._evaluated: list[_Evaluated] = []
+        self._evaluated: list[_EvaluatedPoint] = []
 
     def run(self, observer: ProgressObserver) -> SearchResult:
         """Search and reduce; a limit of cases ends the study with the failures so far."""
         observer.begin("search", self.settings.cases)
-        failures: list[Failure] = []
+        failures: list[FoundFailure] = []
         reason = ""
         n_searched = violations = 0
         try:
@@ -215,14 +215,14 @@ class SearchStudy:
             reason,
         )
 
-    def _evaluate(self, candidates: Sequence[Candidate]) -> list[_Evaluated]:
+    def _evaluate(self, candidates: Sequence[Candidate]) -> list[_EvaluatedPoint]:
         """Run cases, and add them to the evaluated cases of the study."""
         first = self.runner.n_cases
         rows = self.runner.run(candidates)
         new_cases = [
-            _Evaluated(
+            _EvaluatedPoint(
                 first + index,
-                Point.read(str(row[POINT_COLUMN])),
+                StudyPoint.read(str(row[POINT_COLUMN])),
                 compute_margin(row, self._requirement),
                 str(row["outcome"]),
             )
@@ -286,7 +286,7 @@ class SearchStudy:
                 break
         return starts
 
-    def _reduce_all(self, violating_cases: list[_Evaluated], failures: list[Failure]) -> None:
+    def _reduce_all(self, violating_cases: list[_EvaluatedPoint], failures: list[FoundFailure]) -> None:
         """Reduce the most likely violation, remove those with the same cause, and repeat with the others.
 
         failures: receives the reduced violations, also those before a CaseLimitError
@@ -320,7 +320,7 @@ class SearchStudy:
             repetition = Candidate(reduction.point.coordinates, None, reduction.point.nominal)
             repetitions = self._evaluate([repetition] * self.settings.repetitions)
             failures.append(
-                Failure(
+                FoundFailure(
                     reduction.case,
                     first.case,
                     reduction.margin,
@@ -333,7 +333,7 @@ class SearchStudy:
                 )
             )
 
-    def _remove_dispersions(self, failure: _Evaluated) -> _Evaluated:
+    def _remove_dispersions(self, failure: _EvaluatedPoint) -> _EvaluatedPoint:
         """Reset groups of dispersions to the campaign's parameters, as long as the case remains a violation."""
         paths = [path for path in self.campaign.drawn_paths if path not in failure.point.nominal]
         group_count = 2
@@ -356,7 +356,7 @@ class SearchStudy:
                 group_count = min(2 * group_count, len(paths))
         return failure
 
-    def _shrink(self, failure: _Evaluated) -> _Evaluated:
+    def _shrink(self, failure: _EvaluatedPoint) -> _EvaluatedPoint:
         """Bisect each remaining coordinate towards its median, as long as the case remains a violation."""
         for index, path in enumerate(self.campaign.drawn_paths):
             if path in failure.point.nominal:

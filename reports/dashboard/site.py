@@ -32,7 +32,7 @@ _FORMATTERS = {"margin": margin_text, "basis": basis_text, "evidence": evidence_
 
 
 @dataclass(frozen=True)
-class Site:
+class DashboardSite:
     """A written site: its index page, the number of campaigns, and messages about omitted campaigns."""
 
     index: Path
@@ -40,7 +40,9 @@ class Site:
     problems: Sequence[str]
 
 
-def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, SharedRequirement] | None = None) -> Site:
+def write_site(
+    directory: Path, sources: Sequence[Path], shared: Mapping[str, SharedRequirement] | None = None
+) -> DashboardSite:
     """Write the dashboard of all campaigns in or below the folders `sources`.
 
     `shared` contains the requirements that campaigns reference by id; None for those installed with Marsyard.
@@ -76,7 +78,7 @@ def write_site(directory: Path, sources: Sequence[Path], shared: Mapping[str, Sh
     )
     write_atomic(directory / INDEX, index)
     write_atomic(directory / VERIFICATION_FILE, _create_traceability_csv(rows))
-    return Site(directory / INDEX, len(entries), problems)
+    return DashboardSite(directory / INDEX, len(entries), problems)
 
 
 def read_script() -> str:

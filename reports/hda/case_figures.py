@@ -170,7 +170,7 @@ def draw_maps(products: Products) -> Figure:
     return figure
 
 
-def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, truth: stages.GroundTruth) -> None:
+def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, truth: stages.StoredGroundTruth) -> None:
     colour_scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
     map_axes.imshow(maps.safety, interpolation="nearest", **colour_scale)
     # hazards (2) are also hatched, since colour must not be the only distinction

@@ -86,7 +86,7 @@ class LandingMaps:
 
 
 @dataclass(frozen=True)
-class GroundTruth:
+class StoredGroundTruth:
     """Ground truth on its sampling grid.
 
     - offset_from_nadir_m: world (x, y) relative to the camera's true nadir point
@@ -164,7 +164,7 @@ def read_landing_maps(products: Mapping[str, Any]) -> LandingMaps | None:
     return LandingMaps(pixels=pixels, cell_m=cell_m, site=site, **arrays)
 
 
-def read_ground_truth(products: Mapping[str, Any]) -> GroundTruth | None:
+def read_ground_truth(products: Mapping[str, Any]) -> StoredGroundTruth | None:
     """Read the ground truth; None if missing."""
     positions = check_shape(products.get("true_positions"), None, None, 2)
     heights = to_matrix(products.get("true_heights"))
@@ -180,7 +180,7 @@ def read_ground_truth(products: Mapping[str, Any]) -> GroundTruth | None:
     indices = np.nan_to_num((positions - corner)[..., ::-1] / spacing_m)
     rows, columns = np.moveaxis(np.clip(np.rint(indices), 0, np.array(heights.shape) - 1).astype(np.int64), -1, 0)
     elevation_m = heights[rows, columns] - camera[2, 3]
-    return GroundTruth(positions - camera[:2, 3], elevation_m, maps[0], maps[1], maps[2] > 0.5, maps[3] > 0.5)
+    return StoredGroundTruth(positions - camera[:2, 3], elevation_m, maps[0], maps[1], maps[2] > 0.5, maps[3] > 0.5)
 
 
 def _read_positive(products: Mapping[str, Any], name: str) -> float | None:

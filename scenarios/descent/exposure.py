@@ -10,7 +10,7 @@ from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.descent.parameters import (
-    CameraParameters,
+    DescentCameraParameters,
     DescentScenarioParameters,
     add_terrain_fault,
     draw_clouds,
@@ -40,7 +40,7 @@ MESH_FINEST_M, MESH_FINEST_FRACTION = 12.0, 0.01
 
 
 @dataclass(frozen=True)
-class World:
+class DescentWorld:
     """Terrain and light of a descent.
 
     - ground: the terrain with its site's light, texture and rocks; None for a generic terrain
@@ -60,7 +60,7 @@ class World:
         return Environment() if self.ground is None else self.ground.site.environment
 
     @classmethod
-    def from_parameters(cls, p: DescentScenarioParameters) -> World:
+    def from_parameters(cls, p: DescentScenarioParameters) -> DescentWorld:
         """Create the world of a case; load its terrain if it is stored, otherwise build it in memory."""
         terrain = add_terrain_fault(p.faults, p.terrain)
         bank = TerrainBank(terrain, p.location.bank_seed)
@@ -91,7 +91,7 @@ class World:
 
 def take_exposures(
     p: DescentScenarioParameters,
-    world: World,
+    world: DescentWorld,
     states: Sequence[State],
     optics: Optics,
     detector: Detector,
@@ -129,13 +129,13 @@ def draw_mounting(p: DescentScenarioParameters, streams: Streams) -> RigidTransf
     return RigidTransform.from_rotation(Rotation.from_rotvec(tilt))
 
 
-def camera_optics(parameters: CameraParameters) -> Optics:
+def camera_optics(parameters: DescentCameraParameters) -> Optics:
     """Create the true camera in the body frame: at the origin, looking down; columns point east at zero attitude."""
     model = parameters.model
     return shared_optics(_create_camera(parameters, 1.0, (0.0, 0.0), 0.0) if model is None else model.camera())
 
 
-def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) -> CameraModel:
+def calibrated_camera(parameters: DescentCameraParameters, rng: np.random.Generator) -> CameraModel:
     """Return the calibrated camera: the true camera of `camera_optics` with sampled calibration errors."""
     p = parameters
     focal, column, row, distortion = rng.standard_normal(4)
@@ -146,7 +146,9 @@ def calibrated_camera(parameters: CameraParameters, rng: np.random.Generator) ->
     return _create_camera(p, 1.0 + focal_error, centre, corner_px)
 
 
-def _create_camera(p: CameraParameters, focal_factor: float, shift_px: tuple[float, float], corner_px: float) -> Cahvor:
+def _create_camera(
+    p: DescentCameraParameters, focal_factor: float, shift_px: tuple[float, float], corner_px: float
+) -> Cahvor:
     """Create the camera with scaled focal length, shifted image centre, and corners distorted outwards by corner_px."""
     centre = (0.5 * (p.columns - 1), 0.5 * (p.rows - 1))
     focal_px = p.focal_length_mm / (1e-3 * p.pixel_pitch_um)

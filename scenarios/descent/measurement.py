@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
+from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics
 from marsyard.scenarios.descent.flight import IMU_MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_altitude_faults, add_attitude_faults
 from marsyard.scenarios.interface import Scalar
@@ -37,7 +37,7 @@ from marsyard.sim.streams import Streams
 
 
 @dataclass(frozen=True)
-class Instruments:
+class DescentInstruments:
     """Instruments of one descent with their constant errors, and readings of custom instruments.
 
     - approach: flight before the descent, during which navigation errors grow
@@ -58,7 +58,9 @@ class Instruments:
     row: Mapping[str, Scalar]
 
     @classmethod
-    def draw(cls, p: DescentScenarioParameters, world: World, flight: DescentFlight, streams: Streams) -> Instruments:
+    def draw(
+        cls, p: DescentScenarioParameters, world: DescentWorld, flight: DescentFlight, streams: Streams
+    ) -> DescentInstruments:
         """Draw the instruments of a case, propagate the navigation, and read the custom instruments."""
         start, end = -flight.lead_s + IMU_MARGIN_S, flight.firing_s + IMU_MARGIN_S
         approach = Approach(p.approach, start)
@@ -118,7 +120,7 @@ Counts = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 def measure_exactly(
-    p: DescentScenarioParameters, world: World, states: Sequence[State], images: Counts, detector: Detector
+    p: DescentScenarioParameters, world: DescentWorld, states: Sequence[State], images: Counts, detector: Detector
 ) -> DescentMeasurements:
     """Create measurements without errors: true attitudes, altitudes, times and velocities, and the true camera."""
     camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
@@ -140,11 +142,11 @@ def measure_exactly(
 
 def measure(
     p: DescentScenarioParameters,
-    world: World,
+    world: DescentWorld,
     motion: Trajectory,
     images: Counts,
     detector: Detector,
-    instruments: Instruments,
+    instruments: DescentInstruments,
     streams: Streams,
 ) -> DescentMeasurements:
     """Create measurements with errors: attitudes at the images' time tags, and the last altitude before each image."""

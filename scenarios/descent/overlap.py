@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.scenarios.descent.exposure import World
+from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -35,7 +35,7 @@ _PER_SIDE, _SPOT_POINTS = 8, 48
 Polygon = Float64[np.ndarray, "n 2"]
 
 
-def overlap_row(states: Sequence[State], world: World, camera: CameraModel) -> dict[str, Scalar]:
+def overlap_row(states: Sequence[State], world: DescentWorld, camera: CameraModel) -> dict[str, Scalar]:
     """Compute the widths of the overlap of the image pairs of a triple; `feasible_overlap`: both are large enough.
 
     - states: true states at the three images

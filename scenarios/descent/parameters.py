@@ -49,7 +49,7 @@ REGULAR_DUNES = Dunes(wavelength_m=60.0, height_m=1.0, crest_length=20.0, regula
 FAULTY_IMAGE = 1
 
 
-class Faults(SizedFaults):
+class DescentFaults(SizedFaults):
     """Faults of a descent."""
 
     heat_shield_deg: Annotated[
@@ -89,7 +89,7 @@ class Faults(SizedFaults):
         return {**super().detector_changes(), "bursts": bursts if self.cable_bursts else {}}
 
 
-def add_terrain_fault(faults: Faults, terrain: TerrainParameters) -> TerrainParameters:
+def add_terrain_fault(faults: DescentFaults, terrain: TerrainParameters) -> TerrainParameters:
     """Return the terrain; the dune fault adds regular dunes and removes rocks and craters."""
     if faults.dunes_m == 0.0:
         return terrain
@@ -97,19 +97,19 @@ def add_terrain_fault(faults: Faults, terrain: TerrainParameters) -> TerrainPara
     return terrain.model_copy(update={"dunes": dunes, "rocks": None, "craters_per_km2": 0.0})
 
 
-def draw_clouds(faults: Faults, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
+def draw_clouds(faults: DescentFaults, ground_m: float, rng: np.random.Generator) -> CloudLayer | None:
     """Draw the clouds of the cloud fault over ground at this height; None without the fault."""
     if faults.cloud_cover == 0.0:
         return None
     return CloudLayer.draw(CloudParameters(cover=faults.cloud_cover), rng, ground_m=ground_m)
 
 
-def add_time_fault(faults: Faults, times_s: Sequence[float]) -> list[float]:
+def add_time_fault(faults: DescentFaults, times_s: Sequence[float]) -> list[float]:
     """Return the true exposure times of images commanded at these times."""
     return [time + faults.exposure_delay_s * (index == FAULTY_IMAGE) for index, time in enumerate(times_s)]
 
 
-def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
+def add_altitude_faults(faults: DescentFaults, altitudes: Sequence[AltitudeMeasurement]) -> list[AltitudeMeasurement]:
     """Add the faults' relative errors to measured altitudes, or replace the altitudes by ranges to the heat shield."""
     if faults.shield_range_m:
         first_s = altitudes[0].time_s
@@ -127,7 +127,7 @@ def add_altitude_faults(faults: Faults, altitudes: Sequence[AltitudeMeasurement]
 
 
 def add_attitude_faults(
-    faults: Faults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
+    faults: DescentFaults, attitudes: Sequence[AttitudeMeasurement], rng: np.random.Generator
 ) -> list[AttitudeMeasurement]:
     """Tilt all attitudes about one random horizontal axis, and that of `FAULTY_IMAGE` also about a second one."""
     axes = [np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) for azimuth in rng.uniform(-np.pi, np.pi, 2)]
@@ -146,7 +146,7 @@ def add_attitude_faults(
 TRIPLE_SIZE = 3
 
 
-class LanderParameters(Parameters):
+class DescentLanderParameters(Parameters):
     """The lander's shadow in its own images, modelled as the shadow of a disc at the camera's position.
 
     The parachute's canopy dominates. Its diameter is 15.09 m (nominal) times 0.72 (inflated; Witkowski & Bruno 2003,
@@ -174,7 +174,7 @@ class LandingParameters(Parameters):
     burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS velocity error of the burn per axis")] = 1.0
 
 
-class CameraParameters(Parameters):
+class DescentCameraParameters(Parameters):
     """The descent camera: focal length 14.67 mm, pixels 12 um, field of view 45 deg.
 
     The distortion is that of an Opportunity navcam (its PDS label).
@@ -266,9 +266,9 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     #: Default: the last image and two earlier ones, at the longest possible equal intervals.
     triple: Annotated[tuple[int, int, int] | None, Field(description="image numbers of the triple, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or custom motion")] = None
-    lander: LanderParameters = LanderParameters()
-    camera: CameraParameters = CameraParameters()
-    faults: Faults = Faults()
+    lander: DescentLanderParameters = DescentLanderParameters()
+    camera: DescentCameraParameters = DescentCameraParameters()
+    faults: DescentFaults = DescentFaults()
     algorithm: Annotated[str, Field(description="dimes, phase-correlation, homography, or custom")] = "dimes"
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
     detector: DetectorChoice = DetectorParameters()
@@ -313,7 +313,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
             raise ValueError("dust_opacity needs a site; the air of a generic terrain is clear")
         if self.terrain_site != self.site:
             raise ValueError(f"site is {self.site}, but terrain is of {self.terrain_site}; `site` cannot be dispersed")
-        camera: CameraParameters | CustomCamera = self.camera if self.camera.model is None else self.camera.model
+        camera: DescentCameraParameters | CustomCamera = self.camera if self.camera.model is None else self.camera.model
         columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
             raise ValueError(f"detector.rows_summed {self.detector.rows_summed} does not divide the {rows} camera rows")

@@ -21,7 +21,7 @@ from marsyard.scenarios.conditions import (
     hash_images,
     image_columns,
 )
-from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
+from marsyard.scenarios.descent.exposure import DescentWorld, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import (
     DescentFlight,
     create_flight,
@@ -29,7 +29,7 @@ from marsyard.scenarios.descent.flight import (
     states_at_images,
     true_velocity,
 )
-from marsyard.scenarios.descent.measurement import Instruments, add_increments, measure, measure_exactly
+from marsyard.scenarios.descent.measurement import DescentInstruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.descent.score import (
@@ -41,7 +41,7 @@ from marsyard.scenarios.descent.score import (
 )
 from marsyard.scenarios.descent.timeline import descent_timeline
 from marsyard.scenarios.evaluation import Score, evaluate_case
-from marsyard.scenarios.exposure import Optics, Sample, pixel_sample
+from marsyard.scenarios.exposure import ImageSample, Optics, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent
@@ -80,10 +80,10 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         p = self.check_parameters(parameters)
         return (p.location.terrain,) if add_terrain_fault(p.faults, p.terrain) == p.terrain else ()
 
-    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
+    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[ImageSample]:
         """Yield the images of a case, without transmission faults, and the ground truth of their pixels."""
         p = self.check_parameters(parameters)
-        world = World.from_parameters(p)
+        world = DescentWorld.from_parameters(p)
         states = states_at_images(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
         camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
@@ -137,9 +137,9 @@ class Descent:
 
     p: DescentScenarioParameters
     streams: Streams
-    world: World
+    world: DescentWorld
     flight: DescentFlight
-    instruments: Instruments
+    instruments: DescentInstruments
     states: Sequence[State]
     images: Images
     measurements: DescentMeasurements
@@ -148,14 +148,14 @@ class Descent:
     @classmethod
     def simulate(cls, p: DescentScenarioParameters, streams: Streams) -> Descent:
         """Simulate the descent of a case and its measurements."""
-        world = World.from_parameters(p)
+        world = DescentWorld.from_parameters(p)
         flight = create_flight(p, world.surface, streams)
         states = states_at_images(p, flight)
         optics = camera_optics(p.camera)
         detector = draw_detector(p, optics, streams)
         exposures = [counts for counts, _ in take_exposures(p, world, states, optics, detector, streams)]
         images = corrupt_images(exposures, p.faults.repeated_image, p.faults.black_image)
-        instruments = Instruments.draw(p, world, flight, streams)
+        instruments = DescentInstruments.draw(p, world, flight, streams)
         if p.exact_instruments:
             measurements = measure_exactly(p, world, states, images, detector)
         else:

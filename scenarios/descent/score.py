@@ -13,9 +13,9 @@ from marsyard.algorithms.dimes import propagate_velocity
 from marsyard.algorithms.dimes.binning import altitudes_at_images
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
-from marsyard.scenarios.descent.exposure import World
+from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.descent.flight import mean_velocities
-from marsyard.scenarios.descent.measurement import Instruments
+from marsyard.scenarios.descent.measurement import DescentInstruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.velocity import Horizontal
@@ -27,7 +27,7 @@ Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 
 @dataclass(frozen=True)
-class Touchdown:
+class TouchdownVelocities:
     """Horizontal touchdown velocities of a descent, steered with the estimate and without it, m/s.
 
     - is_in_time: with the assumed computation time, the estimate is available before the rockets fire
@@ -44,7 +44,7 @@ def compute_touchdown(
     estimated_m_s: Horizontal | None,
     available_s: float,
     rng: np.random.Generator,
-) -> Touchdown:
+) -> TouchdownVelocities:
     """Compute touchdown velocities with a simple model of MER's last seconds; `rng` draws errors of burn and steering.
 
     Solid rockets in the backshell stop the fall near 100 m; small rockets next to them (TIRS) can tilt the backshell
@@ -63,13 +63,13 @@ def compute_touchdown(
     is_in_time = p.computation_s <= available_s
     speed = 0.0 if estimated_m_s is None else float(np.hypot(*estimated_m_s))
     if estimated_m_s is None or not is_in_time or speed <= p.steering_deadband_m_s:
-        return Touchdown(unsteered, unsteered, is_in_time)
+        return TouchdownVelocities(unsteered, unsteered, is_in_time)
     correction = estimated_m_s * min(1.0, p.max_steering_m_s / speed)
-    return Touchdown(unsteered - correction + steering * np.hypot(*correction), unsteered, is_in_time)
+    return TouchdownVelocities(unsteered - correction + steering * np.hypot(*correction), unsteered, is_in_time)
 
 
 def propagate_to_firing(
-    estimate: VelocityEstimate | None, instruments: Instruments, firing_s: float, gravity_m_s2: float
+    estimate: VelocityEstimate | None, instruments: DescentInstruments, firing_s: float, gravity_m_s2: float
 ) -> Horizontal | None:
     """Propagate the estimate to the thrusters' firing with the inertial unit; None without an estimate.
 
@@ -90,7 +90,11 @@ def propagate_to_firing(
 
 
 def conditions(
-    p: DescentScenarioParameters, world: World, states: Sequence[State], at_firing: State, instruments: Instruments
+    p: DescentScenarioParameters,
+    world: DescentWorld,
+    states: Sequence[State],
+    at_firing: State,
+    instruments: DescentInstruments,
 ) -> dict[str, Scalar]:
     """Compute the columns of a case's conditions: true states, and the columns of custom instruments."""
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
@@ -113,7 +117,9 @@ def conditions(
     return {**row, **instruments.row}
 
 
-def instrument_errors(world: World, states: Sequence[State], measurements: DescentMeasurements) -> dict[str, Scalar]:
+def instrument_errors(
+    world: DescentWorld, states: Sequence[State], measurements: DescentMeasurements
+) -> dict[str, Scalar]:
     """Compute the columns of measurement errors, split into a part common to all images and an independent part.
 
     The common attitude error is the mean of the images' rotation vectors (world axes); the independent part is the

@@ -73,7 +73,7 @@ class DriftParameters(Parameters):
     time_constant_s: Annotated[Positive, Field(description="time constant of the cooling, s (assumed)")] = 300.0
 
 
-class TargetParameters(Parameters):
+class ImageTargetParameters(Parameters):
     """The surveyed targets and the errors of their sightings (paper, III.D.2)."""
 
     placed: Annotated[int, Field(ge=3, le=1000, description="number of targets on the ground")] = 11
@@ -97,7 +97,7 @@ class TargetParameters(Parameters):
     survey_m: Annotated[NonNegative, Field(description="error of the survey per axis, m (assumed)")] = 0.02
 
     @model_validator(mode="after")
-    def _check_used(self) -> TargetParameters:
+    def _check_used(self) -> ImageTargetParameters:
         if self.used > self.placed:
             raise ValueError(f"{self.used} targets are used, but only {self.placed} are placed")
         if self.central > self.used:
@@ -169,7 +169,7 @@ class FieldTestParameters(AlgorithmSelection, CustomScores):
     imu: ImuParameters = ImuParameters(rate_hz=100.0, gyro_bias_deg_h_k=0.0)
     drift: DriftParameters = DriftParameters()
     gps: GpsParameters = POST_PROCESSED
-    targets: TargetParameters = TargetParameters()
+    targets: ImageTargetParameters = ImageTargetParameters()
     elevation: ElevationParameters = ElevationParameters()
     images: ImageParameters = ImageParameters()
     triples: TripleParameters = TripleParameters()

@@ -137,7 +137,7 @@ def _pairwise_distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarra
 
 
 @dataclass(frozen=True)
-class Run(UnprocessedRun):
+class FieldRun(UnprocessedRun):
     """A simulated and processed run.
 
     - truth: true motion at the images of the passes
@@ -172,7 +172,7 @@ def simulate_elevation_model(
     return RegularGridInterpolator((x, y), ground + error)
 
 
-def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> Run:
+def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> FieldRun:
     """Simulate and process a run; the result depends only on the key."""
     p, run, generator = key.field_test, key.parameters, key.generator
     ground = run_ground(key, load_ground)
@@ -210,7 +210,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
         altitude_m=altitude,
         centre_m=horizontal + (altitude / -down[:, 2])[:, None] * down[:, :2],
     )
-    return Run(
+    return FieldRun(
         key=key,
         clouds=clouds,
         flight=flight,

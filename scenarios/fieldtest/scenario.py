@@ -21,7 +21,7 @@ from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, imag
 from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.fieldtest.imaging import RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.run import Category, Run, Triple, simulate_run
+from marsyard.scenarios.fieldtest.run import Category, FieldRun, Triple, simulate_run
 from marsyard.scenarios.fieldtest.timeline import triple_timeline
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredFlight
@@ -41,10 +41,10 @@ _CACHED_GROUNDS, _CACHED_RUNS, _CACHED_SCENES = 3, 16, 5
 
 
 @dataclass(frozen=True)
-class Case:
+class TripleCase:
     """A triple of a run, and the true states at its images."""
 
-    run: Run
+    run: FieldRun
     triple: Triple
     states: tuple[State, State, State]
 
@@ -85,7 +85,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         run, ground = self._simulate_run(key), run_ground(key, self.load_ground)
         triple = run.triples[index]
         first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.image_indices)])
-        case = Case(run, triple, (first, second, third))
+        case = TripleCase(run, triple, (first, second, third))
         detector = key.detector()
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
         exposures = [take_image(run, scene, ground, state, detector, noise) for state in case.states]
@@ -145,7 +145,7 @@ def case_order(p: FieldTestParameters) -> list[tuple[int, int]]:
     return [(number, index) for _, number, index in sorted(ranks)]
 
 
-def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, "2 3"]:
+def truth_velocities(p: FieldTestParameters, case: TripleCase) -> Float64[np.ndarray, "2 3"]:
     """Compute the paper's truth velocities: GPS differences divided by the virtual interval, world axes (III.D.5).
 
     The images of a triple are not consecutive, so the time between them has no meaning for an inertial unit. The paper
@@ -157,7 +157,7 @@ def truth_velocities(p: FieldTestParameters, case: Case) -> Float64[np.ndarray, 
 
 def measure(
     p: FieldTestParameters,
-    case: Case,
+    case: TripleCase,
     images: Sequence[UInt16[np.ndarray, "rows columns"]],
     detector: Detector,
     camera: CameraModel,
@@ -185,7 +185,7 @@ def measure(
 
 
 def _conditions(
-    p: FieldTestParameters, case: Case, measurements: DescentMeasurements, surface: Surface
+    p: FieldTestParameters, case: TripleCase, measurements: DescentMeasurements, surface: Surface
 ) -> dict[str, Scalar]:
     """Compute the columns of a case's conditions and measurement errors."""
     run, indices = case.run, list(case.triple.image_indices)
@@ -224,7 +224,7 @@ def _conditions(
 
 
 def cloud_transmittances(
-    run: Run, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
+    run: FieldRun, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
 ) -> Float64[np.ndarray, "times m n"]:
     """Compute the fraction of direct sunlight that clouds transmit to points on the ground."""
     if run.clouds is None:

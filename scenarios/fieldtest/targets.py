@@ -20,7 +20,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.fieldtest.parameters import TargetParameters
+from marsyard.scenarios.fieldtest.parameters import ImageTargetParameters
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import Motion
 from marsyard.sim.render import Objects
@@ -53,7 +53,7 @@ class Targets:
 
     @classmethod
     def draw(
-        cls, p: TargetParameters, surface: Surface, centre_m: Float64[np.ndarray, "2"], rng: np.random.Generator
+        cls, p: ImageTargetParameters, surface: Surface, centre_m: Float64[np.ndarray, "2"], rng: np.random.Generator
     ) -> Targets:
         """Draw `placed` panels on the ground around a position; return the first `used` of them.
 

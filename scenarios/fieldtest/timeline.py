@@ -11,7 +11,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.exposure import camera_optics
 from marsyard.scenarios.fieldtest.imaging import field_camera, sun_at
-from marsyard.scenarios.fieldtest.run import Run
+from marsyard.scenarios.fieldtest.run import FieldRun
 from marsyard.scenarios.timeline import Timeline, surface_from_above
 from marsyard.scenarios.velocity_timeline import STEP_S, VelocityCase
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
@@ -25,7 +25,7 @@ _MAX_POSES = 2000
 
 
 def triple_timeline(
-    run: Run,
+    run: FieldRun,
     ground: SiteGround,
     states: Sequence[State],
     images: Sequence[UInt16[np.ndarray, "rows columns"]],

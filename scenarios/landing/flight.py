@@ -36,7 +36,7 @@ MIN_INTERVAL_S = 0.1
 
 
 @dataclass(frozen=True)
-class Flight:
+class LandingFlight:
     """True states and estimated poses at the two images."""
 
     states: tuple[State, State]  #: true states of the body; the camera is at the body's origin
@@ -45,7 +45,7 @@ class Flight:
     transit: Transit | None = None  #: the helicopter flight; None if the parameters define the poses
 
     @classmethod
-    def from_parameters(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> Flight:
+    def from_parameters(cls, p: LandingScenarioParameters, surface: Surface, streams: Streams) -> LandingFlight:
         """Create the flight of a case: choose a pair from a helicopter flight, or use the poses of the parameters."""
         if p.helicopter is None:
             states = true_states(p, surface, streams)

@@ -47,7 +47,7 @@ from marsyard.sim.streams import Streams
 MAX_ITERATIONS, MAX_PATH_CHANGE_M = 8, 1e-3
 
 
-class HelicopterParameters(Parameters):
+class LandingHelicopterParameters(Parameters):
     """Parameters of a helicopter flight: vehicle, air, guidance and instruments."""
 
     craft: RotorcraftParameters = RotorcraftParameters()
@@ -85,7 +85,7 @@ class HelicopterParameters(Parameters):
 
 
 @dataclass(frozen=True)
-class Instruments:
+class HelicopterInstruments:
     """On-board instruments with sampled errors, and the filter configured for them."""
 
     imu: Imu
@@ -94,7 +94,7 @@ class Instruments:
     navigation: NavigationFilter
 
     @classmethod
-    def draw(cls, p: HelicopterParameters, gravity_m_s2: float, streams: Streams) -> Instruments:
+    def draw(cls, p: LandingHelicopterParameters, gravity_m_s2: float, streams: Streams) -> HelicopterInstruments:
         """Draw the instruments of a case."""
         return cls(
             Imu.draw(p.imu, p.span_s, streams.generator("inertial unit")),
@@ -120,7 +120,7 @@ class NavigatedLeg:
         trajectory: Trajectory,
         start_s: float,
         end_s: float,
-        instruments: Instruments,
+        instruments: HelicopterInstruments,
         streams: Streams,
         leg: str,
         initial: FilterState | None = None,
@@ -154,8 +154,8 @@ class NavigatedLeg:
 class Transit:
     """The leg of the flight in which the images are taken."""
 
-    parameters: HelicopterParameters
-    instruments: Instruments
+    parameters: LandingHelicopterParameters
+    instruments: HelicopterInstruments
     air: Air
     flight: RotorcraftFlight  #: true flight
     navigation_leg: NavigatedLeg
@@ -165,7 +165,7 @@ class Transit:
     @classmethod
     def fly(
         cls,
-        parameters: HelicopterParameters,
+        parameters: LandingHelicopterParameters,
         start_m: Float64[np.ndarray, "3"],
         course_rad: float,
         heading_rad: float,
@@ -182,7 +182,7 @@ class Transit:
         flight = simulate_transit(
             p.craft, p.transit, start_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )
-        instruments = Instruments.draw(p, gravity_m_s2, streams)
+        instruments = HelicopterInstruments.draw(p, gravity_m_s2, streams)
         navigation_leg = NavigatedLeg.simulate(flight.path, *flight.path.span_s, instruments, streams, "transit")
         times = np.linspace(0.0, p.transit.imaging_duration_s, p.transit.images)
         # another name of a random stream would change the random values

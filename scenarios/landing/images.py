@@ -14,7 +14,7 @@ from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
 from marsyard.scenarios.exposure import Optics, camera_optics, draw_calibrated, render_state, sunlight_ratio
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults, raise_sun_deg
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
@@ -33,7 +33,7 @@ MAX_GROUNDS = 4
 
 
 @dataclass(frozen=True)
-class World:
+class LandingWorld:
     """Terrain with rocks, custom meshes, and sun of a landing case."""
 
     ground: SiteGround
@@ -42,7 +42,9 @@ class World:
     brightness: float  #: sunlight at the ground / reference sunlight of the detector
 
     @classmethod
-    def from_parameters(cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank) -> World:
+    def from_parameters(
+        cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank
+    ) -> LandingWorld:
         """Create the world of a case."""
         ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)
         texture = p.preset.ground_texture
@@ -84,7 +86,9 @@ class Pair:
         return float(np.median(ranges[first_row : first_row + 2, first_column : first_column + 2]))
 
 
-def take_images(p: LandingScenarioParameters, world: World, flight: Flight, optics: Optics, streams: Streams) -> Pair:
+def take_images(
+    p: LandingScenarioParameters, world: LandingWorld, flight: LandingFlight, optics: Optics, streams: Streams
+) -> Pair:
     """Take both images of a flight; the first image determines the exposure of both."""
     settings = add_detector_faults(p.faults, p.detector)
     detector = Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
@@ -114,7 +118,7 @@ def take_images(p: LandingScenarioParameters, world: World, flight: Flight, opti
     return Pair((first, second), (frames[0], frames[1]))
 
 
-def measure(p: LandingScenarioParameters, flight: Flight, pair: Pair, streams: Streams) -> LandingMeasurements:
+def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, streams: Streams) -> LandingMeasurements:
     """Simulate the measurements of a case.
 
     The a-priori site is the point on the first optical axis at the measured range, or at the commanded height if there
@@ -156,7 +160,7 @@ class GroundTruth:
     step_m: float
 
     @classmethod
-    def from_images(cls, world: World, flight: Flight, pair: Pair, limits: Limits) -> GroundTruth:
+    def from_images(cls, world: LandingWorld, flight: LandingFlight, pair: Pair, limits: Limits) -> GroundTruth:
         """Compute the ground truth of the area in the first image."""
         centre = flight.states[0].position_m
         # rows: unit vectors of the image's right and up directions on the ground
@@ -254,8 +258,8 @@ class RenderedFlight:
     """A flight with its world, images and ground truth."""
 
     p: LandingScenarioParameters
-    world: World
-    flight: Flight
+    world: LandingWorld
+    flight: LandingFlight
     pair: Pair
     truth: GroundTruth
 
@@ -264,8 +268,8 @@ class RenderedFlight:
         cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
     ) -> RenderedFlight:
         """Simulate the flight of a case and take its images."""
-        world = World.from_parameters(p, load_ground)
-        flight = Flight.from_parameters(p, world.ground.surface, streams)
+        world = LandingWorld.from_parameters(p, load_ground)
+        flight = LandingFlight.from_parameters(p, world.ground.surface, streams)
         pair = take_images(p, world, flight, camera_optics(p.optics), streams)
         return cls(p, world, flight, pair, GroundTruth.from_images(world, flight, pair, p.lander.limits))
 
@@ -289,7 +293,7 @@ class SampledMap:
 
     @classmethod
     def sample(
-        cls, ground: MappedGround, flight: Flight, truth: GroundTruth, limits: tuple[float, float]
+        cls, ground: MappedGround, flight: LandingFlight, truth: GroundTruth, limits: tuple[float, float]
     ) -> SampledMap:
         """Sample the map at the truth's positions; `limits`: the algorithm's slope (rad) and roughness (m) limits."""
         offsets = truth.positions - flight.states[0].position_m[:2]
@@ -353,7 +357,9 @@ def count_hazards(ground: MappedGround, sampled: SampledMap, truth: GroundTruth)
     return {column: int(np.count_nonzero(mask)) for column, mask in masks.items()}
 
 
-def map_errors(ground: MappedGround, flight: Flight, sampled: SampledMap, truth: GroundTruth) -> dict[str, Scalar]:
+def map_errors(
+    ground: MappedGround, flight: LandingFlight, sampled: SampledMap, truth: GroundTruth
+) -> dict[str, Scalar]:
     """Compute the errors of the map's elevation and slope.
 
     The reference elevation is the mean of the exact heights in a cell, relative to the camera. `bias` is the mean

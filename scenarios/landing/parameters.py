@@ -13,7 +13,7 @@ from marsyard.algorithms.hda import HdaOptions
 from marsyard.scenarios.algorithm_run import AlgorithmSelection
 from marsyard.scenarios.conditions import SizedFaults
 from marsyard.scenarios.exposure import CalibrationParameters
-from marsyard.scenarios.landing.helicopter import HelicopterParameters
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.meshes import MeshParameters
@@ -41,7 +41,7 @@ POSE_POSITION = ErrorSource("position", "position and motion")
 POSE_ATTITUDE = ErrorSource("attitude", "attitude and inclinometers")
 
 
-class Faults(SizedFaults):
+class LandingFaults(SizedFaults):
     """Faults of a landing case; lost images and receiver outages need a helicopter flight."""
 
     black_image: Annotated[int, bounded_field(0, 2, "number of the black image, 1 or 2; 0: none")] = 0
@@ -74,7 +74,7 @@ class Faults(SizedFaults):
         return {**super().detector_changes(), "defects": defects}
 
 
-def raise_sun_deg(faults: Faults, elevation_deg: float) -> float:
+def raise_sun_deg(faults: LandingFaults, elevation_deg: float) -> float:
     """Return the sun's elevation; the vehicle shadow fault reduces its zenith distance to a quarter.
 
     A nadir camera sees the vehicle's shadow only if the sun's zenith distance is below half its field of view.
@@ -82,7 +82,7 @@ def raise_sun_deg(faults: Faults, elevation_deg: float) -> float:
     return 90.0 - 0.25 * (90.0 - elevation_deg) if faults.vehicle_shadow_m else elevation_deg
 
 
-def add_receiver_outage(faults: Faults, helicopter: HelicopterParameters) -> HelicopterParameters:
+def add_receiver_outage(faults: LandingFaults, helicopter: LandingHelicopterParameters) -> LandingHelicopterParameters:
     """Add the outage of the GPS receiver, from before the first image until after the landing.
 
     The outage extends the initial hover, so that the filter is initialized with the receiver as in other flights.
@@ -99,13 +99,15 @@ def add_receiver_outage(faults: Faults, helicopter: HelicopterParameters) -> Hel
     )
 
 
-def draw_received_images(faults: Faults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
+def draw_received_images(faults: LandingFaults, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "n"]:
     """Draw the images of a flight that arrive, at least two; return their sorted indices."""
     received_count = max(2, count - round(faults.lost_images * count))
     return np.sort(rng.permutation(count)[:received_count]).astype(np.int64)
 
 
-def add_range_faults(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_m: float) -> Float64[np.ndarray, "n"]:
+def add_range_faults(
+    faults: LandingFaults, ranges_m: Float64[np.ndarray, "n"], height_m: float
+) -> Float64[np.ndarray, "n"]:
     """Replace the altimeter's ranges by the stuck range, or by NaN, if the altimeter has a fault."""
     stuck_m = stuck_range_m(faults, height_m)
     if stuck_m is None:
@@ -113,7 +115,7 @@ def add_range_faults(faults: Faults, ranges_m: Float64[np.ndarray, "n"], height_
     return np.full_like(ranges_m, np.nan if np.isinf(stuck_m) else stuck_m)
 
 
-def stuck_range_m(faults: Faults, height_m: float) -> float | None:
+def stuck_range_m(faults: LandingFaults, height_m: float) -> float | None:
     """Return the stuck range of the altimeter: infinite if it returns no range, None if it has no fault."""
     if faults.laser_silent:
         return float("inf")
@@ -148,7 +150,7 @@ class ImagePoseParameters(Parameters):
     )
 
 
-class NavigationParameters(Parameters):
+class PoseErrorParameters(Parameters):
     """Standard deviations per axis of the on-board poses and of the inclinometers, sampled for a case."""
 
     position_m: Annotated[NonNegative, POSE_POSITION] = Field(
@@ -222,14 +224,14 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         default=ImagePoseParameters(),
         description="camera poses at the images; a helicopter flight uses only the azimuths",
     )
-    navigation: NavigationParameters = Field(
-        default=NavigationParameters(), description="navigation errors of cases without a helicopter flight"
+    navigation: PoseErrorParameters = Field(
+        default=PoseErrorParameters(), description="navigation errors of cases without a helicopter flight"
     )
-    helicopter: HelicopterParameters | None = Field(default=None, description="helicopter flight and landing")
+    helicopter: LandingHelicopterParameters | None = Field(default=None, description="helicopter flight and landing")
     pair: PairParameters = Field(default=PairParameters(), description="choice of two images of a helicopter flight")
     laser: LaserParameters = LaserParameters()
     lander: LanderParameters = LanderParameters()
-    faults: Faults = Faults()
+    faults: LandingFaults = LandingFaults()
     algorithm: str = Field(default="hda", description="hda, essential-matrix, semi-global, or a custom 'module:Class'")
     hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions()
     render: RenderParameters = Field(default_factory=RenderParameters)

@@ -14,7 +14,7 @@ from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.conditions import hash_images, image_columns
 from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.exposure import Sample, pixel_sample, select_middle_rows
+from marsyard.scenarios.exposure import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.images import MAX_GROUNDS, RenderedFlight, measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
@@ -45,7 +45,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     def __init__(self) -> None:
         super().__init__(MAX_GROUNDS)
 
-    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[Sample]:
+    def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[ImageSample]:
         """Yield the two delivered images of a case with the ground truth of their pixels."""
         case = RenderedFlight.simulate(self.check_parameters(parameters), streams, self.load_ground)
         p, pair = case.p, case.pair

@@ -14,7 +14,7 @@ from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.conditions import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
 from marsyard.scenarios.landing.images import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
@@ -81,7 +81,7 @@ def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
     }
 
 
-def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict[str, Scalar]:
+def site_row(estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth) -> dict[str, Scalar]:
     """Compare the reported site with the ground truth.
 
     The true site is the reported site minus the navigation error at the first image. Only the outcome SAFE_SITE
@@ -110,7 +110,7 @@ def site_row(estimate: SiteEstimate, flight: Flight, truth: GroundTruth) -> dict
     }
 
 
-def _true_site(estimate: SiteEstimate, flight: Flight) -> np.ndarray | None:
+def _true_site(estimate: SiteEstimate, flight: LandingFlight) -> np.ndarray | None:
     """Compute the true x, y of the reported site; None without a site."""
     return None if estimate.site_world is None else (estimate.site_world - flight.position_error_m)[:2]
 
@@ -130,7 +130,7 @@ def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> d
 
 
 def simulate_touchdown(
-    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth, streams: Streams
+    p: LandingScenarioParameters, estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth, streams: Streams
 ) -> Touchdown | None:
     """Simulate the helicopter's landing at the reported site; None without a site, a helicopter or ground contact."""
     relief = truth.relief
@@ -142,7 +142,7 @@ def simulate_touchdown(
 
 
 def landing_row(
-    touchdown: Touchdown | None, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
+    touchdown: Touchdown | None, estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth
 ) -> dict[str, Scalar]:
     """Compute the columns of the touchdown and of the ground under it.
 
@@ -178,7 +178,7 @@ def landing_row(
     return {"landed": True, **ground_row, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
 
 
-def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
+def true_motion(flight: LandingFlight, pair: Pair) -> RigidTransform:
     """Compute the true motion from the first to the second camera's frame."""
     first, second = (
         state.world_from_body * camera_pose(image.camera)
@@ -187,7 +187,7 @@ def true_motion(flight: Flight, pair: Pair) -> RigidTransform:
     return second.inv() * first
 
 
-def motion_row(details: object, flight: Flight, pair: Pair) -> dict[str, Scalar]:
+def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, Scalar]:
     """Compute the columns of tracks and motion errors; NaN for stages that were not reached."""
     row: dict[str, Scalar] = dict.fromkeys(MOTION_COLUMNS, NAN)
     row["tracked_well"] = False
@@ -227,7 +227,7 @@ def times_row(details: object) -> dict[str, Scalar]:
 
 
 def map_row(
-    p: LandingScenarioParameters, estimate: SiteEstimate, flight: Flight, truth: GroundTruth
+    p: LandingScenarioParameters, estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth
 ) -> dict[str, Scalar]:
     """Compute the columns of map errors and hazard counts; only the relief error, NaN, without a map."""
     row: dict[str, Scalar] = {"relief_error_fraction": NAN}
@@ -288,7 +288,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
     }
 
 
-def _navigation_errors(flight: Flight, measurements: LandingMeasurements) -> dict[str, Scalar]:
+def _navigation_errors(flight: LandingFlight, measurements: LandingMeasurements) -> dict[str, Scalar]:
     """Compute the columns of the errors of inclinometers and poses."""
     states, poses = flight.states, flight.poses
     first, second = (

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, MappedGround, Safety
 from marsyard.algorithms.interface import SiteEstimate
-from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.helicopter import NavigatedLeg, Touchdown
 from marsyard.scenarios.landing.images import RenderedFlight
 from marsyard.scenarios.meshes import add_meshes
@@ -68,7 +68,7 @@ def landing_timeline(case: RenderedFlight, estimate: SiteEstimate, touchdown: To
     )
 
 
-def _legs(flight: Flight, touchdown: Touchdown | None) -> list[NavigatedLeg]:
+def _legs(flight: LandingFlight, touchdown: Touchdown | None) -> list[NavigatedLeg]:
     """Return the navigated legs of the flight; none if the parameters define the poses."""
     legs = [] if flight.transit is None else [flight.transit.navigation_leg]
     return legs if touchdown is None else [*legs, touchdown.navigation_leg]
@@ -84,7 +84,7 @@ def _inertial_data(legs: list[NavigatedLeg]) -> InertialData:
     )
 
 
-def _paths(flight: Flight, touchdown: Touchdown | None) -> dict[str, Path]:
+def _paths(flight: LandingFlight, touchdown: Touchdown | None) -> dict[str, Path]:
     """Return the true path and the path that the on-board filter estimates."""
     if flight.transit is None:
         states, poses = flight.states, flight.poses

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct
 from marsyard.scenarios.conformance.inputs import BLANKS, MEAN, Blank, TexturedPlane, texture
-from marsyard.scenarios.localisation.instruments import CameraParameters, true_camera
+from marsyard.scenarios.localisation.instruments import LanderCameraParameters, true_camera
 from marsyard.scenarios.localisation.stream import LocalisationMeasurements
 from marsyard.sim.camera import Cahvore
 from marsyard.sim.frames import rigid
@@ -122,7 +122,7 @@ def _altitudes() -> tuple[AltitudeMeasurement, ...]:
 
 def _images() -> tuple[DetectorImage, ...]:
     """Take the images of the ground at the height 0."""
-    camera: Cahvore = true_camera(CameraParameters(pixels=192, pixel_mrad=8.7))
+    camera: Cahvore = true_camera(LanderCameraParameters(pixels=192, pixel_mrad=8.7))
     shape = camera.size[::-1]
     # uniform response, exposure of 150 us, no row transfer times (global shutter), no summed rows
     calibration = DetectorCalibration(np.ones(shape), 150e-6, 0.0, 0.0, 1, _OFFSET_DN, _FULL_SCALE_DN)

@@ -26,7 +26,7 @@ from marsyard.sim.sensor import ClockParameters, DetectorParameters, RadarAltime
 from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
 
 
-class CameraParameters(Parameters):
+class LanderCameraParameters(Parameters):
     """The lander's camera: a fisheye (CAHVORE type 2) of 1024 x 1024 pixels, 90 x 90 deg, and 1.67 mrad on the axis.
 
     With the angle theta from the axis, the focal length f in pixels (1 / 1.67 mrad) and half the field theta_h, the
@@ -46,7 +46,7 @@ class CameraParameters(Parameters):
     )
 
     @model_validator(mode="after")
-    def _check_field(self) -> CameraParameters:
+    def _check_field(self) -> LanderCameraParameters:
         camera = true_camera(self)
         edge = np.array([[-0.5, 0.5 * (self.pixels - 1)]])
         angle = np.arccos(-camera.rays(edge)[1][0, 2])
@@ -64,7 +64,7 @@ class CameraParameters(Parameters):
         return self.focal_length_mm * self.pixel_mrad
 
 
-def true_camera(p: CameraParameters) -> Cahvore:
+def true_camera(p: LanderCameraParameters) -> Cahvore:
     """Create the true camera in the body frame."""
     focal_px, half_field = 1e3 / p.pixel_mrad, 0.5 * np.radians(p.field_deg)
     pinhole = Cahv.from_axes(
@@ -74,7 +74,7 @@ def true_camera(p: CameraParameters) -> Cahvore:
     return Cahvore.from_cahv(pinhole, r=np.array([0.0, cubic, 0.0]), linearity=0.0)
 
 
-def draw_calibrated_camera(p: CameraParameters, rng: np.random.Generator) -> CameraModel:
+def draw_calibrated_camera(p: LanderCameraParameters, rng: np.random.Generator) -> CameraModel:
     """Return the calibrated camera: the true one with normally distributed errors of lens and mounting.
 
     The error of the distortion moves a pixel at the angle theta outwards in proportion to theta^3.
@@ -115,7 +115,7 @@ def _full_well_e() -> float:
 def _create_detector() -> DetectorParameters:
     full_well = _full_well_e()
     # f-number, pixel pitch (um), passband (nm)
-    light = LightPath(2.7, CameraParameters().pixel_pitch_um, (400.0, 900.0))
+    light = LightPath(2.7, LanderCameraParameters().pixel_pitch_um, (400.0, 900.0))
     return DetectorParameters(
         exposure_s=_EXPOSURE_S,
         responsivity_e_s=BRIGHT_FILL * full_well / (BRIGHT_RADIANCE_FACTOR * _EXPOSURE_S),

@@ -16,8 +16,8 @@ from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
     LANDER_DETECTOR,
     RADAR,
-    CameraParameters,
     InitialErrors,
+    LanderCameraParameters,
     check_clock,
 )
 from marsyard.scenarios.localisation.map_product import MapParameters
@@ -71,7 +71,7 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     map: MapParameters = MapParameters()
     flight: ProfileParameters = ProfileParameters()
     images: ImageSchedule = ImageSchedule()
-    camera: CameraParameters = CameraParameters()
+    camera: LanderCameraParameters = LanderCameraParameters()
     detector: DetectorParameters = LANDER_DETECTOR
     imu_class: Annotated[ImuClass, Field(description="class of the inertial unit")] = "ln-200"
     initial: InitialErrors = InitialErrors()

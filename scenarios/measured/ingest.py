@@ -33,8 +33,8 @@ from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import format_problems
 from marsyard.sim.camera import (
     CameraModel,
-    Frame,
     FramedCamera,
+    LabelFrame,
     Pds3Product,
     mount_looking_down,
     read_framed_cameras,
@@ -151,7 +151,7 @@ class _RecordedImage:
     time_s: float
     attitude: Rotation
     position_m: Float64[np.ndarray, "3"] | None
-    frame: Frame | None = None
+    frame: LabelFrame | None = None
     world_from_frame: RigidTransform | None = None
 
 
@@ -370,7 +370,7 @@ def _to_vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
 
 def _label_pose(
     row: ImageRow, framed: FramedCamera, product: Pds3Product | None
-) -> tuple[CameraModel, Frame, RigidTransform]:
+) -> tuple[CameraModel, LabelFrame, RigidTransform]:
     """Return the camera in the body's frame, and the body's pose in the frame that the label names.
 
     The body is the rover or, for a model in a frame that the label does not connect to the rover, the camera's centre
@@ -385,7 +385,7 @@ def _label_pose(
     return camera, *product.pose
 
 
-def _world_from(row: ImageRow, frame: Frame, frame_from_body: RigidTransform) -> RigidTransform:
+def _world_from(row: ImageRow, frame: LabelFrame, frame_from_body: RigidTransform) -> RigidTransform:
     """Return the transform to world axes: from a site, or from the Mars-fixed frame with the origin at the body."""
     if frame.name != MARS_FIXED:
         return rigid(SITE_FROM_WORLD.inv(), np.zeros(3))
@@ -395,14 +395,14 @@ def _world_from(row: ImageRow, frame: Frame, frame_from_body: RigidTransform) ->
         raise row.error(f"the label's pose in {frame}: {error}; allowed: metres from the centre of Mars") from error
 
 
-def _is_same_world(frame: Frame | None, first: Frame | None) -> bool:
+def _is_same_world(frame: LabelFrame | None, first: LabelFrame | None) -> bool:
     """Return whether positions in both frames have the same origin; that of the table (None) can be a site's."""
     if frame is None or first is None:
         return MARS_FIXED not in [known.name for known in (frame, first) if known is not None]
     return frame.matches(first)
 
 
-def _describe(frame: Frame | None) -> str:
+def _describe(frame: LabelFrame | None) -> str:
     return "the table's axes" if frame is None else f"the label's frame {frame}"
 
 

@@ -131,7 +131,7 @@ def read_ingest_file(folder: Path) -> IngestFile:
     return file
 
 
-class Column(NamedTuple):
+class ImageColumn(NamedTuple):
     """A column of `images.csv`; `images.toml` describes all columns.
 
     - tasks: tasks that read the column
@@ -146,7 +146,7 @@ class Column(NamedTuple):
 
 #: All columns, in the order of the documentation.
 COLUMNS = tuple(
-    Column(name, tuple(group["tasks"]), group["required"], group["description"])
+    ImageColumn(name, tuple(group["tasks"]), group["required"], group["description"])
     for group in tomllib.loads(Path(__file__).with_name("images.toml").read_text(encoding="utf-8"))["columns"]
     for name in group["names"].split()
 )

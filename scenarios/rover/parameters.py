@@ -175,7 +175,7 @@ class LegParameters(Parameters):
 SUN_MOTION = ErrorSource("sun", "motion of the sun")
 
 
-class SunParameters(Parameters):
+class MovingSunParameters(Parameters):
     """Position of the sun at the start, and motion of the sun."""
 
     azimuth_deg: Annotated[Azimuth, Field(description="azimuth of the sun, clockwise from north")] = 225.0
@@ -246,7 +246,7 @@ class CustomPair(Parameters):
         return mount_on_head(self.left.camera(), right.camera(), self.baseline_m, self.toe_in_deg)
 
 
-class CameraParameters(Parameters):
+class MastCameraParameters(Parameters):
     """The stereo pair on the mast."""
 
     preset: str = Field(
@@ -371,9 +371,9 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     odometry: OdometryParameters = OdometryParameters()
     pointing: PointingParameters = PointingParameters()
     stereo: StereoCalibrationParameters = StereoCalibrationParameters()
-    camera: CameraParameters = CameraParameters()
+    camera: MastCameraParameters = MastCameraParameters()
     exposure: ExposureParameters = ExposureParameters()
-    sun: SunParameters = SunParameters()
+    sun: MovingSunParameters = MovingSunParameters()
     clouds: Annotated[CloudParameters | None, CLOUDS, Field(description="clouds whose shadows drift over the run")] = (
         None
     )

@@ -19,7 +19,7 @@ from marsyard.algorithms.vtt.placement import (
 )
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.points import Vector, enclosing_spheres, ray_distances, sight_axes, spheres_near_line
-from marsyard.scenarios.rover.run import Run
+from marsyard.scenarios.rover.run import RoverRun
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements
 
 NAN = float("nan")
@@ -44,7 +44,7 @@ def auto_place(measurements: RoverMeasurements, target_rover: Vector) -> Placeme
     return place_instrument(surface, target_rover, camera_position(mast, head))
 
 
-def sample_surface(run: Run, viewpoint: Vector) -> Points3:
+def sample_surface(run: RoverRun, viewpoint: Vector) -> Points3:
     """Sample the rock's surface around the designated point, as seen from a viewpoint; world axes, metres."""
     point = run.target.point_world
     _, right, up = sight_axes(point - viewpoint)
@@ -60,7 +60,7 @@ def sample_surface(run: Run, viewpoint: Vector) -> Points3:
     return np.asarray(viewpoint + distances[is_hit, None] * rays[is_hit])
 
 
-def placement_truth(run: Run) -> dict[str, Scalar]:
+def placement_truth(run: RoverRun) -> dict[str, Scalar]:
     """Compute whether a position near the designated point is free of collisions; for a run at its start."""
     mast, stance = run.rig.calibrated, run.vehicle.stance
     position = camera_position(mast, mast.geometry.rover_from_head(*run.rig.state.readings_rad))
@@ -69,7 +69,7 @@ def placement_truth(run: Run) -> dict[str, Scalar]:
     return {"placeable": placement.outcome in _PLACED}
 
 
-def placement_row(run: Run) -> dict[str, Scalar]:
+def placement_row(run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of the placement at the end of a run; NaN if the instrument was not placed.
 
     - `placed`: whether a position without a predicted collision was found

@@ -45,7 +45,7 @@ from marsyard.scenarios.rover.stops import (
     RunOutcome,
     StereoCamera,
     Stop,
-    View,
+    StopView,
     designate_from_start,
     triangulate_point,
 )
@@ -105,7 +105,7 @@ def is_stuck(steps: Sequence[Step], mobility: MobilityParameters) -> bool:
 
 
 @dataclass
-class Run(Setup):
+class RoverRun(Setup):
     """State of a run in progress or finished."""
 
     target: DesignatedTarget
@@ -123,7 +123,7 @@ class Run(Setup):
     steps: list[Step] = field(default_factory=list)  #: all steps with a commanded path, in order
 
     @classmethod
-    def from_setup(cls, setup: Setup, target: DesignatedTarget) -> Run:
+    def from_setup(cls, setup: Setup, target: DesignatedTarget) -> RoverRun:
         """Create a run with a target, at its start."""
         return cls(setup.world, setup.rig, setup.vehicle, setup.camera, setup.navigation_cameras, target)
 
@@ -136,7 +136,7 @@ class Run(Setup):
 class TrackerGuide:
     """The tracker under test as guide: it receives copies of its inputs, and its answers are checked."""
 
-    def __init__(self, p: RoverScenarioParameters, run: Run, estimated_pose: RigidTransform) -> None:
+    def __init__(self, p: RoverScenarioParameters, run: RoverRun, estimated_pose: RigidTransform) -> None:
         """Create the tracker and designate the run's target; `estimated_pose` is the rover's estimated world pose."""
         self._tracker: TargetTracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
         # a tracker in a process of its own cannot change its inputs
@@ -158,7 +158,7 @@ class TrackerGuide:
             copy.check()
         del self._copies[1:]
 
-    def aim(self, run: Run) -> MastAim | None:
+    def aim(self, run: RoverRun) -> MastAim | None:
         """Return the tracker's mast angles and subframe boxes; None if the mast or cameras cannot show the target.
 
         Raises AlgorithmError for an invalid answer, and the tracker's own errors.
@@ -167,7 +167,7 @@ class TrackerGuide:
         self._check_inputs()
         return check_aim(answer, run.rig.calibrated)
 
-    def observe(self, run: Run, view: View) -> RunOutcome | None:
+    def observe(self, run: RoverRun, view: StopView) -> RunOutcome | None:
         """Update the tracker and append the stop to the run; return the outcome if the run ends, else None.
 
         Raises the same exceptions as `aim`.
@@ -185,7 +185,7 @@ class TrackerGuide:
             return RunOutcome.LOST
         return RunOutcome.NOT_SEEDED if update.position_rover is None else None
 
-    def target(self, run: Run) -> TargetEstimate:
+    def target(self, run: RoverRun) -> TargetEstimate:
         """Transform the target's last reported position by the estimated motion since that stop."""
         stop = run.stops[-1]
         if stop.update.position_rover is None:
@@ -204,9 +204,9 @@ class DesignationGuide:
 
     margin_px: float
     position_world: Float64[np.ndarray, "3"] | None
-    views: list[View] = field(default_factory=list)
+    views: list[StopView] = field(default_factory=list)
 
-    def aim(self, run: Run) -> MastAim | None:
+    def aim(self, run: RoverRun) -> MastAim | None:
         """Return an aim at the estimated target; None if the mast cannot point there or a camera misses the rock."""
         stance, rig = run.vehicle.stance, run.rig
         angles = mast_angles(self.target(run).position_rover, rig.calibrated, use_both=False)
@@ -227,13 +227,13 @@ class DesignationGuide:
         # the mast does not move if its encoders already read these angles
         return MastAim(*rig.state.readings_rad, *boxes)
 
-    def observe(self, run: Run, view: View) -> RunOutcome | None:
+    def observe(self, run: RoverRun, view: StopView) -> RunOutcome | None:
         """Store the view; the run continues."""
         # a case that tracks over these views has one leg, and no drives of its own
         self.views.append(replace(view, leg=0, drives=()))
         return None
 
-    def target(self, run: Run) -> TargetEstimate:
+    def target(self, run: RoverRun) -> TargetEstimate:
         """Return the designated position in the rover frame of the estimated pose, or the true target position."""
         if self.position_world is None:
             true_pose = run.vehicle.stance.world_from_rover
@@ -241,7 +241,7 @@ class DesignationGuide:
         return run.create_target_estimate(run.vehicle.estimated_pose.inv().apply(self.position_world.copy()))
 
     @classmethod
-    def designate(cls, run: Run, margin_px: float, oracle: bool) -> DesignationGuide:
+    def designate(cls, run: RoverRun, margin_px: float, oracle: bool) -> DesignationGuide:
         """Create the guide at the start; operators triangulate the point in images of the start.
 
         Raises ValueError if the mast cannot point at the target or the point cannot be triangulated.
@@ -261,18 +261,20 @@ class DesignationGuide:
 Guide = TrackerGuide | DesignationGuide
 
 
-def run_case(p: RoverScenarioParameters, streams: Streams) -> Run:
+def run_case(p: RoverScenarioParameters, streams: Streams) -> RoverRun:
     """Simulate a run from the designation of the target to its end."""
     return track_target(p, prepare_run(p, streams))
 
 
-def prepare_run(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank) -> Run:
+def prepare_run(
+    p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
+) -> RoverRun:
     """Create a run at its start and designate its target; the tracker is not called."""
     setup = Setup.draw(p, streams, load_ground)
-    return Run.from_setup(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
+    return RoverRun.from_setup(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
 
 
-def track_target(p: RoverScenarioParameters, run: Run) -> Run:
+def track_target(p: RoverScenarioParameters, run: RoverRun) -> RoverRun:
     """Drive a prepared run to its end, guided by the tracker of the parameters."""
     guide, last_leg = TrackerGuide(p, run, run.vehicle.estimated_pose), p.legs[-1]
     failure = drive_legs(p, run, guide)
@@ -291,7 +293,7 @@ def track_target(p: RoverScenarioParameters, run: Run) -> Run:
     return run
 
 
-def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome | None:
+def drive_legs(p: RoverScenarioParameters, run: RoverRun, guide: Guide) -> RunOutcome | None:
     """Drive all legs; return the outcome if the run ends early, else None."""
     failure = visit_stop(p, run, guide, -1)
     for number, leg in enumerate(p.legs):
@@ -306,7 +308,7 @@ def drive_legs(p: RoverScenarioParameters, run: Run, guide: Guide) -> RunOutcome
     return failure
 
 
-def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> RunOutcome | None:
+def visit_stop(p: RoverScenarioParameters, run: RoverRun, guide: Guide, leg: int) -> RunOutcome | None:
     """Point the mast, take images, and pass them to the guide; return the outcome if the run ends, else None."""
     run.time_s += p.timing.track_s
     aim = guide.aim(run)
@@ -325,12 +327,12 @@ def visit_stop(p: RoverScenarioParameters, run: Run, guide: Guide, leg: int) -> 
     images = run.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
     angles, drives = rig.state.readings_rad, tuple(run.drives_since_stop)
     run.drives_since_stop = []
-    view = View(leg, time_s, vehicle.stance, vehicle.estimated_pose, angles, world_from_head, images, drives)
+    view = StopView(leg, time_s, vehicle.stance, vehicle.estimated_pose, angles, world_from_head, images, drives)
     return guide.observe(run, view)
 
 
 def drive_step(
-    p: RoverScenarioParameters, run: Run, leg: LegParameters, step_count: int, target: TargetEstimate
+    p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, step_count: int, target: TargetEstimate
 ) -> RunOutcome | None:
     """Drive one step of a leg, in parts for visual odometry; return the outcome if the run ends, else None."""
     commands: Iterable[DriveCommand] = plan_step(leg, step_count, target)
@@ -358,7 +360,7 @@ def drive_step(
     return None
 
 
-def drive_part(p: RoverScenarioParameters, run: Run, leg: LegParameters, command: DriveCommand) -> Drive:
+def drive_part(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, command: DriveCommand) -> Drive:
     """Execute a drive command; with visual odometry, correct the estimated position by the motion between two pairs."""
     vehicle, is_oracle = run.vehicle, p.navigation.odometry == "oracle-motion"
     if not leg.visual_odometry or is_oracle:
@@ -376,7 +378,7 @@ def drive_part(p: RoverScenarioParameters, run: Run, leg: LegParameters, command
     return drive
 
 
-def take_odometry_pair(p: RoverScenarioParameters, run: Run) -> StereoMeasurement:
+def take_odometry_pair(p: RoverScenarioParameters, run: RoverRun) -> StereoMeasurement:
     """Take the stereo pair of visual odometry, straight ahead; reuse the last one if the rover has not moved since."""
     stance = run.vehicle.stance
     if run.odometry_pair is None or run.odometry_pair[0] is not stance:
@@ -386,7 +388,7 @@ def take_odometry_pair(p: RoverScenarioParameters, run: Run) -> StereoMeasuremen
     return run.odometry_pair[1]
 
 
-def map_terrain(p: RoverScenarioParameters, run: Run, leg: LegParameters, target: TargetEstimate) -> None:
+def map_terrain(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, target: TargetEstimate) -> None:
     """Add the stereo pairs of a navigation update to the navigator's map.
 
     The first update also adds the ground under the rover.

@@ -36,14 +36,14 @@ from marsyard.scenarios.rover import placement, score
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.run import (
     DesignationGuide,
-    Run,
+    RoverRun,
     Setup,
     TrackerGuide,
     drive_legs,
     prepare_run,
     track_target,
 )
-from marsyard.scenarios.rover.stops import RunOutcome, View, Visibility, designate_point, evaluate_visibility
+from marsyard.scenarios.rover.stops import RunOutcome, StopView, Visibility, designate_point, evaluate_visibility
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.timeline import run_timeline
 from marsyard.scenarios.rover.world import terrain_parameters
@@ -165,8 +165,8 @@ class SharedDrive:
     circle on the face that is visible from both ends of the circle.
     """
 
-    run: Run
-    views: tuple[View, ...]
+    run: RoverRun
+    views: tuple[StopView, ...]
     viewpoint: Float64[np.ndarray, "3"]
 
 
@@ -186,7 +186,9 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
-    run = Run.from_setup(setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast)))
+    run = RoverRun.from_setup(
+        setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast))
+    )
     guide = DesignationGuide.designate(run, key.margin_px, key.steering == "oracle-target")
     drive_legs(p, run, guide)
     if not guide.views:
@@ -194,15 +196,15 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
     return SharedDrive(run, tuple(guide.views), compute_viewpoint(guide.views[0].world_from_head))
 
 
-def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> Run:
+def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> RoverRun:
     """Create a run over the drive's images and designate its target; the tracker is not called."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
     target = designate_point(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint)
-    return Run.from_setup(run, target)
+    return RoverRun.from_setup(run, target)
 
 
-def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> Run:
+def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> RoverRun:
     """Run a tracker over the drive's images for one of the targets; default: the tracker under test."""
     run = prepare_shared_run(p, drive)
     parameters = p.drive.model_copy(update={"algorithm": algorithm or p.drive.algorithm})
@@ -227,7 +229,7 @@ def evaluate_drive_visibility(
     target = designate_point(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
     heads = [view.world_from_head for view in drive.views]
     visibility = evaluate_visibility(world, rig, target.point_world, heads, options)
-    run = Run.from_setup(drive.run, target)
+    run = RoverRun.from_setup(drive.run, target)
     return visibility, score.shadow_columns(p.model_copy(update={"vtt": options}), run, drive.views)
 
 
@@ -339,7 +341,7 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
         )
 
 
-def place_target(run: Run) -> Run:
+def place_target(run: RoverRun) -> RoverRun:
     """Place the instrument on a target that was handed over to the arm; return the run."""
     target = run.stops[-1].update.position_rover if run.handed_over else None
     if target is not None:
@@ -352,7 +354,7 @@ def place_target(run: Run) -> Run:
 class ScoredTrack:
     """A run of a tracker and the columns of its score."""
 
-    run: Run
+    run: RoverRun
     row: dict[str, Scalar]
 
     @property
@@ -361,7 +363,7 @@ class ScoredTrack:
         return self.run.outcome
 
 
-def run_tracker(p: RoverScenarioParameters, track: Callable[[], Run]) -> AlgorithmRun[ScoredTrack]:
+def run_tracker(p: RoverScenarioParameters, track: Callable[[], RoverRun]) -> AlgorithmRun[ScoredTrack]:
     """Run a tracker, whose answers move the mast or the rover; an exception is a failure of the tracker."""
 
     def track_and_score() -> ScoredTrack:

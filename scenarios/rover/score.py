@@ -18,8 +18,8 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
-from marsyard.scenarios.rover.run import Run
-from marsyard.scenarios.rover.stops import RunOutcome, View, evaluate_visibility
+from marsyard.scenarios.rover.run import RoverRun
+from marsyard.scenarios.rover.stops import RunOutcome, StopView, evaluate_visibility
 
 NAN = float("nan")
 #: Quantities of each update, in the order of the columns of stored updates.
@@ -39,13 +39,13 @@ REDUCTIONS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
 }
 
 
-def errors_px(run: Run) -> Float64[np.ndarray, "stops 2"]:
+def errors_px(run: RoverRun) -> Float64[np.ndarray, "stops 2"]:
     """Compute tracked minus true pixels (u, v) of the designated point at all stops; NaN if it was not tracked."""
     errors = [stop.reported_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
     return np.stack(errors) if errors else np.empty((0, 2))
 
 
-def score_run(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of tracking success and errors at the goal.
 
     - `tracked`: whether the run is completed and the last tracked pixel is within `tracked_px` of the true
@@ -100,7 +100,7 @@ def _finite_max(values: Float64[np.ndarray, "n"]) -> float:
     return float(np.nanmax(values)) if np.any(np.isfinite(values)) else NAN
 
 
-def tracking_row(run: Run) -> dict[str, Scalar]:
+def tracking_row(run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of tracking: extremes of Table III's quantities, drift, and designation errors."""
     quantities = update_quantities(run)
     tracked_stops = [stop for stop in run.stops if stop.update.tracked]
@@ -134,7 +134,7 @@ def tracking_row(run: Run) -> dict[str, Scalar]:
     }
 
 
-def update_quantities(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
+def update_quantities(run: RoverRun) -> dict[str, Float64[np.ndarray, "stops"]]:
     """Collect the quantities of all updates in arrays; NaN if missing: for a tracker without details, for example."""
     rows = []
     for stop, error in zip(run.stops, errors_px(run), strict=True):
@@ -164,7 +164,7 @@ def update_quantities(run: Run) -> dict[str, Float64[np.ndarray, "stops"]]:
     return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in UPDATE_QUANTITIES}
 
 
-def update_columns(run: Run, count: int) -> dict[str, Scalar]:
+def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
     """Compute the columns of the first updates (as in Table III), NaN for missing updates."""
     return {
         f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else NAN
@@ -173,7 +173,7 @@ def update_columns(run: Run, count: int) -> dict[str, Scalar]:
     }
 
 
-def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of conditions that do not depend on the tracker, from the simulated objects."""
     target, rocks, number = run.target, run.world.rocks, run.world.target_number
     azimuth_error, elevation_error = np.degrees(run.rig.mast.zeros_rad)
@@ -203,7 +203,7 @@ def fixed_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     }
 
 
-def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of conditions that depend on the tracker's run, from the simulated objects."""
     stops, world = run.stops, run.world
     drives = [drive for stop in stops for drive in stop.drives]
@@ -236,7 +236,7 @@ def run_conditions(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
     }
 
 
-def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar]:
+def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of the designated point's visibility at the stops of a run, and of the rover's shadow on it.
 
     Stops count up to the first one with a lost or falsely tracked point: later poses follow from the tracker's error.
@@ -254,11 +254,11 @@ def visibility_columns(p: RoverScenarioParameters, run: Run) -> dict[str, Scalar
     return {"point_in_view": columns.pop("in_view"), **columns, **shadow_columns(p, run, run.stops[:end])}
 
 
-def shadow_columns(p: RoverScenarioParameters, run: Run, views: Sequence[View]) -> dict[str, Scalar]:
+def shadow_columns(p: RoverScenarioParameters, run: RoverRun, views: Sequence[StopView]) -> dict[str, Scalar]:
     """Compute the columns of the rover's shadow: whether it is on the template of the designated point in any view."""
     half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
 
-    def is_in_shadow(view: View) -> bool:
+    def is_in_shadow(view: StopView) -> bool:
         viewpoint = run.rig.camera_positions(view.world_from_head)[0]
         patch = sample_template(viewpoint, run.target.point_world, half_angle)
         sun = run.world.sun.direction(view.time_s)
@@ -268,7 +268,7 @@ def shadow_columns(p: RoverScenarioParameters, run: Run, views: Sequence[View]) 
     return {"rover_shadow_on_target": is_shadowed, "no_rover_shadow_on_target": not is_shadowed}
 
 
-def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
+def products(p: RoverScenarioParameters, run: RoverRun) -> dict[str, object]:
     """Collect the arrays for a run's figures (Figs. 15, 16b and 17 of the paper).
 
     ================== ================================================================================================
@@ -330,7 +330,7 @@ def products(p: RoverScenarioParameters, run: Run) -> dict[str, object]:
     return arrays
 
 
-def create_scored_run(run: Run) -> ScoredRun:
+def create_scored_run(run: RoverRun) -> ScoredRun:
     """Create the input of custom scores."""
     mast = run.rig.calibrated
     return ScoredRun(

@@ -153,7 +153,7 @@ class RunOutcome(Enum):
 
 
 @dataclass(frozen=True)
-class View:
+class StopView:
     """The images of a stop, with the poses at which they were taken."""
 
     leg: int  #: index of the leg (drive between two stops) that ended here; -1 for the start
@@ -171,7 +171,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Stop(View):
+class Stop(StopView):
     """A stop at which the target was tracked."""
 
     update: TargetUpdate  #: the tracker's answer
@@ -184,12 +184,17 @@ class Stop(View):
 
     @classmethod
     def from_view(
-        cls, view: View, point_m: Float64[np.ndarray, "3"], left: CameraModel, update: TargetUpdate, track_time_s: float
+        cls,
+        view: StopView,
+        point_m: Float64[np.ndarray, "3"],
+        left: CameraModel,
+        update: TargetUpdate,
+        track_time_s: float,
     ) -> Stop:
         """Create a stop; `point_m` is the designated point in world axes, `left` the true left camera."""
         in_head = np.asarray(view.world_from_head.inv().apply(point_m.copy()))
         return cls(
-            **{item.name: getattr(view, item.name) for item in fields(View)},
+            **{item.name: getattr(view, item.name) for item in fields(StopView)},
             update=update,
             details=update.details if isinstance(update.details, VttDetails) else None,
             reported_position_rover=update.position_rover if update.tracked else None,

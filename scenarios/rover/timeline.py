@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import Run
+from marsyard.scenarios.rover.run import RoverRun
 from marsyard.scenarios.rover.score import update_quantities
 from marsyard.scenarios.rover.stops import Stop
 from marsyard.scenarios.timeline import CameraPose, Path, Points, Series, TimedImage, Timeline, surface_from_above
@@ -19,7 +19,7 @@ _MARGIN_M = 2.0
 _NO_SERIES = ("leg", "time_s")
 
 
-def run_timeline(p: RoverScenarioParameters, run: Run) -> Timeline:
+def run_timeline(p: RoverScenarioParameters, run: RoverRun) -> Timeline:
     """Create the timeline of a run: images and answers at the stops, true and estimated path."""
     stops, target_m = run.stops, run.target.point_world
     true_path, positions = _true_path(stops), np.array([stop.stance.world_from_rover.translation for stop in stops])
@@ -74,7 +74,7 @@ def _true_path(stops: list[Stop]) -> Path:
     return Path.from_poses(times, poses)
 
 
-def _images(run: Run, stop: Stop, template_px: float) -> list[TimedImage]:
+def _images(run: RoverRun, stop: Stop, template_px: float) -> list[TimedImage]:
     """Return the subframes of a stop; the tracked template and the search window are marked in the left one."""
     images = []
     details, rig = stop.details, run.rig

@@ -11,12 +11,12 @@ from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters, WorldParameters
+from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
 from marsyard.scenarios.views import SiteGround, Viewpoint, select_rocks, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.driving import Drive, Soil, drive
-from marsyard.sim.dynamics.rover import MER, ROCKY_8, Ground, RockyGround, RoverParameters, Stance, settle
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, DrivenGround, RockyGround, RoverParameters, Stance, settle
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, MastCalibration
 from marsyard.sim.render import CloudLayer, PixelRays, Scene
@@ -71,7 +71,7 @@ class RunWorld:
     base: Scene  #: scene at the start, without the rover
     viewpoint: Viewpoint  #: position of the target and resolution of the cameras
     start_distance_m: float
-    sun: SunParameters
+    sun: MovingSunParameters
     target_number: int  #: index of the target's rock
     target_triangles: Float64[np.ndarray, "triangles 3 3"]  #: rendered mesh of the target's rock, used as truth
     _cached_scene: tuple[int, Scene] | None = field(default=None, repr=False)
@@ -255,7 +255,7 @@ class Vehicle:
     """A rover on its route: true stance, and pose estimated by odometry."""
 
     rover: RoverParameters
-    ground: Ground
+    ground: DrivenGround
     soil: Soil
     stance: Stance
     odometer: Odometer
@@ -278,7 +278,7 @@ class Vehicle:
         position = (
             target + (world.face_distance_m(p) + p.start.distance_m) * to_start - base[0] * ahead - base[1] * left
         )
-        ground: Ground = world.ground.surface
+        ground: DrivenGround = world.ground.surface
         if p.world.rocks_underfoot:
             ground = world.route_ground
         stance = settle(rover, ground, float(position[0]), float(position[1]), float(azimuth))

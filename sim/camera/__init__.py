@@ -7,7 +7,7 @@ column and row, with the centre of the upper left pixel at (0, 0).
 
 from marsyard.sim.camera.base import CameraModel, camera_pose, mount_looking_down
 from marsyard.sim.camera.calibrations import Calibration, read_calibrations
-from marsyard.sim.camera.label_frames import Frame, FramedCamera
+from marsyard.sim.camera.label_frames import FramedCamera, LabelFrame
 from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
 from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
 from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product
@@ -24,6 +24,14 @@ from marsyard.sim.camera.text_files import (
 )
 
 __all__ = ["BODY_FRAME", "HEAD_FRAME", "Cahv", "Cahvor", "Cahvore", "Calibration", "CameraFileError", "CameraModel"]
-__all__ += ["Frame", "FramedCamera", "Pds3Product", "Residual", "camera_pose", "from_opencv", "from_opencv_fisheye"]
+__all__ += [
+    "FramedCamera",
+    "LabelFrame",
+    "Pds3Product",
+    "Residual",
+    "camera_pose",
+    "from_opencv",
+    "from_opencv_fisheye",
+]
 __all__ += ["mount_looking_down", "read_cahvor", "read_calibrations", "read_camera", "read_cameras"]
 __all__ += ["read_framed_cameras", "read_pds3", "read_pds3_product", "read_pds4", "write_cahvor"]

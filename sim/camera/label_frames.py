@@ -37,14 +37,14 @@ _QUATERNION_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Frame:
+class LabelFrame:
     """A frame of reference: normalised name (`SITE` for SITE_FRAME), and its indices (site, drive); () if unknown."""
 
     name: str
     indices: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, name: str, indices: Sequence[int] = ()) -> Frame:
+    def of(cls, name: str, indices: Sequence[int] = ()) -> LabelFrame:
         """Create the frame from the name and all indices in a label."""
         words = re.sub(r"[\s_-]+", "_", name.strip().upper()).removesuffix("_FRAME")
         words = _NAMES.get(words, words)
@@ -55,7 +55,7 @@ class Frame:
         """Whether the frame is that of a rover or lander."""
         return self.name in _VEHICLES.values()
 
-    def matches(self, other: Frame) -> bool:
+    def matches(self, other: LabelFrame) -> bool:
         """Return whether both frames can be equal: names, and the indices that both contain."""
         common = min(len(self.indices), len(other.indices))
         return self.name == other.name and self.indices[:common] == other.indices[:common]
@@ -65,15 +65,15 @@ class Frame:
 
 
 #: Frame of camera models whose label does not name one, and of files in other formats.
-ROVER_FRAME = Frame("ROVER")
+ROVER_FRAME = LabelFrame("ROVER")
 
 
 @dataclass(frozen=True)
 class CoordinateSystem:
     """Definition of a frame in a label: ``reference_from_frame.apply(points_frame)`` gives points in `reference`."""
 
-    frame: Frame
-    reference: Frame
+    frame: LabelFrame
+    reference: LabelFrame
     reference_from_frame: RigidTransform
 
 
@@ -82,7 +82,7 @@ class FramedCamera:
     """A camera model and the frame of its vectors: a vehicle's, a site's, or the Mars-fixed frame."""
 
     camera: CameraModel
-    frame: Frame
+    frame: LabelFrame
 
 
 def transform_from_label(
@@ -99,7 +99,7 @@ def transform_from_label(
 
 
 def resolve_camera(
-    camera: CameraModel, frame: Frame, systems: Sequence[CoordinateSystem], field: str, source: Source
+    camera: CameraModel, frame: LabelFrame, systems: Sequence[CoordinateSystem], field: str, source: Source
 ) -> FramedCamera:
     """Transform a label's camera to the vehicle's frame or, without that transform, to a site's or the Mars-fixed one.
 
@@ -114,7 +114,7 @@ def resolve_camera(
     raise source.error(field, f"{frame} has no known transform to the rover", _ALLOWED)
 
 
-def find_pose(vehicle: Frame, systems: Sequence[CoordinateSystem]) -> tuple[Frame, RigidTransform] | None:
+def find_pose(vehicle: LabelFrame, systems: Sequence[CoordinateSystem]) -> tuple[LabelFrame, RigidTransform] | None:
     """Find the vehicle's pose in a site's frame or else in the Mars-fixed frame; None if the label has none."""
     paths = _transforms_from(vehicle, systems)
     for name in (SITE, MARS_FIXED):
@@ -124,12 +124,14 @@ def find_pose(vehicle: Frame, systems: Sequence[CoordinateSystem]) -> tuple[Fram
     return None
 
 
-def _transforms_from(start: Frame, systems: Sequence[CoordinateSystem]) -> list[tuple[Frame, RigidTransform | None]]:
+def _transforms_from(
+    start: LabelFrame, systems: Sequence[CoordinateSystem]
+) -> list[tuple[LabelFrame, RigidTransform | None]]:
     """Return all frames connected to `start`, nearest first, with the transforms from it; None is the identity."""
     edges = [(system.frame, system.reference, system.reference_from_frame) for system in systems]
     edges += _implied_edges(systems)
     edges += [(target, source, transform.inv()) for source, target, transform in edges]
-    paths: list[tuple[Frame, RigidTransform | None]] = [(start, None)]
+    paths: list[tuple[LabelFrame, RigidTransform | None]] = [(start, None)]
     for frame, frame_from_start in paths:  # grows while it is read: breadth first
         for source, target, target_from_source in edges:
             if frame.matches(source) and not any(known.matches(target) for known, _ in paths):
@@ -138,7 +140,7 @@ def _transforms_from(start: Frame, systems: Sequence[CoordinateSystem]) -> list[
     return paths
 
 
-def _implied_edges(systems: Sequence[CoordinateSystem]) -> list[tuple[Frame, Frame, RigidTransform]]:
+def _implied_edges(systems: Sequence[CoordinateSystem]) -> list[tuple[LabelFrame, LabelFrame, RigidTransform]]:
     """Return the transforms from vehicles to the local level frame, which is defined by the vehicle's pose in a site.
 
     Its origin is the vehicle's and its axes are the site's. A definition in the label has priority.
@@ -148,7 +150,7 @@ def _implied_edges(systems: Sequence[CoordinateSystem]) -> list[tuple[Frame, Fra
     return [
         (
             system.frame,
-            Frame(LOCAL_LEVEL, system.frame.indices),
+            LabelFrame(LOCAL_LEVEL, system.frame.indices),
             rigid(system.reference_from_frame.rotation, np.zeros(3)),
         )
         for system in systems

@@ -25,8 +25,8 @@ from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     SITE,
     CoordinateSystem,
-    Frame,
     FramedCamera,
+    LabelFrame,
     find_pose,
     resolve_camera,
     transform_from_label,
@@ -83,7 +83,7 @@ class Pds3Product:
     """
 
     counts: UInt16[np.ndarray, "rows columns"]
-    pose: tuple[Frame, RigidTransform] | None
+    pose: tuple[LabelFrame, RigidTransform] | None
     time_s: float | None
 
     @property
@@ -160,13 +160,13 @@ def read_pds3_product(path: str | Path) -> Pds3Product:
     return Pds3Product(counts, pose, time_s)
 
 
-def _read_frame(group: Any, kind: str, default: str = ROVER_FRAME.name) -> Frame:
+def _read_frame(group: Any, kind: str, default: str = ROVER_FRAME.name) -> LabelFrame:
     """Read the frame of a group: its own (kind COORDINATE) or the one that it refers to (kind REFERENCE)."""
     prefix = "COORDINATE_SYSTEM" if kind == "COORDINATE" else "REFERENCE_COORD_SYSTEM"
     name, indices = group.get(f"{prefix}_NAME"), group.get(f"{prefix}_INDEX", [])
     indices = indices if isinstance(indices, list) else [indices]
     is_known = all(isinstance(index, int) for index in indices)
-    return Frame.of(name if isinstance(name, str) else default, indices if is_known else ())
+    return LabelFrame.of(name if isinstance(name, str) else default, indices if is_known else ())
 
 
 def _read_systems(label: Any, source: Source) -> list[CoordinateSystem]:

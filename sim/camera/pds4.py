@@ -16,8 +16,8 @@ from marsyard.sim.camera.calibration_files import parse_xml
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     CoordinateSystem,
-    Frame,
     FramedCamera,
+    LabelFrame,
     resolve_camera,
     transform_from_label,
 )
@@ -99,10 +99,10 @@ def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> t
     )
 
 
-def _read_systems(root: ElementTree.Element, source: Source) -> tuple[list[CoordinateSystem], dict[str, Frame]]:
+def _read_systems(root: ElementTree.Element, source: Source) -> tuple[list[CoordinateSystem], dict[str, LabelFrame]]:
     """Read the definitions of frames, and the frames by local identifier. Raises CameraFileError."""
     definitions = []
-    identified: dict[str, Frame] = {}
+    identified: dict[str, LabelFrame] = {}
     for element in _find_elements(root, "Coordinate_Space_Definition"):
         identifiers = [_element_text(child) for child in element if _local_name(child) == "local_identifier"]
         default = _parse_identifier(identifiers[0]) if identifiers else None
@@ -141,25 +141,25 @@ def _read_systems(root: ElementTree.Element, source: Source) -> tuple[list[Coord
 
 
 def _read_frame(
-    element: ElementTree.Element | None, identified: dict[str, Frame], default: Frame | None
-) -> Frame | None:
+    element: ElementTree.Element | None, identified: dict[str, LabelFrame], default: LabelFrame | None
+) -> LabelFrame | None:
     """Read the frame of a reference: named with indices, by a SPICE name, or by the identifier of a definition."""
     if element is None:
         return default
     for child in _find_elements(element, "coordinate_space_frame_type", "frame_spice_name"):
         indices = [_element_text(index) for index in _find_elements(element, "index_value_number")]
         is_known = all(index.isdecimal() for index in indices)
-        return Frame.of(_element_text(child), [int(index) for index in indices] if is_known else ())
+        return LabelFrame.of(_element_text(child), [int(index) for index in indices] if is_known else ())
     for child in _find_elements(element, "local_identifier_reference"):
         return identified.get(_element_text(child)) or _parse_identifier(_element_text(child))
     return default
 
 
-def _parse_identifier(identifier: str) -> Frame:
+def _parse_identifier(identifier: str) -> LabelFrame:
     match = _IDENTIFIER.fullmatch(identifier)
     if match is None:
-        return Frame.of(identifier)
-    return Frame.of(match["name"], [int(index) for index in match["indices"].split("_")[1:]])
+        return LabelFrame.of(identifier)
+    return LabelFrame.of(match["name"], [int(index) for index in match["indices"].split("_")[1:]])
 
 
 def _local_name(element: ElementTree.Element) -> str:

@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.sim.dynamics.rover import Ground, RoverParameters, Stance, settle
+from marsyard.sim.dynamics.rover import DrivenGround, RoverParameters, Stance, settle
 from marsyard.sim.error_sources import SLIP
 from marsyard.sim.frames import compose, rotation_matrix
 from marsyard.sim.measurements import DriveCommand
@@ -171,7 +171,12 @@ class Drive:
 
 
 def drive(
-    rover: RoverParameters, ground: Ground, soil: Soil, start: Stance, command: DriveCommand, rng: np.random.Generator
+    rover: RoverParameters,
+    ground: DrivenGround,
+    soil: Soil,
+    start: Stance,
+    command: DriveCommand,
+    rng: np.random.Generator,
 ) -> Drive:
     """Execute one command (a path forward, backward, sideways or along an arc, or a turn in place) from a stance.
 

@@ -54,7 +54,7 @@ _SAMPLE_SPACING = 0.7
 
 
 @runtime_checkable
-class Ground(Protocol):
+class DrivenGround(Protocol):
     """Ground under the wheels: `marsyard.sim.terrain.Surface`, or `RockyGround`."""
 
     def height(self, x: Float[np.ndarray, "*batch"], y: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
@@ -72,14 +72,14 @@ class RockyGround:
     - above_m: height of each cell above the ground, 0 without a rock; row i is at y = corner + i cells
     """
 
-    ground: Ground
+    ground: DrivenGround
     corner_m: tuple[float, float]
     above_m: Float64[np.ndarray, "rows columns"]
 
     @classmethod
     def from_triangles(
         cls,
-        ground: Ground,
+        ground: DrivenGround,
         triangles: Float64[np.ndarray, "triangles 3 3"],
         centre_m: tuple[float, float],
         half_m: float,
@@ -234,7 +234,7 @@ class Stance:
 
 def settle(
     rover: RoverParameters,
-    ground: Ground,
+    ground: DrivenGround,
     east_m: float,
     north_m: float,
     azimuth_rad: float,
@@ -279,7 +279,7 @@ class _StanceEquations:
     """Gaps under the wheels as a function of (height, pitch, roll, differential, left bogie, right bogie)."""
 
     rover: RoverParameters
-    ground: Ground
+    ground: DrivenGround
     position_m: Float64[np.ndarray, "2"]
     yaw_rad: float
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
-from marsyard.sim.terrain.landforms.ground import Ground, Spectrum, refine, substream
+from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround, refine, substream
 from marsyard.sim.terrain.landforms.kernels import interleave_samples, stamp_craters
 from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_craters
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
@@ -48,11 +48,11 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     if p.units is None:
         height = relief.draw_field(substream(rng, "relief"), relief_m)
         log_albedo = albedo.draw_field(substream(rng, "albedo"), contrast)
-        ground = Ground(height, log_albedo, p.spacing_m)
+        ground = TerrainGround(height, log_albedo, p.spacing_m)
     else:
         height, fine_relief = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
         log_albedo, fine_albedo = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
-        ground = Ground(height, log_albedo, p.spacing_m)
+        ground = TerrainGround(height, log_albedo, p.spacing_m)
         factors = p.units.apply(ground, craters, substream(rng, "units"))
         height += fine_relief * refine(np.ascontiguousarray(factors[..., ROUGHNESS]), ground.side)
         log_albedo += fine_albedo * refine(np.ascontiguousarray(factors[..., TEXTURE]), ground.side)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, spline_filter
 
-from marsyard.sim.terrain.landforms.ground import Ground, refine
+from marsyard.sim.terrain.landforms.ground import TerrainGround, refine
 from marsyard.sim.terrain.rasters import (
     Coordinates,
     Grid,
@@ -215,7 +215,7 @@ def choose_grid(source: RealTerrain) -> tuple[int, float]:
 Detail = tuple[GridPatch, GridPatch]
 
 
-def extract_fine_detail(ground: Ground, dtm: EmbeddedDtm) -> Detail:
+def extract_fine_detail(ground: TerrainGround, dtm: EmbeddedDtm) -> Detail:
     """Extract the synthetic ground's wavelengths below twice the DTM's posting, in the area of the DTM.
 
     This is a Gaussian high-pass filter with an amplitude of 0.5 at that wavelength.
@@ -228,7 +228,7 @@ def extract_fine_detail(ground: Ground, dtm: EmbeddedDtm) -> Detail:
     return height, log_brightness
 
 
-def blend_into_ground(ground: Ground, dtm: EmbeddedDtm, detail: Detail | None) -> None:
+def blend_into_ground(ground: TerrainGround, dtm: EmbeddedDtm, detail: Detail | None) -> None:
     """Blend the DTM into the synthetic ground, in place.
 
     First the synthetic ground is deformed to meet the DTM at its border. The deformation is the height difference at

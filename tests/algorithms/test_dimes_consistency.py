@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, build_view
+from marsyard.algorithms.dimes.binning import BinnedView, build_view
 from marsyard.algorithms.dimes.details import DimesTrack, PairDetails
 from marsyard.algorithms.dimes.estimator import combine_pairs
 from marsyard.algorithms.dimes.options import DimesOptions
@@ -39,7 +39,7 @@ def make_track(pair: int, index: int, velocity: np.ndarray, failures: tuple[Vali
 
 
 @cache
-def make_nadir_view() -> View:
+def make_nadir_view() -> BinnedView:
     """Create a black view from 2 km."""
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, CAMERA.bin(1, ROWS_SUMMED), make_calibration())
     return build_view(image, Rotation.identity(), 2000.0, (256, 256))

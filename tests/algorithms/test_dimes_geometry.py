@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.dimes.binning import (
-    View,
+    BinnedView,
     build_view,
     ground_from_pixels,
     ground_lattice,
@@ -55,7 +55,9 @@ MAX_OFF_NADIR_RAD = OPTIONS.max_off_nadir_rad
 SUN_BELOW_HORIZON = direction(0.0, -1.0)
 
 
-def make_view(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None) -> View:
+def make_view(
+    attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None
+) -> BinnedView:
     """Create a view of level ground; its image is uniform unless `counts` are given."""
     image = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
     return build_view(
@@ -65,12 +67,12 @@ def make_view(attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts
 
 def make_views(
     first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)
-) -> tuple[View, View]:
+) -> tuple[BinnedView, BinnedView]:
     """Create two views with these attitudes; the default altitudes differ by 75 m/s in 3.75 s."""
     return make_view(first, altitudes[0]), make_view(second, altitudes[1], INTERVAL_S)
 
 
-def find_candidates(first: View, second: View, sun: np.ndarray = SUN_BELOW_HORIZON) -> Candidates:
+def find_candidates(first: BinnedView, second: BinnedView, sun: np.ndarray = SUN_BELOW_HORIZON) -> Candidates:
     """Find the template candidates of a pair."""
     return template_candidates(first, second, search_geometry(first, second, OPTIONS), sun, OPTIONS)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import View, bin_factors, bin_mean, build_view, correct_patch
+from marsyard.algorithms.dimes.binning import BinnedView, bin_factors, bin_mean, build_view, correct_patch
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import (
@@ -65,7 +65,7 @@ def test_exposure_is_optional_without_frame_transfer() -> None:
     np.testing.assert_array_equal(remove_frame_transfer(signal, detector, 2), signal)
 
 
-def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, View]:
+def render_view(transfer_row_s: float, clear_row_s: float) -> tuple[np.ndarray, BinnedView]:
     """Render a textured scene; return its radiance and the DIMES view of its image."""
     attitude = Rotation.from_euler("zy", [30.0, 12.0], degrees=True)
     radiance = trace_scene(draw_terrain(), attitude, np.array([500.0, 300.0, 1700.0]))

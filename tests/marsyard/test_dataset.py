@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.dataset import _prepare_terrains
-from marsyard.scenarios.descent.exposure import World
+from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.sim.camera import read_cahvor
 from tests.command import run_command
@@ -132,7 +132,7 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     campaign = load_campaign("dimes-smoke", settings)
     parameters = campaign.parameters(0)
     assert isinstance(parameters, DescentScenarioParameters)
-    surface = World.from_parameters(parameters).surface
+    surface = DescentWorld.from_parameters(parameters).surface
     path = tmp_path / "camera.cahvor"
     for number in range(3):
         sample = json.loads(files[f"0000000-{number}.json"])

@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 from rich.console import Console
 
 from marsyard import doctor, gl_probe
-from marsyard.doctor import Check, Probe, Verdict
+from marsyard.doctor import CheckResult, DoctorCheck, Probe
 
 #: Results of a rendering test with an OpenGL backend that works, and with one that is not installed.
 WORKING_BACKEND = Probe(
@@ -34,7 +34,7 @@ def run_doctor(*, as_json: bool = False) -> tuple[int, str]:
 
 
 @pytest.fixture
-def set_check(monkeypatch: pytest.MonkeyPatch) -> Callable[[Check], None]:
+def set_check(monkeypatch: pytest.MonkeyPatch) -> Callable[[DoctorCheck], None]:
     """Return a function that replaces all checks by one."""
     return lambda check: monkeypatch.setattr(doctor, "run_checks", lambda: iter([check]))
 
@@ -47,11 +47,11 @@ def test_all_checks_pass_on_this_machine() -> None:
     assert "A campaign can run here." in text
 
 
-@pytest.mark.parametrize(("verdict", "status"), [(Verdict.OK, 0), (Verdict.WARN, 0), (Verdict.FAIL, 1)])
+@pytest.mark.parametrize(("verdict", "status"), [(CheckResult.OK, 0), (CheckResult.WARN, 0), (CheckResult.FAIL, 1)])
 def test_only_failures_change_the_exit_status(
-    set_check: Callable[[Check], None], verdict: Verdict, status: int
+    set_check: Callable[[DoctorCheck], None], verdict: CheckResult, status: int
 ) -> None:
-    set_check(Check("disk", "2 GB [free]", verdict, "see the manual"))
+    set_check(DoctorCheck("disk", "2 GB [free]", verdict, "see the manual"))
     exit_status, text = run_doctor()
     assert exit_status == status
     assert "2 GB [free]" in text
@@ -81,16 +81,16 @@ def test_missing_backend_has_an_error_message() -> None:
 @pytest.mark.parametrize(
     ("osmesa", "egl", "backend", "verdict", "remedy"),
     [
-        (WORKING_BACKEND, WORKING_BACKEND, "osmesa", Verdict.OK, ""),
-        (WORKING_BACKEND, ABSENT_BACKEND, "osmesa", Verdict.OK, ""),
-        (ABSENT_BACKEND, WORKING_BACKEND, "egl", Verdict.OK, ""),
-        (ABSENT_BACKEND, WORKING_BACKEND, "osmesa", Verdict.WARN, "export MARSYARD_GL=egl"),
-        (ABSENT_BACKEND, ABSENT_BACKEND, "osmesa", Verdict.FAIL, "apt-get install libosmesa6"),
-        (WORKING_BACKEND, WORKING_BACKEND, "vulkan", Verdict.FAIL, "unset MARSYARD_GL"),
+        (WORKING_BACKEND, WORKING_BACKEND, "osmesa", CheckResult.OK, ""),
+        (WORKING_BACKEND, ABSENT_BACKEND, "osmesa", CheckResult.OK, ""),
+        (ABSENT_BACKEND, WORKING_BACKEND, "egl", CheckResult.OK, ""),
+        (ABSENT_BACKEND, WORKING_BACKEND, "osmesa", CheckResult.WARN, "export MARSYARD_GL=egl"),
+        (ABSENT_BACKEND, ABSENT_BACKEND, "osmesa", CheckResult.FAIL, "apt-get install libosmesa6"),
+        (WORKING_BACKEND, WORKING_BACKEND, "vulkan", CheckResult.FAIL, "unset MARSYARD_GL"),
     ],
 )
 def test_verdict_follows_the_selected_backend(
-    monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, backend: str, verdict: Verdict, remedy: str
+    monkeypatch: pytest.MonkeyPatch, osmesa: Probe, egl: Probe, backend: str, verdict: CheckResult, remedy: str
 ) -> None:
     monkeypatch.setenv("MARSYARD_GL", backend)
     *_, selection = doctor.check_rendering({"osmesa": osmesa, "egl": egl})
@@ -102,8 +102,8 @@ def test_backend_with_wrong_depth_fails() -> None:
     assert WORKING_BACKEND.measurements is not None
     inaccurate = Probe({**WORKING_BACKEND.measurements, "depth_error_m": 0.5})
     first, *_, selection = doctor.check_rendering({"osmesa": inaccurate})
-    assert first.verdict is Verdict.WARN
-    assert selection.verdict is Verdict.FAIL
+    assert first.verdict is CheckResult.WARN
+    assert selection.verdict is CheckResult.FAIL
 
 
 def test_package_from_another_folder_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_package_from_another_folder_is_reported(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(importlib.util, "find_spec", find_shadowed_spec)
     check = next(doctor.check_shadowing())
-    assert check.verdict is Verdict.FAIL
+    assert check.verdict is CheckResult.FAIL
     assert f"marsyard from {tmp_path / 'marsyard'}" in check.finding
 
 
@@ -150,11 +150,11 @@ def test_missing_old_and_broken_dependencies_are_reported(monkeypatch: pytest.Mo
     monkeypatch.setattr(doctor, "_read_pins", lambda: {"rich": "15.0.0"})
     checks = {check.name: check for check in doctor.check_dependencies({"joblib": "OSError: truncated"})}
     assert {name: check.verdict for name, check in checks.items()} == {
-        "numpy": Verdict.FAIL,
-        "scipy": Verdict.FAIL,
-        "joblib": Verdict.FAIL,
-        "dependencies": Verdict.OK,
-        "pinned versions": Verdict.WARN,
+        "numpy": CheckResult.FAIL,
+        "scipy": CheckResult.FAIL,
+        "joblib": CheckResult.FAIL,
+        "dependencies": CheckResult.OK,
+        "pinned versions": CheckResult.WARN,
     }
     assert "truncated" in checks["joblib"].finding
     assert "rich 14.0 (pinned 15.0.0)" in checks["pinned versions"].finding
@@ -172,12 +172,12 @@ def test_module_that_exits_does_not_hide_other_failures(monkeypatch: pytest.Monk
 
 
 def test_python_without_assertions_fails() -> None:
-    assert doctor.check_optimisation(has_assertions=False).verdict is Verdict.FAIL
+    assert doctor.check_optimisation(has_assertions=False).verdict is CheckResult.FAIL
 
 
 def test_more_threads_than_cores_give_a_warning() -> None:
-    assert doctor.check_threads({"OMP_NUM_THREADS": "64"}, cores=2).verdict is Verdict.WARN
-    assert doctor.check_threads({"OMP_NUM_THREADS": "1"}, cores=2).verdict is Verdict.OK
+    assert doctor.check_threads({"OMP_NUM_THREADS": "64"}, cores=2).verdict is CheckResult.WARN
+    assert doctor.check_threads({"OMP_NUM_THREADS": "1"}, cores=2).verdict is CheckResult.OK
 
 
 def test_unwritable_caches_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -185,8 +185,8 @@ def test_unwritable_caches_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_pat
     file.touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(file / "numba"))
     monkeypatch.setenv("MARSYARD_CACHE", str(file))
-    assert doctor.check_numba_cache().verdict is Verdict.WARN
-    assert [check.verdict for check in doctor.check_disk()] == [Verdict.OK, Verdict.FAIL]
+    assert doctor.check_numba_cache().verdict is CheckResult.WARN
+    assert [check.verdict for check in doctor.check_disk()] == [CheckResult.OK, CheckResult.FAIL]
 
 
 def test_probe_imports_only_the_standard_library() -> None:

@@ -26,8 +26,8 @@ from marsyard.scenarios.fieldtest.imaging import (
     sun_direction,
     take_image,
 )
-from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, TargetParameters
-from marsyard.scenarios.fieldtest.run import Category, Run, find_triples, simulate_elevation_model, simulate_run
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, ImageTargetParameters
+from marsyard.scenarios.fieldtest.run import Category, FieldRun, find_triples, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
 from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
 from marsyard.scenarios.parts import ScoredFlight
@@ -54,12 +54,12 @@ def make_parameters(**changes: Any) -> FieldTestParameters:
     return FieldTestParameters.model_validate({**parameters, **small, **changes})
 
 
-def make_ivanpah_run(**changes: Any) -> Run:
+def make_ivanpah_run(**changes: Any) -> FieldRun:
     """Simulate run 4 of the campaign, Ivanpah Run 3, with seed 5."""
     return simulate_run(RunKey(make_parameters(**changes), 4, 5, "test"))
 
 
-def compute_attitude_errors_deg(run: Run) -> np.ndarray:
+def compute_attitude_errors_deg(run: FieldRun) -> np.ndarray:
     """Compute the errors of the fitted attitudes, rotation vectors in world axes, shape (images, 3)."""
     errors: np.ndarray = np.degrees((run.attitudes * run.truth.attitudes.inv()).as_rotvec())
     return errors
@@ -223,7 +223,7 @@ def test_three_targets_are_in_the_centre() -> None:
     """Paper, III.D.2: nine of eleven targets are used, three are in the centre (here on a circle of 10 m radius)."""
     flat_ground = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
     centre = np.array([300.0, -120.0])
-    targets = Targets.draw(TargetParameters(survey_m=0.0), flat_ground, centre, np.random.default_rng(3))
+    targets = Targets.draw(ImageTargetParameters(survey_m=0.0), flat_ground, centre, np.random.default_rng(3))
     distances = np.hypot(*(targets.surveyed_m[:, :2] - centre).T)
     assert len(distances) == 9
     np.testing.assert_allclose(distances[:3], 10.0, atol=1e-6)
@@ -231,7 +231,7 @@ def test_three_targets_are_in_the_centre() -> None:
     sides = targets.surveyed_m[:3] - np.roll(targets.surveyed_m[:3], 1, axis=0)
     np.testing.assert_allclose(np.linalg.norm(sides, axis=1), 10.0 * np.sqrt(3.0), atol=1e-6)
     with pytest.raises(ValueError, match="10 targets are in the centre, but only 9 are used"):
-        TargetParameters(central=10)
+        ImageTargetParameters(central=10)
 
 
 def test_targets_are_detected_only_if_the_image_contains_them() -> None:
@@ -241,7 +241,7 @@ def test_targets_are_detected_only_if_the_image_contains_them() -> None:
     image = rng.normal(1000.0, 30.0, (256, 1024)).clip(0.0).astype(np.uint16)
     image[100:103, 500:505] = 3000
     flat_ground = Surface.from_samples(np.zeros((64, 64, 2), dtype=np.float32), 500.0)
-    targets = Targets.draw(TargetParameters(), flat_ground, np.zeros(2), rng)
+    targets = Targets.draw(ImageTargetParameters(), flat_ground, np.zeros(2), rng)
     position = np.array([0.0, 0.0, 500.0])
     centroids = detect_targets(image, targets, camera, position, Rotation.identity(), np.radians(1.0))
     assert np.isnan(centroids).all()

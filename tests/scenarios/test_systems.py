@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.identity import custom_sources
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ConfigurationError
 from marsyard.cli.app import app
-from marsyard.doctor import Verdict, check_systems
+from marsyard.doctor import CheckResult, check_systems
 from marsyard.scenarios import columns as column_declarations
 from marsyard.scenarios.columns import ENGINE, label, row_columns
 from marsyard.scenarios.estimators import shipped_names
@@ -182,7 +182,7 @@ def test_invalid_system_does_not_affect_others(install: Install, source: str, re
     assert "dimes-smoke" in result.stdout
     checks = list(check_systems())
     assert checks[0].finding.endswith("plug-ins: valid")
-    assert [entry.finding for entry in checks if entry.verdict is Verdict.WARN] == [message]
+    assert [entry.finding for entry in checks if entry.verdict is CheckResult.WARN] == [message]
     with pytest.raises(UnknownScenarioError, match="is omitted"):
         scenario("unknown-scenario")
 

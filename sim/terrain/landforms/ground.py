@@ -19,7 +19,7 @@ Grid = Float32[np.ndarray, "side side"]
 
 
 @dataclass(frozen=True)
-class Ground:
+class TerrainGround:
     """Height and albedo of a terrain during synthesis; landforms change them in place.
 
     - height: control values of the spline, metres
@@ -40,7 +40,7 @@ class Ground:
         """Period of the ground along x and y, metres."""
         return float(self.side * self.spacing_m)
 
-    def coarser(self, feature_m: float) -> Ground:
+    def coarser(self, feature_m: float) -> TerrainGround:
         """Return an empty grid of the same extent with a spacing of at most `feature_m`, but not finer than this grid.
 
         A landform without detail finer than `feature_m` is computed faster on this grid, and then added by `add`.
@@ -49,9 +49,9 @@ class Ground:
         while side > SMALLEST_SIDE and self.period_m / (side // 2) <= feature_m:
             side //= 2
         height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
-        return Ground(height, log_albedo, self.period_m / side)
+        return TerrainGround(height, log_albedo, self.period_m / side)
 
-    def add(self, layer: Ground, *, include_albedo: bool = True) -> None:
+    def add(self, layer: TerrainGround, *, include_albedo: bool = True) -> None:
         """Add height and albedo of a coarser grid (`coarser`); the refinement of a B-spline is exact."""
         for total, grid in ((self.height, layer.height), (self.log_albedo, layer.log_albedo))[: 1 + include_albedo]:
             if grid.shape == total.shape:

@@ -12,7 +12,7 @@ from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.terrain.landforms.ground import Ground, draw_smooth_fields, refine, resample
+from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, refine, resample
 from marsyard.sim.terrain.landforms.kernels import (
     Bedforms,
     add_cracks,
@@ -64,7 +64,7 @@ class Dunes(Parameters):
     ] = 1.5
     albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
         # the wave vector points downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
@@ -107,7 +107,7 @@ class Lava(Parameters):
     aa_contrast: Annotated[float, Field(ge=-1.0, le=1.0, description="ln(albedo of a'a / of pahoehoe)")] = -0.06
     pahoehoe_relief_m: Annotated[NonNegative, Field(description="RMS height of hummocks on pahoehoe, m")] = 0.05
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the flows, then the blocks."""
         layer = ground.coarser(max(self.lobe_length_m / 36.0, self.lobe_thickness_m))
         scale_m = self.lobe_length_m / 12.0
@@ -131,7 +131,7 @@ class Lava(Parameters):
         if self.aa_fraction > 0.0 or self.pahoehoe_relief_m > 0.0:
             self._add_blocks(ground, rng)
 
-    def _add_blocks(self, ground: Ground, rng: Generator) -> None:
+    def _add_blocks(self, ground: TerrainGround, rng: Generator) -> None:
         """Add noise with the wavelength of the blocks, in patches where a smooth random field exceeds a threshold."""
         blocks = ground.coarser(self.aa_block_m / 2.0)
         patches = np.zeros((blocks.side, blocks.side), dtype=np.float32)
@@ -158,7 +158,7 @@ class Swell(Parameters):
     relief_m: Annotated[Positive, Field(description="lowest to highest, m")] = 200.0
     waves: Annotated[int, Field(ge=1, le=8, description="maximum number of waves along a side")] = 1
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the swell."""
         layer = ground.coarser(ground.period_m / 64.0)
         phase = 2.0 * np.pi * np.arange(layer.side) / layer.side
@@ -186,7 +186,7 @@ class Ramp(Parameters):
     length_m: Annotated[Positive, Field(description="horizontal length of the even slope, m")] = 30.0
     uphill: Annotated[Literal["east", "north"], Field(description="direction in which the first slope climbs")] = "east"
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the ramp."""
         period = ground.period_m
         max_length = 0.45 * period
@@ -277,7 +277,7 @@ class Gullies(Parameters):
     downhill_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth to which they run")] = 90.0
     contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of their floors / of the ground)")] = -0.1
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Cut the gullies."""
         # until the channels are complete, the albedo grid of `layer` contains their depth
         layer = ground.coarser(self.width_m / 12.0)
@@ -321,11 +321,11 @@ class Playa(Parameters):
     fissure_depth_m: Annotated[NonNegative, Field(description="depth of a fissure, m")] = 0.1
     contrast: Annotated[float, Field(ge=-2.0, le=2.0, description="ln(albedo of fissures / of the plates)")] = -0.12
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add fissures to the whole terrain."""
         ground.add(self.compute_fissures(ground, rng))
 
-    def compute_fissures(self, ground: Ground, rng: Generator) -> Ground:
+    def compute_fissures(self, ground: TerrainGround, rng: Generator) -> TerrainGround:
         """Compute the fissures on a separate grid."""
         layer = ground.coarser(self.fissure_m)
         for scale in (1.0, 0.4):
@@ -361,7 +361,7 @@ class Fans(Parameters):
 
     polygons: Annotated[Playa | None, Field(description="desiccation polygons on the playa")] = None
 
-    def apply(self, ground: Ground, rng: Generator) -> None:
+    def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the fans and their washes; flatten the playa."""
         count = max(round(ground.period_m / self.apex_spacing_m), 1)
         apex_x = (np.tile(np.arange(count), self.divides) + rng.uniform(-0.3, 0.3, count * self.divides)) / count
@@ -391,7 +391,7 @@ class Fans(Parameters):
         if self.washes_per_fan:
             self._add_washes(ground, apexes, rng)
 
-    def _add_washes(self, ground: Ground, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
+    def _add_washes(self, ground: TerrainGround, apexes: Float64[np.ndarray, "fans 3"], rng: Generator) -> None:
         """Cut the washes of all fans."""
         # until the channels are complete, the albedo grid of `layer` contains their depth
         layer = ground.coarser(self.wash_width_m / 3.0)

@@ -15,7 +15,7 @@ from numpy.random import Generator
 from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.terrain.landforms.ground import Grid, Ground, Spectrum
+from marsyard.sim.terrain.landforms.ground import Grid, Spectrum, TerrainGround
 from marsyard.sim.terrain.landforms.kernels import cut_channels, scale_roughness, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_channels
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
@@ -69,7 +69,7 @@ class SurfaceUnits(Parameters):
     streak_log_albedo_rms: Annotated[Fraction, Field(description="RMS of the logarithm of albedo of tails")] = 0.12
 
     def apply(
-        self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], rng: Generator
+        self, ground: TerrainGround, craters: Float64[np.ndarray, "craters columns"], rng: Generator
     ) -> Float32[np.ndarray, "side side 3"]:
         """Add the albedo of units, dust devil tracks and wind tails (streaks) of craters to the ground.
 
@@ -90,7 +90,7 @@ class SurfaceUnits(Parameters):
         factors = np.exp(membership @ np.log(np.maximum(unit_factors, 1e-3)).astype(np.float32))
         log_albedo = np.ascontiguousarray(membership @ np.array([unit.log_albedo for unit in units], dtype=np.float32))
         self._add_tracks(log_albedo, spacing, downwind, rng)
-        ground.add(Ground(np.zeros_like(log_albedo), log_albedo, spacing))
+        ground.add(TerrainGround(np.zeros_like(log_albedo), log_albedo, spacing))
         self._add_streaks(ground, craters, downwind, rng)
         if len(craters):
             # columns of `stamp_craters`; depth below the rim, which is 0.4 radii for a fresh crater
@@ -121,7 +121,7 @@ class SurfaceUnits(Parameters):
         log_albedo -= darkening
 
     def _add_streaks(
-        self, ground: Ground, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
+        self, ground: TerrainGround, craters: Float64[np.ndarray, "craters columns"], downwind: float, rng: Generator
     ) -> None:
         """Add wind tails (streaks) behind a random selection of the craters of at least `streak_min_m`."""
         large = craters[craters[:, 2] > 0.5 * self.streak_min_m]

@@ -12,7 +12,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
 from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
@@ -102,7 +102,7 @@ def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:
     settings = SearchSettings("velocity", cases=20, restarts=1, max_failures=1)
     result = start_search(campaign, settings, 500, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
     rows = {int(row["case"]): row for row in read_case_rows(tmp_path / "run")}
-    assert all(row["terrain"] == Point.read(str(row[POINT_COLUMN])).stream for row in rows.values())
+    assert all(row["terrain"] == StudyPoint.read(str(row[POINT_COLUMN])).stream for row in rows.values())
     (failure,) = result.failures
     assert failure.values["terrain"] == rows[failure.case]["terrain"] == rows[failure.original_case]["terrain"]
     (path,) = write_regression_campaigns(campaign, result, tmp_path / "run")
@@ -156,7 +156,7 @@ def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
     rows = []
     step = ((3, 0.995), (4, math.sqrt(1.0 - 0.995**2)))
     for sources, blend in (((), ()), (removed, ()), ((), ()), ((), step)):
-        point = Point((0.1,) * len(campaign.drawn_paths), 3, (), sources, blend)
+        point = StudyPoint((0.1,) * len(campaign.drawn_paths), 3, (), sources, blend)
         parameters = campaign.parameters_at(point)
         for shared_input in campaign.scenario.shared_inputs(parameters):
             campaign.scenario.prepare(parameters, shared_input)

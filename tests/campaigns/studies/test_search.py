@@ -12,7 +12,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
-from marsyard.campaigns.sampling.points import POINT_COLUMN, Point
+from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.rare import continue_rare
 from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
@@ -61,7 +61,7 @@ class DirectRunner:
         rows: list[dict[str, object]] = []
         for candidate in candidates:
             stream = self.n_cases if candidate.stream is None else candidate.stream
-            point = Point(candidate.coordinates, stream, candidate.nominal)
+            point = StudyPoint(candidate.coordinates, stream, candidate.nominal)
             result = self.campaign.scenario.run(self.campaign.parameters_at(point), self.campaign.streams(stream))
             rows.append({"outcome": result.outcome, "answered": True, **result.row, POINT_COLUMN: point.text})
             self.n_cases += 1

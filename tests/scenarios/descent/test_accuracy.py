@@ -7,9 +7,9 @@ import pytest
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesTrack
 from marsyard.algorithms.dimes.binning import altitudes_at_images
-from marsyard.scenarios.descent.exposure import World, camera_optics, take_exposures
+from marsyard.scenarios.descent.exposure import DescentWorld, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import create_flight, mean_velocities, states_at_images
-from marsyard.scenarios.descent.measurement import Instruments, measure
+from marsyard.scenarios.descent.measurement import DescentInstruments, measure
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector
@@ -35,13 +35,13 @@ def _run_descent(case: int, **tables: Any) -> tuple[list[DimesTrack], list[State
         "heading_deg": rng.uniform(0.0, 360.0),
     }
     parameters = make_parameters(**IDEAL_INSTRUMENTS, descent=motion, detector=NOISELESS_DETECTOR, **tables)
-    world, streams = World.from_parameters(parameters), Streams(5, "accuracy", case)
+    world, streams = DescentWorld.from_parameters(parameters), Streams(5, "accuracy", case)
     flight = create_flight(parameters, world.surface, streams)
     states = states_at_images(parameters, flight)
     optics = camera_optics(parameters.camera)
     detector = Detector.draw(optics.fall_off, parameters.detector, streams.generator("detector response"))
     images = [counts for counts, _ in take_exposures(parameters, world, states, optics, detector, streams)]
-    instruments = Instruments.draw(parameters, world, flight, streams)
+    instruments = DescentInstruments.draw(parameters, world, flight, streams)
     measurements = measure(parameters, world, flight.motion, images, detector, instruments, streams)
     details = DimesEstimator().estimate(measurements).details
     assert isinstance(details, DimesDetails)

@@ -10,11 +10,11 @@ from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
-from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics, take_exposures
+from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics, take_exposures
 from marsyard.scenarios.descent.flight import create_flight, states_at_images
 from marsyard.scenarios.descent.parameters import (
-    CameraParameters,
-    Faults,
+    DescentCameraParameters,
+    DescentFaults,
     add_altitude_faults,
     add_attitude_faults,
     add_terrain_fault,
@@ -30,7 +30,7 @@ from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, TerrainParameters
 from tests.scenarios.descent.settings import NOISELESS_DETECTOR, make_parameters, run_descent
 
-SMALL_CAMERA = CameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
+SMALL_CAMERA = DescentCameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
 #: Sun at an azimuth of 4 rad and an elevation of 0.7 rad.
 SUN = Sun(direction(4.0, 0.7))
 
@@ -55,7 +55,7 @@ def _make_state(height_m: float) -> State:
 
 
 def test_disabled_faults_have_no_effect() -> None:
-    no_faults = Faults()
+    no_faults = DescentFaults()
     terrain, detector = TerrainParameters(), DetectorParameters()
     assert add_terrain_fault(no_faults, terrain) == terrain
     assert add_detector_faults(no_faults, detector) == detector
@@ -63,14 +63,18 @@ def test_disabled_faults_have_no_effect() -> None:
     assert no_faults.columns == {"fault": "none", "fault_size": 0.0, "fault_free": True}
 
 
-@pytest.mark.parametrize(("name", "field"), Faults.model_fields.items())
+@pytest.mark.parametrize(("name", "field"), DescentFaults.model_fields.items())
 def test_fault_name_and_size_are_reported(name: str, field: FieldInfo) -> None:
     size = 2 if field.annotation is int else 0.25
-    assert Faults.model_validate({name: size}).columns == {"fault": name, "fault_size": size, "fault_free": False}
+    assert DescentFaults.model_validate({name: size}).columns == {
+        "fault": name,
+        "fault_size": size,
+        "fault_free": False,
+    }
 
 
 def test_multiple_faults_have_no_size() -> None:
-    name, size, is_free = Faults(haze=1.0, dust_discs=3).columns.values()
+    name, size, is_free = DescentFaults(haze=1.0, dust_discs=3).columns.values()
     assert (name, is_free) == ("several", False)
     assert np.isnan(size)
 
@@ -114,13 +118,15 @@ def test_images_can_be_repeated_or_black() -> None:
 
 
 def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
-    faults = Faults(altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0)
+    faults = DescentFaults(
+        altitude_error=0.1, altitude_error_once=0.2, attitude_error_deg=3.0, attitude_error_once_deg=5.0
+    )
     altitudes = add_altitude_faults(faults, [AltitudeMeasurement(100.0, time_s) for time_s in (0.0, 1.0, 2.0)])
     # 10 % in all readings, and another 20 % in the second
     assert [entry.altitude_m for entry in altitudes] == pytest.approx([110.0, 130.0, 110.0])
     # the heat shield moves away at 20 m/s
     readings = [AltitudeMeasurement(2000.0, time_s) for time_s in (0.0, 1.0, 2.0)]
-    shield_ranges = add_altitude_faults(Faults(shield_range_m=60.0), readings)
+    shield_ranges = add_altitude_faults(DescentFaults(shield_range_m=60.0), readings)
     assert [entry.altitude_m for entry in shield_ranges] == [60.0, 80.0, 100.0]
     attitudes = [AttitudeMeasurement(Rotation.identity(), time_s) for time_s in (0.0, 1.0, 2.0)]
     tilts = [entry.world_from_body for entry in add_attitude_faults(faults, attitudes, np.random.default_rng(0))]
@@ -132,7 +138,7 @@ def test_altitude_and_attitude_faults_have_the_specified_size() -> None:
 def _render_descent(faults: Mapping[str, Any], **tables: Any) -> list[np.ndarray]:
     """Return the three images of a descent, in counts."""
     parameters = make_parameters(faults=faults, detector=NOISELESS_DETECTOR, **tables)
-    world, streams = World.from_parameters(parameters), Streams(1, "faults", 0)
+    world, streams = DescentWorld.from_parameters(parameters), Streams(1, "faults", 0)
     states = states_at_images(parameters, create_flight(parameters, world.surface, streams))
     optics = camera_optics(parameters.camera)
     detector = Detector.draw(
@@ -166,7 +172,7 @@ def test_image_faults_change_the_expected_pixels() -> None:
 
 def test_calibration_errors_have_the_specified_standard_deviation() -> None:
     """Compare standard deviations of image centre and corner position over 300 draws of the calibration."""
-    parameters = CameraParameters()
+    parameters = DescentCameraParameters()
     true_camera = camera_optics(parameters).camera
     cameras = [calibrated_camera(parameters, np.random.default_rng(seed)) for seed in range(300)]
     nadir = np.array([[0.0, 0.0, -1.0]])

@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.dimes.binning import binned_size_for
-from marsyard.scenarios.descent.exposure import World, calibrated_camera, camera_optics
-from marsyard.scenarios.descent.parameters import CameraParameters, DescentScenarioParameters
+from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics
+from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
 from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 
@@ -65,7 +65,7 @@ def test_illumination_follows_the_site() -> None:
     """The site defines sunlight and reflectance; the brightness depends on sunlight and atmosphere."""
     small_terrain = {"terrain": {"samples": 256, "spacing_m": 16.0}, "location": {"bank": 1}}
     parameters = [DescentScenarioParameters.model_validate({"site": name} | small_terrain) for name in SITES]
-    mars, earth = (World.from_parameters(site_parameters) for site_parameters in parameters)
+    mars, earth = (DescentWorld.from_parameters(site_parameters) for site_parameters in parameters)
     assert mars.ground is not None
     # the sun's radius at 1.5 au
     assert mars.sun.angular_radius_rad == pytest.approx(0.00308, rel=0.01)
@@ -73,7 +73,7 @@ def test_illumination_follows_the_site() -> None:
     assert earth.brightness / mars.brightness > 1.0 / 0.44
     # A detector specified for the sun at 1 au receives 1 / 1.5^2 = 0.44 of its light on Mars.
     earth_detector = {"site": SITES[0], "detector": {"sun_au": 1.0}} | small_terrain
-    world_with_earth_detector = World.from_parameters(DescentScenarioParameters.model_validate(earth_detector))
+    world_with_earth_detector = DescentWorld.from_parameters(DescentScenarioParameters.model_validate(earth_detector))
     assert world_with_earth_detector.brightness == pytest.approx(mars.brightness / 1.5**2)
     # scene below the origin, for a last image at 1400 m with pixels of 0.82 mrad
     scene = mars.scene(0.0, 0.0, 1400.0, 8.2e-4)
@@ -116,7 +116,7 @@ def test_custom_cameras_are_stored_in_the_campaign(tmp_path: Path) -> None:
 
 
 def test_custom_camera_distortion_error_applies_at_corner() -> None:
-    parameters = CameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
+    parameters = DescentCameraParameters(focal_error=0.0, centre_error_px=0.0, distortion_error_px=2.0)
     custom = parameters.model_copy(update={"model": CustomCamera.from_camera(camera_optics(parameters).camera)})
     for camera_parameters in (parameters, custom):
         rng = np.random.default_rng(3)

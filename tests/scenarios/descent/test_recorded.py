@@ -9,7 +9,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import World
+from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
@@ -41,7 +41,7 @@ def _write_vertical_fall(folder: Path, *, height_m: float = 2200.0, tilt_deg: fl
 def test_recorded_flight_equals_the_simulated_case(tmp_path: Path) -> None:
     """The file has 50 Hz, north-east-down axes, attitudes of the camera and another time origin."""
     simulated_case, parameters = run_descent(), make_parameters()
-    world = World.from_parameters(parameters)
+    world = DescentWorld.from_parameters(parameters)
     flight = create_flight(parameters, world.surface, Streams(1, "test", 0))
     times = np.arange(-5.0, flight.firing_s + 1.0, 0.02)
     truth = flight.motion.motion(times)

@@ -5,9 +5,9 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.scenarios.conditions import add_detector_faults
-from marsyard.scenarios.landing.helicopter import HelicopterParameters, Transit
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.parameters import (
-    Faults,
+    LandingFaults,
     LandingScenarioParameters,
     add_range_faults,
     add_receiver_outage,
@@ -17,7 +17,7 @@ from marsyard.scenarios.landing.parameters import (
 from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams
 
-HELICOPTER = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
+HELICOPTER = LandingHelicopterParameters.model_validate({"transit": {"hover_s": 8.0}})
 
 
 @pytest.mark.slow
@@ -25,7 +25,7 @@ def test_receiver_outage_covers_images_and_landing() -> None:
     """During an outage of 40 s the filter propagates without position updates, so its position errors increase."""
     position_errors_m: dict[float, list[float]] = {0.0: [], 40.0: []}
     for outage_s, errors in position_errors_m.items():
-        flight = add_receiver_outage(Faults(gps_outage_s=outage_s), HELICOPTER)
+        flight = add_receiver_outage(LandingFaults(gps_outage_s=outage_s), HELICOPTER)
         for case in range(6):
             # start (m), course and heading (rad), gravity (m/s^2)
             transit = Transit.fly(flight, np.array([0.0, 0.0, 10.0]), 0.5, 0.5, 9.8, Streams(7, "outage", case))
@@ -40,22 +40,22 @@ def test_receiver_outage_covers_images_and_landing() -> None:
 
 def test_altimeter_faults_replace_all_ranges() -> None:
     ranges = np.array([9.0, 10.0, 11.0])
-    np.testing.assert_array_equal(add_range_faults(Faults(), ranges, 10.0), ranges)
+    np.testing.assert_array_equal(add_range_faults(LandingFaults(), ranges, 10.0), ranges)
     # stuck at 20 % above the height of 10 m
-    np.testing.assert_allclose(add_range_faults(Faults(laser_stuck=0.2), ranges, 10.0), 12.0)
-    assert np.isnan(add_range_faults(Faults(laser_silent=1), ranges, 10.0)).all()
+    np.testing.assert_allclose(add_range_faults(LandingFaults(laser_stuck=0.2), ranges, 10.0), 12.0)
+    assert np.isnan(add_range_faults(LandingFaults(laser_silent=1), ranges, 10.0)).all()
     # The landing treats a silent altimeter as an infinite range, above the height at which it slows down.
-    assert stuck_range_m(Faults(laser_silent=1), 10.0) == np.inf
-    assert stuck_range_m(Faults(), 10.0) is None
+    assert stuck_range_m(LandingFaults(laser_silent=1), 10.0) == np.inf
+    assert stuck_range_m(LandingFaults(), 10.0) is None
 
 
 def test_two_or_more_images_are_received_for_any_loss_rate() -> None:
     rng = np.random.default_rng(0)
-    assert len(draw_received_images(Faults(), 40, rng)) == 40
-    image_numbers = draw_received_images(Faults(lost_images=0.75), 40, rng)
+    assert len(draw_received_images(LandingFaults(), 40, rng)) == 40
+    image_numbers = draw_received_images(LandingFaults(lost_images=0.75), 40, rng)
     assert len(np.unique(image_numbers)) == 10
     assert np.all(np.diff(image_numbers) > 0)
-    assert len(draw_received_images(Faults(lost_images=1.0), 40, rng)) == 2
+    assert len(draw_received_images(LandingFaults(lost_images=1.0), 40, rng)) == 2
 
 
 @pytest.mark.parametrize("fault", [{"lost_images": 0.5}, {"gps_outage_s": 5.0}])
@@ -68,7 +68,7 @@ def test_flight_faults_require_a_flight(fault: dict[str, float]) -> None:
 def test_bad_pixel_faults_set_the_fraction_and_the_list() -> None:
     detector = preset("xc-55").detector
     unlisted, listed = (
-        add_detector_faults(Faults.model_validate({name: 0.01}), detector).defects
+        add_detector_faults(LandingFaults.model_validate({name: 0.01}), detector).defects
         for name in ("bad_pixels", "listed_bad_pixels")
     )
     assert (unlisted.dead_fraction, unlisted.hot_fraction, unlisted.listed) == (0.01, 0.01, False)

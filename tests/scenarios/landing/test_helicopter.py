@@ -5,7 +5,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from marsyard.scenarios.landing.helicopter import HelicopterParameters, Touchdown, Transit, horizontal_distance_m, land
+from marsyard.scenarios.landing.helicopter import (
+    LandingHelicopterParameters,
+    Touchdown,
+    Transit,
+    horizontal_distance_m,
+    land,
+)
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.sensor import LaserParameters
 from marsyard.sim.sensor.ranging import RangingUnit
@@ -23,7 +29,7 @@ FLOATING_RTK: dict[str, object] = {"rtk": {"float_fraction": 1.0}, "transit": {"
 
 def _fly_transit(case: int, **changes: object) -> tuple[Transit, Streams]:
     streams = Streams(7, "helicopter", case)
-    parameters = HelicopterParameters.model_validate({"transit": {"hover_s": 8.0}} | changes)
+    parameters = LandingHelicopterParameters.model_validate({"transit": {"hover_s": 8.0}} | changes)
     start_m = np.array([0.0, 0.0, HEIGHT_M])
     return Transit.fly(parameters, start_m, COURSE_RAD, HEADING_RAD, GRAVITY_M_S2, streams), streams
 

@@ -15,7 +15,7 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import swinging_fall
-from marsyard.scenarios.landing.flight import Flight
+from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.images import GroundTruth, SampledMap, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
@@ -29,11 +29,11 @@ SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 SITE_REPORTED, NO_SITE_REPORTED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
 
 
-def make_flight() -> Flight:
+def make_flight() -> LandingFlight:
     """Return a flight with exact navigation."""
     states = swinging_fall().state(0.0), swinging_fall().state(3.75)
     first, second = (PoseMeasurement(rigid(entry.attitude, entry.position_m), entry.time_s) for entry in states)
-    return Flight(states, (first, second), np.array([0.0, 0.0, 1.0]))
+    return LandingFlight(states, (first, second), np.array([0.0, 0.0, 1.0]))
 
 
 def make_truth(n_safe: int) -> GroundTruth:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing import kernels
 from marsyard.scenarios.landing.flight import choose_pair
-from marsyard.scenarios.landing.images import World
+from marsyard.scenarios.landing.images import LandingWorld
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
 from marsyard.scenarios.landing.relief import Limits, Relief
 from marsyard.scenarios.landing.scenario import LandingScenario
@@ -32,7 +32,7 @@ def test_electron_count_does_not_depend_on_the_sun_distance_of_the_responsivity(
     for sun_au in (1.0, 1.5, 3.0):
         detector = {"preset": "xc-55", "sun_au": sun_au, "responsivity_e_s": 1e7 / sun_au**2}
         parameters = LandingScenarioParameters.model_validate({**small_terrain, "detector": detector})
-        electrons.append(World.from_parameters(parameters).brightness * parameters.detector.responsivity_e_s)
+        electrons.append(LandingWorld.from_parameters(parameters).brightness * parameters.detector.responsivity_e_s)
     assert electrons == pytest.approx([electrons[0]] * 3, rel=1e-12)
 
 

@@ -11,8 +11,8 @@ from marsyard.scenarios.localisation.instruments import (
     HALF_WELL_SNR,
     LANDER_DETECTOR,
     RADAR,
-    CameraParameters,
     InitialErrors,
+    LanderCameraParameters,
     draw_calibrated_camera,
     measure_altitudes,
     true_camera,
@@ -27,7 +27,7 @@ EXACT_LENS = CalibrationParameters(focal_error=0.0, centre_error_px=0.0, distort
 
 def test_camera_has_the_field_and_pixel_of_the_lander() -> None:
     """90 deg from edge to edge, 1.67 mrad per pixel on the axis; columns along body x, looking along -z."""
-    camera = true_camera(CameraParameters())
+    camera = true_camera(LanderCameraParameters())
     assert camera.size == (1024, 1024)
     edges = np.array([[-0.5, 511.5], [1023.5, 511.5], [511.5, -0.5], [511.5, 1023.5]])
     _, rays = camera.rays(edges)
@@ -41,18 +41,18 @@ def test_camera_has_the_field_and_pixel_of_the_lander() -> None:
     assert visible.all()
     np.testing.assert_allclose(projected, pixels, rtol=0.0, atol=1e-6)
     # pixels of 9.6 um: 2 x 2 of 4.8 um
-    assert CameraParameters().pixel_pitch_um == pytest.approx(9.6, abs=0.1)
+    assert LanderCameraParameters().pixel_pitch_um == pytest.approx(9.6, abs=0.1)
 
 
 def test_field_of_view_with_a_folded_image_is_rejected() -> None:
     """The distortion is a cubic term; for this field of view it would map two directions to one pixel."""
     with pytest.raises(ValueError, match="allowed: a field close to"):
-        CameraParameters(field_deg=120.0, pixel_mrad=1.0)
+        LanderCameraParameters(field_deg=120.0, pixel_mrad=1.0)
 
 
 def test_calibration_without_errors_is_the_true_camera() -> None:
     """All errors of the calibrated camera are parameters."""
-    p = CameraParameters(alignment_error_deg=0.0, calibration=EXACT_LENS)
+    p = LanderCameraParameters(alignment_error_deg=0.0, calibration=EXACT_LENS)
     camera, calibrated = true_camera(p), draw_calibrated_camera(p, np.random.default_rng(0))
     grid = camera.pixel_grid()[::170, ::170]
     np.testing.assert_allclose(calibrated.rays(grid)[1], camera.rays(grid)[1], rtol=0.0, atol=1e-12)
@@ -71,7 +71,7 @@ def test_calibration_without_errors_is_the_true_camera() -> None:
 )
 def test_calibration_errors_have_their_standard_deviation(changes: dict[str, float], expected_px: float) -> None:
     """RMS displacement of a corner by each error of the lens; 100 cameras determine it to 7 % (one sigma)."""
-    p = CameraParameters(alignment_error_deg=0.0, calibration=EXACT_LENS.model_copy(update=changes))
+    p = LanderCameraParameters(alignment_error_deg=0.0, calibration=EXACT_LENS.model_copy(update=changes))
     camera = true_camera(p)
     corner = np.array([-0.5, -0.5])
     point = camera.rays(corner)[1]

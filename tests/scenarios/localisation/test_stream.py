@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate
 from marsyard.scenarios.localisation.flight import LanderFlight
-from marsyard.scenarios.localisation.instruments import IMAGE_CLOCK, CameraParameters, true_camera
+from marsyard.scenarios.localisation.instruments import IMAGE_CLOCK, LanderCameraParameters, true_camera
 from marsyard.scenarios.localisation.stream import ImageSchedule, LocalisationMeasurements
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
@@ -16,7 +16,7 @@ from marsyard.sim.sensor.imu import LN200, true_increments
 
 #: True start and end of the inertial data, s.
 SPAN_S = (0.0, 6.0)
-CAMERA = true_camera(CameraParameters(pixels=64, pixel_mrad=26.0))
+CAMERA = true_camera(LanderCameraParameters(pixels=64, pixel_mrad=26.0))
 
 
 def _make_image(tag_s: float) -> DetectorImage:

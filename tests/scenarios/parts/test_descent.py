@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import World
+from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.descent.flight import create_flight
-from marsyard.scenarios.descent.measurement import Instruments
+from marsyard.scenarios.descent.measurement import DescentInstruments
 from marsyard.scenarios.parts import InstrumentReadings, InstrumentTruth, MotionInputs, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
@@ -136,7 +136,7 @@ def test_case_uses_custom_motion_instruments_and_score() -> None:
 
 def test_motion_is_deterministic_per_case() -> None:
     parameters = make_parameters(terrain=FLAT_TERRAIN, **CUSTOM_PARTS)
-    surface = World.from_parameters(parameters).surface
+    surface = DescentWorld.from_parameters(parameters).surface
     first_row, repeated_row, second_row = (
         create_flight(parameters, surface, Streams(1, "test", case)).row for case in (0, 0, 1)
     )
@@ -160,7 +160,7 @@ def test_invalid_motion_is_reported(defect: str, message: str) -> None:
     flight = {**CUSTOM_PARTS["flight"], "options": {"defect": defect}}
     parameters = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     with pytest.raises(ValueError, match=message):
-        create_flight(parameters, World.from_parameters(parameters).surface, Streams(1, "test", 0))
+        create_flight(parameters, DescentWorld.from_parameters(parameters).surface, Streams(1, "test", 0))
 
 
 @pytest.mark.parametrize("duration_s", [20.0, 20.05, 27.95, 28.0])
@@ -168,10 +168,10 @@ def test_firing_is_at_the_end_of_a_short_motion(duration_s: float) -> None:
     """If the motion ends above the firing altitude, the firing is 0.1 s before its end, for any rounding of times."""
     flight = {**CUSTOM_PARTS["flight"], "options": {"east_m_s": 0.0, "duration_s": duration_s, "height_m": 5000.0}}
     parameters = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
-    world, streams = World.from_parameters(parameters), Streams(1, "test", 0)
+    world, streams = DescentWorld.from_parameters(parameters), Streams(1, "test", 0)
     created_flight = create_flight(parameters, world.surface, streams)
     assert created_flight.firing_s == pytest.approx(created_flight.motion.span_s[1] - 0.1)
-    navigation = Instruments.draw(parameters, world, created_flight, streams).navigation
+    navigation = DescentInstruments.draw(parameters, world, created_flight, streams).navigation
     assert navigation.velocity(np.array([created_flight.firing_s])).shape == (1, 3)
 
 
@@ -179,7 +179,7 @@ def test_motion_below_the_ground_is_reported() -> None:
     flight = {**CUSTOM_PARTS["flight"], "options": {"height_m": 500.0}}
     parameters = make_parameters(terrain=FLAT_TERRAIN, flight=flight)
     with pytest.raises(ValueError, match=r"at image 3 the camera is 62\.5 m below the ground"):
-        create_flight(parameters, World.from_parameters(parameters).surface, Streams(1, "test", 0))
+        create_flight(parameters, DescentWorld.from_parameters(parameters).surface, Streams(1, "test", 0))
 
 
 def test_score_cannot_replace_a_column() -> None:

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover.parameters import RoverScenarioParameters, SunParameters
+from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
-from marsyard.scenarios.rover.run import Run, run_case
+from marsyard.scenarios.rover.run import RoverRun, run_case
 from marsyard.sim.dynamics.rover import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST
@@ -16,14 +16,14 @@ from tests.scenarios.rover.short_run import SHORT_RUN
 from tests.sim.dynamics.grounds import Plane
 
 
-def make_run(**changes: Any) -> Run:
+def make_run(**changes: Any) -> RoverRun:
     return run_case(RoverScenarioParameters.model_validate({**SHORT_RUN, **changes}), Streams(1, "rover tests", 0))
 
 
 def test_sun_moves_westwards_with_its_hour_angle() -> None:
     # At the equator a sun in the zenith moves west by its hour angle: 16 deg in 66 minutes (Table IV of the tracking
     # paper).
-    sun = SunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0)
+    sun = MovingSunParameters(azimuth_deg=0.0, elevation_deg=90.0, latitude_deg=0.0)
     for minutes in (0.0, 66.0, 132.0):
         angle = np.radians(16.0 * minutes / 66.0)
         np.testing.assert_allclose(sun.direction(60.0 * minutes), [-np.sin(angle), 0.0, np.cos(angle)], atol=1e-12)

@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.rover.parameters import CameraParameters, RoverScenarioParameters
-from marsyard.scenarios.rover.run import Run, map_terrain, prepare_run, run_case
+from marsyard.scenarios.rover.parameters import MastCameraParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.run import RoverRun, map_terrain, prepare_run, run_case
 from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid
@@ -28,12 +28,12 @@ SLIPPING_ROVER: dict[str, Any] = {
 OBSTACLE = {"towards_start_m": 3.0, "right_m": 0.4, "diameter_m": 0.5, "height_m": 0.3}
 
 
-def run_slipping_rover(seed: int = 4, **changes: Any) -> Run:
+def run_slipping_rover(seed: int = 4, **changes: Any) -> RoverRun:
     parameters = RoverScenarioParameters.model_validate({**SLIPPING_ROVER, **changes})
     return run_case(parameters, Streams(seed, "rover tests", 0))
 
 
-def _position_error_m(run: Run) -> float:
+def _position_error_m(run: RoverRun) -> float:
     """Compute the horizontal distance between estimated and true final position."""
     vehicle = run.vehicle
     return float(np.linalg.norm((vehicle.estimated_pose.translation - vehicle.stance.world_from_rover.translation)[:2]))
@@ -125,7 +125,7 @@ def test_pair_from_files_equals_the_preset(name: str, baseline_m: float, toe_in_
     files = {side: str(tmp_path / f"{side}.cahvor") for side in ("left", "right")}
     pair_geometry = {"baseline_m": baseline_m, "toe_in_deg": toe_in_deg}
     mast, preset_mast = (
-        CameraParameters.model_validate({"preset": name, "custom": files | pair_geometry}).mast(),
+        MastCameraParameters.model_validate({"preset": name, "custom": files | pair_geometry}).mast(),
         stereo_mast(name),
     )
     points = np.array([[2.0, 0.3, -0.2], [4.0, -0.5, 0.4], [30.0, 1.0, 1.0]])
@@ -174,4 +174,4 @@ def test_invalid_camera_pairs_are_rejected(
     (tmp_path / "large.yaml").write_text(OPENCV_CALIBRATION.replace("640\nimage_height", "800\nimage_height"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValidationError, match=message):
-        CameraParameters.model_validate(settings)
+        MastCameraParameters.model_validate(settings)

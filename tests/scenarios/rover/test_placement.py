@@ -19,7 +19,7 @@ from marsyard.scenarios.rover.points import (
     ray_distances,
     spheres_near_line,
 )
-from marsyard.scenarios.rover.run import Run, prepare_run, track_target
+from marsyard.scenarios.rover.run import RoverRun, prepare_run, track_target
 from marsyard.scenarios.rover.scenario import RoverScenario, SharedDriveParameters, SharedDriveScenario, place_target
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
@@ -34,7 +34,7 @@ SLAB: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def placed_run() -> tuple[bool, Run]:
+def placed_run() -> tuple[bool, RoverRun]:
     """Return whether the target of a short run is placeable, and the run."""
     parameters = RoverScenarioParameters.model_validate(SLAB)
     run = prepare_run(parameters, Streams(1, "placement tests", 0))
@@ -42,7 +42,7 @@ def placed_run() -> tuple[bool, Run]:
     return bool(placeable), place_target(track_target(parameters, run))
 
 
-def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, Run]) -> None:
+def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, RoverRun]) -> None:
     placeable, run = placed_run
     row = placement_row(run)
     assert placeable
@@ -54,7 +54,7 @@ def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, Run]) -> Non
     assert float(row["tool_overlap_m"]) <= 0.0
 
 
-def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, Run]) -> None:
+def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, RoverRun]) -> None:
     _, run = placed_run
     stop = run.stops[-1]
     target = np.asarray(stop.update.position_rover)
@@ -69,7 +69,7 @@ def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, Run]) -> 
     assert np.median(distances) < 0.02
 
 
-def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, Run]) -> None:
+def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, RoverRun]) -> None:
     """A tool axis tilted by 60 deg from the surface normal: 5 cm x tan(60 deg) exceeds the clearance."""
     _, run = placed_run
     assert run.placement is not None

@@ -10,7 +10,7 @@ from marsyard.sim.dynamics.rover import (
     MER,
     ROCKY_8,
     WHEELS,
-    Ground,
+    DrivenGround,
     RockyGround,
     RoverParameters,
     compute_wheel_centres,
@@ -85,7 +85,7 @@ def test_all_wheels_touch_rough_ground() -> None:
     samples = np.zeros((256, 256, 2), dtype=np.float32)
     samples[..., 0] = 0.03 * np.random.default_rng(3).standard_normal((256, 256))
     surface = Surface.from_samples(samples, 0.1)
-    assert isinstance(surface, Ground)
+    assert isinstance(surface, DrivenGround)
     rng = np.random.default_rng(4)
     for _ in range(10):
         east, north = rng.uniform(0.0, 25.0, 2).tolist()

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.dynamics.driving import Drive, SlipParameters, Soil, drive
-from marsyard.sim.dynamics.rover import MER, Ground, settle
+from marsyard.sim.dynamics.rover import MER, DrivenGround, settle
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.sensor.odometry import EXACT, Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east
@@ -20,7 +20,7 @@ MIXED_COMMANDS = (
 )
 
 
-def _drive(ground: Ground, commands: tuple[DriveCommand, ...], slip: SlipParameters = NO_SLIP) -> list[Drive]:
+def _drive(ground: DrivenGround, commands: tuple[DriveCommand, ...], slip: SlipParameters = NO_SLIP) -> list[Drive]:
     rng, soil = np.random.default_rng(1), Soil(slip, 1.0)
     stance, drives = settle(MER, ground, 0.0, 0.0, EAST), []
     for command in commands:

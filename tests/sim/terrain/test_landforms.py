@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
-from marsyard.sim.terrain.landforms import Dunes, Fans, Ground, Gullies, Lava, Playa, Ramp, Swell
+from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell, TerrainGround
 from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
 from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
 from marsyard.sim.terrain.surface import mean_slope_deg
@@ -188,7 +188,7 @@ def test_smooth_fields_have_unit_power() -> None:
 
 
 def test_landforms_on_a_coarser_grid_have_the_same_position() -> None:
-    ground = Ground(np.zeros((64, 64), np.float32), np.zeros((64, 64), np.float32), 1.0)
+    ground = TerrainGround(np.zeros((64, 64), np.float32), np.zeros((64, 64), np.float32), 1.0)
     coarse = ground.coarser(4.0)
     assert (coarse.side, coarse.spacing_m, coarse.period_m) == (16, 4.0, 64.0)
     coarse.height[4, 8] = 1.0

@@ -16,7 +16,7 @@ from marsyard.sim.terrain import (
     TerrainParameters,
     synthesise,
 )
-from marsyard.sim.terrain.landforms.ground import Ground, Spectrum
+from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
 from marsyard.sim.terrain.landforms.kernels import scale_roughness, stamp_craters, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
@@ -41,9 +41,9 @@ def _make_units(**changes: Any) -> SurfaceUnits:
     return SurfaceUnits.model_validate({"kinds": KINDS, "boundary": 0.02, **changes})
 
 
-def _apply_units(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[Ground, np.ndarray]:
+def _apply_units(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[TerrainGround, np.ndarray]:
     """Apply units to level ground without craters; return the ground, and the factors of the units at each cell."""
-    ground = Ground(np.zeros((side, side), dtype=np.float32), np.zeros((side, side), dtype=np.float32), 2.0)
+    ground = TerrainGround(np.zeros((side, side), dtype=np.float32), np.zeros((side, side), dtype=np.float32), 2.0)
     return ground, units.apply(ground, NO_CRATERS, np.random.default_rng(seed))
 
 
