@@ -205,7 +205,7 @@ def test_configuration_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["report", "{folder}"], "does not contain a campaign"),
         (["replay", "{run}", "6"], "has no case 6; allowed: 0 to 5"),
         (["replay", "{run}", "x"], "Invalid value for 'CASE'"),
-        (["replay", "{run}", "--", "-1"], "Invalid value for 'CASE'"),
+        (["replay", "{run}", "--", "-1"], "has no case -1; allowed: 0 to 5"),
         (["replay", "{folder}", "0"], "does not contain a campaign"),
         (["replay", "{run}", "0", "--out", "{file}/x"], "cannot be written"),
     ],
