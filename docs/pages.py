@@ -20,6 +20,7 @@ from marsyard.scenarios.columns import row_columns
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
 from marsyard.scenarios.systems import catalogue, scenario, scenario_names
+from marsyard.sim.parameters import list_models
 
 #: Folder of the generated pages.
 FOLDER = Path(__file__).parent / "reference" / "generated"
