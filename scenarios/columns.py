@@ -33,7 +33,7 @@ class Kind(StrEnum):
     - CONFIGURED: flag that follows from the parameters of a case, such as its camera
     - OUTCOME: answer of the algorithm, and quantities of its computation
     - ERROR: difference between answer and truth, or a score of the answer
-    - PROVENANCE: identity of images, programs and machine
+    - PROVENANCE: identity of case, images, programs and machine; times
     """
 
     CONDITION = "condition"
@@ -137,11 +137,11 @@ def text(name: str, meaning: str, kind: Kind = Kind.CONDITION) -> Column:
 
 #: Columns of the engine in every row.
 ENGINE = (
-    outcome("case", "number of the case"),
+    Column("case", Kind.PROVENANCE, "number of the case"),
     text("outcome", "outcome of the answer, or reason of the failure", Kind.OUTCOME),
     flag("answered", "an answer is given", "with an answer"),
-    outcome("wall_time_s", "wall-clock time of the case"),
-    outcome("cpu_time_s", "processor time of the case"),
+    Column("wall_time_s", Kind.PROVENANCE, "wall-clock time of the case"),
+    Column("cpu_time_s", Kind.PROVENANCE, "processor time of the case"),
     text("error", "message of a failure", Kind.OUTCOME),
     text("traceback", "traceback of a failure", Kind.OUTCOME),
     text("standard_point", "point of a study at which the case was run", Kind.PROVENANCE),

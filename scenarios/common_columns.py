@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from marsyard.scenarios.columns import Kind, condition, error, flag, instrument_error, outcome, text
+from marsyard.scenarios.columns import Column, Kind, condition, error, flag, instrument_error, outcome, text
 
-SITE = (text("site", "site of the terrain"), outcome("terrain", "number of the terrain in the bank"))
+SITE = (text("site", "site of the terrain"), Column("terrain", Kind.PROVENANCE, "number of the terrain in the bank"))
 
 SUN = (
     condition("sun_azimuth_deg", "azimuth of the sun, clockwise from north"),
@@ -13,7 +13,7 @@ SUN = (
 
 FAULTS = (
     text("fault", "name of the injected fault", Kind.CONFIGURED),
-    outcome("fault_size", "size of the injected fault, in its unit"),
+    Column("fault_size", Kind.CONFIGURED, "size of the injected fault, in its unit"),
     flag("fault_free", "no fault is injected", "without a fault", Kind.TRUTH),
 )
 

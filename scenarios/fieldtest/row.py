@@ -1,7 +1,7 @@
 """Columns of the rows of a field test: one triple of images of a helicopter flight."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Columns, Kind, condition, flag, instrument_error, outcome, text
+from marsyard.scenarios.columns import Column, Columns, Kind, condition, flag, instrument_error, text
 
 COLUMNS = Columns(
     (
@@ -24,7 +24,7 @@ COLUMNS = Columns(
         instrument_error("attitude_change_*_deg", "change of the attitude error between the images of a pair"),
         condition("cloud_transmittance_*", "mean fraction of direct sunlight that clouds transmit at an image"),
         condition("cloud_change_*", "mean change of the transmitted fraction between the images of a pair"),
-        outcome("image_time_*_s", "true time of an image from the start of the run"),
-        outcome("pass_*", "number of the pass over the target at an image"),
+        Column("image_time_*_s", Kind.PROVENANCE, "true time of an image from the start of the run"),
+        Column("pass_*", Kind.PROVENANCE, "number of the pass over the target at an image"),
     )
 )

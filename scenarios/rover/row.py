@@ -1,7 +1,7 @@
 """Columns of the rows of tracked targets: runs of a rover, and targets on the images of a shared drive."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, instrument_error, outcome, text
+from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, instrument_error, outcome, text
 
 _TARGET = (
     *common.SITE,
@@ -18,7 +18,7 @@ _TARGET = (
     flag("autonav", "the rover avoids hazards by itself", "with autonomous navigation", Kind.CONFIGURED),
     flag("roll_compensated", "the tracker rotates its template", "with roll compensation", Kind.CONFIGURED),
     flag("roll_ignored", "the tracker does not rotate its template", "without roll compensation", Kind.CONFIGURED),
-    outcome("search_px", "side of the search window"),
+    Column("search_px", Kind.CONFIGURED, "side of the search window"),
     condition("rock_diameter_m", "diameter of the target's rock", "rock diameter"),
     condition("rock_height_m", "height of the target's rock"),
     flag(
