@@ -2,13 +2,36 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from marsyard.sim.parameters import Parameters, bounded_field
+from marsyard.sim.parameters import Parameters, bounded_field, merge_settings
 from marsyard.sim.render.backend import Backend, default_backend
-from marsyard.sim.terrain import MAX_TERRAINS
+from marsyard.sim.terrain import MAX_TERRAINS, TerrainParameters, site, sites
+
+
+def complete_terrain(
+    parameters: Any, default_site: str | None, find: Callable[[str, Mapping[str, Any]], TerrainParameters | None]
+) -> Any:
+    """Merge the table `terrain` of a scenario's parameters into the terrain of its site, and name this site.
+
+    find: returns the terrain of a site, given by name; None leaves the parameters unchanged
+    """
+    changes = parameters.get("terrain", {}) if isinstance(parameters, Mapping) else None
+    if not isinstance(changes, Mapping):
+        return parameters
+    name = parameters.get("site", default_site)
+    terrain = find(name, parameters) if isinstance(name, str) else None
+    if terrain is None:
+        return parameters
+    return {"terrain_site": name, **parameters, "terrain": merge_settings(terrain.model_dump(), changes)}
+
+
+def preset_terrain(name: str, scale: str) -> TerrainParameters | None:
+    """Return the terrain of a site at a scale (`descent`, `ground`); None if there is none."""
+    return None if getattr(sites().get(name), scale, None) is None else site(name).terrain(scale)
 
 
 class Location(Parameters):

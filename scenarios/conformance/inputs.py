@@ -167,7 +167,7 @@ def _take_images(
     ground = TexturedPlane(np.zeros(3), np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), step_m)
     rng = np.random.default_rng(1)
     detector = Detector.draw(natural_fall_off(camera), detector_preset.detector, rng)
-    binned_camera = camera.bin(columns=1, rows=detector_preset.detector.rows_summed)
+    binned_camera = detector_preset.detector.delivered_camera(camera)
     images = []
     for position, attitude, time in zip(positions, attitudes, times, strict=True):
         radiance = ground.radiance(camera.transform(rigid(attitude, position)))

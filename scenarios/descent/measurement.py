@@ -123,7 +123,7 @@ def measure_exactly(
     p: DescentScenarioParameters, world: DescentWorld, states: Sequence[State], images: Counts, detector: Detector
 ) -> DescentMeasurements:
     """Create measurements without errors: true attitudes, altitudes, times and velocities, and the true camera."""
-    camera = camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed)
+    camera = p.detector.delivered_camera(camera_optics(p.camera).camera)
     heights = height_above_ground(world.surface, np.stack([state.position_m for state in states]))
     return DescentMeasurements(
         images=tuple(
@@ -152,7 +152,7 @@ def measure(
     """Create measurements with errors: attitudes at the images' time tags, and the last altitude before each image."""
     tags = instruments.tags_s
     model = calibrated_camera(p.camera, streams.generator("camera calibration"))
-    camera = model.bin(columns=1, rows=p.detector.rows_summed)
+    camera = p.detector.delivered_camera(model)
     detector_images = [
         DetectorImage(counts, float(tag), camera, detector.calibration)
         for counts, tag in zip(images, tags, strict=True)

@@ -20,13 +20,20 @@ from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitude
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters
+from marsyard.scenarios.place import (
+    DustOpacity,
+    Location,
+    RenderParameters,
+    SunParameters,
+    complete_terrain,
+    preset_terrain,
+)
 from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
 from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.dynamics.swing import SwingParameters
 from marsyard.sim.error_sources import CALIBRATION, CLOUDS, DETECTOR, SHADOW
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
-from marsyard.sim.parameters import NonNegative, Parameters, bounded_field, merge_settings
+from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
 from marsyard.sim.render.photometry import CloudLayer, CloudParameters
 from marsyard.sim.sensor import (
     ApproachParameters,
@@ -40,7 +47,7 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.sensor.detector import BURST_DN, BURST_PX
 from marsyard.sim.sensor.imu import IMUS, ImuClass
-from marsyard.sim.terrain import Site, TerrainParameters, site, sites
+from marsyard.sim.terrain import Site, TerrainParameters, site
 from marsyard.sim.terrain.landforms import Dunes
 
 #: Regular dunes of the dune fault.
@@ -291,16 +298,8 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete_terrain(cls, settings: Any) -> Any:
-        """Merge the table `terrain` into the terrain of the site."""
-        name = settings.get("site") if isinstance(settings, Mapping) else None
-        if not isinstance(name, str) or getattr(sites().get(name), "descent", None) is None:
-            return settings
-        changes = settings.get("terrain", {})
-        if not isinstance(changes, Mapping):
-            return settings
-        site_terrain = site(name).terrain("descent").model_dump()
-        return {"terrain_site": name, **settings, "terrain": merge_settings(site_terrain, changes)}
+    def _complete_terrain(cls, parameters: Any) -> Any:
+        return complete_terrain(parameters, None, lambda name, _: preset_terrain(name, "descent"))
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:

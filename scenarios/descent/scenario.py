@@ -86,7 +86,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         world = DescentWorld.from_parameters(p)
         states = states_at_images(p, create_flight(p, world.surface, streams))
         optics = camera_optics(p.camera)
-        camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
+        camera = p.detector.delivered_camera(optics.camera)
         exposures = take_exposures(p, world, states, optics, draw_detector(p, optics, streams), streams)
         for state, (counts, frame) in zip(states, exposures, strict=True):
             pose = frame.world_from_body

@@ -31,7 +31,7 @@ def descent_timeline(descent: Descent, estimate: VelocityEstimate | None) -> Tim
         states=states,
         images=descent.images,
         bits=p.detector.bits,
-        camera=camera_optics(p.camera).camera.bin(columns=1, rows=p.detector.rows_summed),
+        camera=p.detector.delivered_camera(camera_optics(p.camera).camera),
         mounting=draw_mounting(p, descent.streams),
         triple=p.triple_indices,
         increments=descent.measurements.increments,

@@ -64,7 +64,7 @@ class RunKey:
     def calibrated_camera(self) -> CameraModel:
         """Draw the calibrated camera of the delivered images in the body frame, which is the same for all cases."""
         p, rng = self.field_test, self.shared_generator("camera calibration")
-        return draw_calibrated(field_camera(), p.calibration, rng).bin(columns=1, rows=p.detector.rows_summed)
+        return p.detector.delivered_camera(draw_calibrated(field_camera(), p.calibration, rng))
 
 
 @dataclass(frozen=True)

@@ -233,7 +233,7 @@ def _estimate_attitudes(run: UnprocessedRun, ground: SiteGround, clock: Clock, g
         if p.targets.sightings == "rendered":
             centroids = render_and_detect_targets(run, ground, targets, times, fixes)
         else:
-            true_camera = field_camera().bin(columns=1, rows=p.detector.rows_summed)
+            true_camera = p.detector.delivered_camera(field_camera())
             centroids = project_targets(targets, true_camera, flight.motion(times), p.targets.centroid_px, noise)
         sightings.append(Sightings.from_centroids(targets, camera, tags, fixes, centroids))
         if (count := len(sightings[-1].times_s)) < _MIN_SIGHTINGS:

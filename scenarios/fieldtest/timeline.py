@@ -55,7 +55,7 @@ def triple_timeline(
         states=states,
         images=images,
         bits=field_test.detector.bits,
-        camera=camera_optics(field_camera()).camera.bin(columns=1, rows=field_test.detector.rows_summed),
+        camera=field_test.detector.delivered_camera(camera_optics(field_camera()).camera),
         mounting=RigidTransform.identity(),
     )
     return case.timeline(estimate, None)

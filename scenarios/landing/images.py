@@ -110,7 +110,7 @@ def take_images(
     counts = [detector.expose(radiance, noise, motion) for radiance, motion in zip(radiances, motions, strict=True)]
     # the fault `repeated_image` = 1 replaces image 2
     delivered_images = corrupt_images(counts, 2 * p.faults.repeated_image, p.faults.black_image, p.faults.lost_rows)
-    camera = optics.camera.bin(columns=1, rows=p.detector.rows_summed)
+    camera = p.detector.delivered_camera(optics.camera)
     first, second = (
         DetectorImage(image, state.time_s, camera, detector.calibration)
         for image, state in zip(delivered_images, flight.states, strict=True)
@@ -128,7 +128,7 @@ def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, str
     reading = unit.readings(np.zeros(1), np.array([pair.range_along_m(unit.axis)]), streams.generator("laser noise"))
     slant = float(add_range_faults(p.faults, reading.values, p.height_m)[0])
     calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
-    camera = calibrated.bin(columns=1, rows=p.detector.rows_summed)
+    camera = p.detector.delivered_camera(calibrated)
     first, second = (replace(image, camera=camera) for image in pair.images)
     camera_to_site_m = (slant if np.isfinite(slant) else p.height_m) * camera.a
     return LandingMeasurements(

@@ -18,7 +18,14 @@ from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
-from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters
+from marsyard.scenarios.place import (
+    DustOpacity,
+    Location,
+    RenderParameters,
+    SunParameters,
+    complete_terrain,
+    preset_terrain,
+)
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR, ErrorSource
@@ -253,24 +260,12 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete_terrain(cls, settings: Any) -> Any:
-        """Merge the table `terrain` into the site's terrain at the selected scale."""
-        if not isinstance(settings, Mapping):
-            return settings
-        name, scale = settings.get("site", "heli-hazardous"), settings.get("scale", "ground")
-        changes = settings.get("terrain", {})
-        site_preset = sites().get(name) if isinstance(name, str) else None
-        if (
-            "terrain_site" in settings
-            or getattr(site_preset, str(scale), None) is None
-            or not isinstance(changes, Mapping)
-        ):
-            return settings
-        return {
-            **settings,
-            "terrain_site": name,
-            "terrain": site(name).terrain(scale).with_changes(changes).model_dump(),
-        }
+    def _complete_terrain(cls, parameters: Any) -> Any:
+        def find(name: str, tables: Mapping[str, Any]) -> TerrainParameters | None:
+            is_complete = "terrain_site" in tables
+            return None if is_complete else preset_terrain(name, str(tables.get("scale", "ground")))
+
+        return complete_terrain(parameters, "heli-hazardous", find)
 
     @model_validator(mode="after")
     def _check_consistency(self) -> LandingScenarioParameters:

@@ -24,9 +24,9 @@ from marsyard.scenarios.localisation.map_product import MapParameters
 from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
 from marsyard.scenarios.localisation.stream import ImageSchedule
 from marsyard.scenarios.localisation.task import LOCALISATION
-from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters
+from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters, complete_terrain
 from marsyard.scenarios.terrain_files import CheckedTerrain
-from marsyard.sim.parameters import NonNegative, bounded_field, merge_settings
+from marsyard.sim.parameters import NonNegative, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarParameters
 from marsyard.sim.sensor.imu import IMUS, ImuClass
 from marsyard.sim.terrain import Site, TerrainParameters
@@ -87,18 +87,14 @@ class LocalisationScenarioParameters(AlgorithmSelection):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete_terrain(cls, settings: Any) -> Any:
-        """Merge the table `terrain` into the terrain of the site."""
-        if not isinstance(settings, Mapping):
-            return settings
-        name, changes = settings.get("site", cls.model_fields["site"].default), settings.get("terrain", {})
-        if not isinstance(name, str) or not isinstance(changes, Mapping):
-            return settings
-        try:
-            terrain = localisation_site(name).terrain("descent")
-        except ValueError:
-            return {"terrain": TerrainParameters(), **settings}  # the check of `site` reports the error
-        return {"terrain_site": name, **settings, "terrain": merge_settings(terrain.model_dump(), changes)}
+    def _complete_terrain(cls, parameters: Any) -> Any:
+        def find(name: str, _: Mapping[str, Any]) -> TerrainParameters:
+            try:
+                return localisation_site(name).terrain("descent")
+            except ValueError:
+                return TerrainParameters()  # the check of `site` reports the error
+
+        return complete_terrain(parameters, cls.model_fields["site"].default, find)
 
     @field_validator("site")
     @classmethod

@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from scipy.ndimage import uniform_filter
 from scipy.optimize import brentq
 
+from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
@@ -101,6 +102,10 @@ class DetectorParameters(Parameters):
     def input_files(self) -> tuple[str, ...]:
         """Return the datasheet that the values were read from, if any."""
         return () if self.file is None else (self.file,)
+
+    def delivered_camera(self, camera: CameraModel) -> CameraModel:
+        """Return the camera of delivered images, of which a row is the sum of `rows_summed` rows of `camera`."""
+        return camera.bin(columns=1, rows=self.rows_summed)
 
     def bin(self, side: int) -> DetectorParameters:
         """Return the parameters of a detector whose pixels are the sums of blocks of side x side pixels.

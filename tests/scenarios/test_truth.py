@@ -104,7 +104,7 @@ def test_descent_inputs_differ_from_truth(case: int) -> None:
     row = DescentScenario().run(parameters, streams).row
     (inputs,), (truth,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
     assert isinstance(truth, ScoredDescent)
-    camera = camera_optics(parameters.camera).camera.bin(columns=1, rows=parameters.detector.rows_summed)
+    camera = parameters.detector.delivered_camera(camera_optics(parameters.camera).camera)
     response = Detector.draw(
         camera_optics(parameters.camera).fall_off, parameters.detector, streams.generator("detector response")
     )
@@ -153,7 +153,7 @@ def test_field_test_inputs_differ_from_truth(case: int) -> None:
     parameters = make_parameters(runs=runs, algorithm="tests.scenarios.spies:VelocitySpy", **RECORDING_SCORE)
     row = FieldTestScenario().run(parameters, Streams(5, "test", case)).row
     (inputs,), (truth,) = spies.RECORDED_INPUTS, spies.RECORDED_CASES
-    camera = field_camera().bin(columns=1, rows=parameters.detector.rows_summed)
+    camera = parameters.detector.delivered_camera(field_camera())
     assert_flight_inputs_differ(inputs, truth, camera, [float(row[f"altitude_{k}_m"]) for k in (1, 2, 3)])
     true_displacements = np.diff([state.position_m for state in truth.states], axis=0)
     true_velocities = true_displacements / parameters.triples.virtual_interval_s
@@ -179,9 +179,7 @@ def test_landing_inputs_differ_from_truth(case: int, helicopter: dict[str, Any] 
         LandingMeasurements, {"images", "poses", "slant_range_m", "up_body", "apriori_site_world"}
     )
     for image, pose, state in zip(inputs.images, inputs.poses, truth.states, strict=True):
-        assert_cameras_differ(
-            "camera", image.camera, parameters.optics.bin(columns=1, rows=parameters.detector.rows_summed)
-        )
+        assert_cameras_differ("camera", image.camera, parameters.detector.delivered_camera(parameters.optics))
         assert_poses_differ("pose", pose.world_from_body, rigid(state.attitude, state.position_m))
     first_state, range_m = truth.states[0], float(row["range_m"])
     assert_differs("slant range", inputs.slant_range_m, range_m)
