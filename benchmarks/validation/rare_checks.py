@@ -13,7 +13,6 @@ from scipy.stats import norm
 
 from benchmarks.validation.limit_states import LimitState, four_branch_margin, linear_margin, run_subset
 from benchmarks.validation.records import Check, Measure
-from marsyard.campaigns.studies.decision import MIN_EFFECTIVE_VIOLATIONS
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.interval import (
     ProbabilityInterval,
@@ -23,6 +22,7 @@ from marsyard.campaigns.studies.interval import (
     weighted_interval,
 )
 from marsyard.campaigns.studies.rare import RareSettings
+from marsyard.campaigns.studies.rare_decision import MIN_EFFECTIVE_VIOLATIONS
 from marsyard.campaigns.studies.subset import SubsetResult
 from marsyard.sim.streams import Blend
 

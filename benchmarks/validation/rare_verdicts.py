@@ -15,9 +15,9 @@ import numpy as np
 from benchmarks.validation.limit_states import KnownState, discontinuous_states, run_subset
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.counting import find_units_needed
-from marsyard.campaigns.studies.decision import Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.interval import replicate_interval
 from marsyard.campaigns.studies.rare import MIN_PROBABILITY_FRACTION, RareSettings
+from marsyard.campaigns.studies.rare_decision import Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.subset import SubsetResult
 
 #: Settings of `marsyard rare` without options, and its one-sided risk of a wrong verdict.

@@ -133,7 +133,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
-def create_subject(spec: str, task: str | None, limit_s: float) -> suite.TestedAlgorithm:
+def create_subject(spec: str, task: str | None, limit_s: float) -> suite.CandidateAlgorithm:
     """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
     limit_s: time limit of one answer
@@ -147,10 +147,10 @@ def create_subject(spec: str, task: str | None, limit_s: float) -> suite.TestedA
         suite.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return suite.TestedAlgorithm(spec, task_name, limit_s)
+    return suite.CandidateAlgorithm(spec, task_name, limit_s)
 
 
-def run_conformance_checks(subject: suite.TestedAlgorithm) -> Iterator[suite.Finding]:
+def run_conformance_checks(subject: suite.CandidateAlgorithm) -> Iterator[suite.Finding]:
     """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
     # the time limit of an answer, the same time for the other work of the check, and 5 s
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
@@ -178,7 +178,7 @@ def run_conformance_checks(subject: suite.TestedAlgorithm) -> Iterator[suite.Fin
                 return
 
 
-def _load_subject(subject: suite.TestedAlgorithm) -> None:
+def _load_subject(subject: suite.CandidateAlgorithm) -> None:
     """Load and compile the subject of conformance checks in a worker."""
     subject.prepare()
     accept_process_state()

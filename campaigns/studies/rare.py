@@ -15,8 +15,8 @@ from marsyard.campaigns.definition.margins import compute_margin, describe_margi
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver
-from marsyard.campaigns.studies.decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.importance import fit_density
+from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,

@@ -46,7 +46,7 @@ def subject_kinds() -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class TestedAlgorithm:
+class CandidateAlgorithm:
     """An algorithm or a user-defined part under test.
 
     - spec: name of the algorithm (`marsyard.scenarios.estimators`) or part (`marsyard.scenarios.parts`)
@@ -101,12 +101,12 @@ def check_subject(spec: str, task: str) -> None:
         tasks()[task].check(spec)
 
 
-def check_names(subject: TestedAlgorithm) -> list[tuple[str, str]]:
+def check_names(subject: CandidateAlgorithm) -> list[tuple[str, str]]:
     """Return names and requirements of a subject's checks."""
     return [(check.name, check.requirement) for check in subject.suite().checks()]
 
 
-def run_check(subject: TestedAlgorithm, number: int) -> Finding:
+def run_check(subject: CandidateAlgorithm, number: int) -> Finding:
     """Run the check with this index."""
     return list(subject.suite().checks())[number].evaluate()
 

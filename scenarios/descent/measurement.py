@@ -1,4 +1,4 @@
-"""Create an estimator's measurements of a descent: images, attitudes, altitudes and inertial velocities."""
+"""Draw the instruments of a descent, and create the measurements of an estimator from true motion and images."""
 
 from __future__ import annotations
 

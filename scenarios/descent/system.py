@@ -25,7 +25,7 @@ SYSTEM = System(
     scenarios={"descent": "marsyard.scenarios.descent.scenario:DescentScenario"},
     tasks=("marsyard.scenarios.velocity:VELOCITY",),
     folder=_FOLDER,
-    columns={"descent": "marsyard.scenarios.descent.row:COLUMNS"},
+    columns={"descent": "marsyard.scenarios.descent.columns:COLUMNS"},
     compilation_campaigns={"dimes-smoke": ("terrain.samples=512",)},
     templates={
         "velocity": CampaignTemplate(

@@ -13,6 +13,6 @@ SYSTEM = System(
     scenarios={"fieldtest": "marsyard.scenarios.fieldtest.scenario:FieldTestScenario"},
     tasks=("marsyard.scenarios.velocity:VELOCITY",),
     folder=Path(__file__).resolve().parent,
-    columns={"fieldtest": "marsyard.scenarios.fieldtest.row:COLUMNS"},
+    columns={"fieldtest": "marsyard.scenarios.fieldtest.columns:COLUMNS"},
     report="marsyard.reports.fieldtest.presentation:FIELD_TEST",
 )

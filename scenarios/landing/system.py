@@ -16,7 +16,7 @@ SYSTEM = System(
     scenarios={"landing": "marsyard.scenarios.landing.scenario:LandingScenario"},
     tasks=("marsyard.scenarios.landing_site:LANDING",),
     folder=_FOLDER,
-    columns={"landing": "marsyard.scenarios.landing.row:COLUMNS"},
+    columns={"landing": "marsyard.scenarios.landing.columns:COLUMNS"},
     compilation_campaigns={"hda-benign": ("terrain.samples=512",)},
     templates={
         "landing": CampaignTemplate(

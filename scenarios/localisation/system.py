@@ -15,7 +15,7 @@ SYSTEM = System(
     scenarios={"localisation": "marsyard.scenarios.localisation.scenario:LocalisationScenario"},
     tasks=("marsyard.scenarios.localisation.task:LOCALISATION",),
     folder=_FOLDER,
-    columns={"localisation": "marsyard.scenarios.localisation.row:COLUMNS"},
+    columns={"localisation": "marsyard.scenarios.localisation.columns:COLUMNS"},
     compilation_campaigns={
         "loc-smoke": (
             "terrain.samples=1024",

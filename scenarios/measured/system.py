@@ -15,9 +15,9 @@ SYSTEM = System(
     },
     tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_site:LANDING"),
     columns={
-        "measured-velocity": "marsyard.scenarios.measured.row:VELOCITY_COLUMNS",
-        "measured-landing": "marsyard.scenarios.measured.row:LANDING_COLUMNS",
-        "measured-matching": "marsyard.scenarios.measured.row:MATCHING_COLUMNS",
+        "measured-velocity": "marsyard.scenarios.measured.columns:VELOCITY_COLUMNS",
+        "measured-landing": "marsyard.scenarios.measured.columns:LANDING_COLUMNS",
+        "measured-matching": "marsyard.scenarios.measured.columns:MATCHING_COLUMNS",
     },
     ingest="marsyard.scenarios.measured.ingest:ingest_campaign",
     report="marsyard.reports.measured.presentation:MEASURED",

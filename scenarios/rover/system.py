@@ -23,8 +23,8 @@ SYSTEM = System(
     tasks=("marsyard.scenarios.rover.task:TRACKING",),
     folder=_FOLDER,
     columns={
-        "rover": "marsyard.scenarios.rover.row:COLUMNS",
-        "rover-drive": "marsyard.scenarios.rover.row:DRIVE_COLUMNS",
+        "rover": "marsyard.scenarios.rover.columns:COLUMNS",
+        "rover-drive": "marsyard.scenarios.rover.columns:DRIVE_COLUMNS",
     },
     compilation_campaigns={"vtt-checkout-2": ("world.samples=512", "start.distance_m=2.4", "target.diameter_m=0.5")},
     templates={

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.studies.decision import RareSample, decide_rare
+from marsyard.campaigns.studies.rare_decision import RareSample, decide_rare
 from marsyard.campaigns.studies.runner import convert_to_json
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
 from marsyard.reports.rare import rare_sentences

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.scenarios.conformance import Finding, TestedAlgorithm, check_names, determine_task, run_check
+from marsyard.scenarios.conformance import CandidateAlgorithm, Finding, check_names, determine_task, run_check
 
 
 def run_suite(spec: str, *checks: str, task: str | None = None, limit_s: float = 60.0) -> dict[str, Finding]:
     """Run the given checks, or all checks, of an algorithm or part; return the findings by name of the check."""
-    subject = TestedAlgorithm(spec, task or determine_task(spec), limit_s)
+    subject = CandidateAlgorithm(spec, task or determine_task(spec), limit_s)
     names = [name for name, _ in check_names(subject)]
     return {name: run_check(subject, names.index(name)) for name in (checks or names)}
 

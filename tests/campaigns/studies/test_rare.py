@@ -13,8 +13,8 @@ from marsyard.campaigns.errors import CampaignError, ConfigurationError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.studies.decision import Basis, RareVerdict
 from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
+from marsyard.campaigns.studies.rare_decision import Basis, RareVerdict
 from marsyard.reports.evaluation import evaluate_run
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume

@@ -10,7 +10,7 @@ import pytest
 
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.replay import create_subject
-from marsyard.scenarios.conformance import TestedAlgorithm, check_names, determine_task, subject_kinds
+from marsyard.scenarios.conformance import CandidateAlgorithm, check_names, determine_task, subject_kinds
 from marsyard.scenarios.conformance.inputs import make_blank
 from marsyard.scenarios.localisation import conformance_inputs as inputs
 from marsyard.scenarios.localisation.stream import LocalisationMeasurements
@@ -211,7 +211,7 @@ def test_estimators_and_programs_have_the_localisation_suite() -> None:
     assert [determine_task(name) for name in ("lvs", "sift", "inertial")] == ["localisation"] * 3
     assert determine_task("marsyard.algorithms.localisation.estimator:MapRelativeEstimator") == "localisation"
     assert create_subject("inertial", None, 60.0).task == "localisation"
-    names = [name for name, _ in check_names(TestedAlgorithm("serve:cat", "localisation", 60.0))]
+    names = [name for name, _ in check_names(CandidateAlgorithm("serve:cat", "localisation", 60.0))]
     assert "start" in names
     assert "inputs" not in names  # a program receives files
 

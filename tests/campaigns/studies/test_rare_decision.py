@@ -14,7 +14,7 @@ from benchmarks.validation.limit_states import (
 )
 from benchmarks.validation.rare_verdicts import DEFAULTS, NOMINAL_RISK, measure_rates, simulate_study
 from marsyard.campaigns.studies.counting import find_units_needed
-from marsyard.campaigns.studies.decision import Basis, RareSample, RareVerdict, decide_rare
+from marsyard.campaigns.studies.rare_decision import Basis, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
 
 STATES = tuple(discontinuous_states())

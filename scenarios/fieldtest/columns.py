@@ -1,4 +1,4 @@
-"""Columns of the rows of a field test: one triple of images of a helicopter flight."""
+"""Columns in the rows of a field test: one triple of images of a helicopter flight."""
 
 from marsyard.scenarios import common_columns as common
 from marsyard.scenarios.columns import Column, Columns, Kind, condition, flag, instrument_error, text

@@ -1,4 +1,4 @@
-"""Columns of the rows of a parachute descent."""
+"""Columns in the rows of a parachute descent."""
 
 from marsyard.scenarios import common_columns as common
 from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, instrument_error, outcome

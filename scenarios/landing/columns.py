@@ -1,4 +1,4 @@
-"""Columns of the rows of a landing: motion, map, site and touchdown."""
+"""Columns in the rows of a landing: motion, map, site and touchdown."""
 
 from marsyard.scenarios import common_columns as common
 from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, instrument_error, outcome

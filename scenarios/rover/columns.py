@@ -1,4 +1,4 @@
-"""Columns of the rows of tracked targets: runs of a rover, and targets on the images of a shared drive."""
+"""Columns in the rows of tracked targets: runs of a rover, and targets on the images of a shared drive."""
 
 from marsyard.scenarios import common_columns as common
 from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, instrument_error, outcome, text

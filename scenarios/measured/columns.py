@@ -1,4 +1,4 @@
-"""Columns of the rows of recorded images: agreement of images and poses, and answers of algorithms."""
+"""Columns in the rows of recorded images: agreement of images and poses, and answers of algorithms."""
 
 from marsyard.scenarios import common_columns as common
 from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, outcome, text
