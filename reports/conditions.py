@@ -35,7 +35,7 @@ from marsyard.scenarios.columns import split_unit
 CONDITIONS = (
     "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "terrain_kind", "relief", "rms_slope",
     "sun_elevation", "sun_azimuth", "image_contrast", "image_patchiness", "dust_opacity", "abundance", "rock_abundance",
-    "defocus", "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "tilt_max",
+    "defocus", "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "max_tilt",
     "pose_error_fraction",
 )  # fmt: skip
 #: A column with at most `MAX_VALUES` values has a row for each value, if the mean number of cases per value is at least

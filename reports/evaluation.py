@@ -32,7 +32,7 @@ _NO_VERDICT = "NO VERDICT"
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A stored campaign with its sampling design, its verdicts, and what they are evidence for.
+    """A stored campaign with its sampling design, its verdicts, and its kind of evidence.
 
     - evidence: kind of evidence; a confirmation is a run with a new seed after the algorithm was frozen, a calibration
       allows no PASS
@@ -90,7 +90,7 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 def _qualify(
     verdict: Verdict, requirement: Mapping[str, Any], run: StoredRun, sampling: SamplingDesign, joint: JointEvidence
 ) -> Verdict:
-    """Add what the record of confirmations shows to the verdict of a confirmation."""
+    """Add the contribution of the record of confirmations to the verdict of a confirmation."""
     if not joint.is_confirmation:
         return verdict
     own = collect_evidence(run.all_cases, requirement, sampling, has_own_terrains=True)

@@ -175,7 +175,7 @@ def _new_campaign_text(verdicts: Sequence[Verdict], cases: int, total: int) -> s
     )
     if needed >= total:
         return ""
-    design = "another seed"
+    design = "a new seed"
     if any(verdict.clustered is not None for verdict in verdicts):
         design += ", and a terrain for each case,"
     needed_text = f"{count(needed, 'case')} (-n {needed})"

@@ -26,7 +26,7 @@ TOUCHDOWN_ERRORS = (
     Quantity("touchdown_error_m", "true touchdown"),
     Quantity("touchdown_error_estimated_m", "navigation filter"),
 )
-_DEVIATIONS = ("gps_deviation_north_m", "gps_deviation_east_m")
+_DEVIATIONS = ("gps_sd_north_m", "gps_sd_east_m")
 _TOUCHDOWN_NOTE = (
     "Averaged GPS: from the coordinates of the site to the GPS receiver's averaged positions after landing. True "
     "touchdown: from the true site to the true touchdown; the true site excludes the navigation error at the first "

@@ -46,15 +46,17 @@ COLUMNS = Columns(
         instrument_error("pose_tilt_error_deg", "tilt error of the first pose", "tilt error of the pose"),
         instrument_error("pose_azimuth_error_deg", "azimuth error of the first pose", "azimuth error of the pose"),
         instrument_error(
-            "pose_turn_error_deg", "error of the rotation between both poses", "error of the rotation between the poses"
+            "pose_rotation_error_deg",
+            "error of the rotation between both poses",
+            "error of the rotation between the poses",
         ),
         instrument_error(
-            "gps_deviation_east_m",
+            "gps_sd_east_m",
             "mean standard deviation that the receiver reports after touchdown, east",
             "east error of averaged GPS",
         ),
         instrument_error(
-            "gps_deviation_north_m",
+            "gps_sd_north_m",
             "mean standard deviation that the receiver reports after touchdown, north",
             "north error of averaged GPS",
         ),
@@ -165,10 +167,12 @@ COLUMNS = Columns(
             "touchdown_margin", "distance of slope and roughness at the touchdown from their limits; the smaller one"
         ),
         outcome("touchdown_sink_m_s", "vertical speed at touchdown"),
-        outcome("touchdown_drift_m_s", "horizontal speed at touchdown"),
+        outcome("touchdown_horizontal_speed_m_s", "horizontal speed at touchdown"),
         outcome("gps_solutions", "averaged solutions of the receiver after touchdown"),
-        outcome("landing_turns", "iterations of flight and filter", "iterations of flight and filter"),
-        outcome("landing_moved_m", "change of the path in the last iteration", "path change in the last iteration"),
+        outcome("landing_iterations", "iterations of flight and filter", "iterations of flight and filter"),
+        outcome(
+            "landing_path_change_m", "change of the path in the last iteration", "path change in the last iteration"
+        ),
         outcome("landing_after_s", "time from the second image to touchdown", "time from the images to the landing"),
     )
 )

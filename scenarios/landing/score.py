@@ -49,9 +49,9 @@ MOTION_COLUMNS = (
 #: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
 GROUND_COLUMNS = ("east_m", "north_m", "slope_deg", "roughness_m", "hazard_distance_m", "margin")
 TOUCHDOWN_COLUMNS = (
-    "touchdown_error_gps_m", "touchdown_error_estimated_m", "touchdown_error_m", "gps_deviation_north_m",
-    "gps_deviation_east_m", "gps_solutions", "landing_turns", "landing_moved_m", "landing_after_s",
-    "touchdown_sink_m_s", "touchdown_drift_m_s",
+    "touchdown_error_gps_m", "touchdown_error_estimated_m", "touchdown_error_m", "gps_sd_north_m",
+    "gps_sd_east_m", "gps_solutions", "landing_iterations", "landing_path_change_m", "landing_after_s",
+    "touchdown_sink_m_s", "touchdown_horizontal_speed_m_s",
 )  # fmt: skip
 
 
@@ -149,10 +149,10 @@ def landing_row(
     `touchdown_error_gps_m` is the distance from the receiver's averaged solutions to the site's coordinates, as
     measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which excludes
     the navigation error at the first image. `touchdown_safe` is true if the ground under the helicopter is safe.
-    `touchdown_sink_m_s` and `touchdown_drift_m_s` are the vertical and horizontal speeds at touchdown. `gps_solutions`
-    is the number of averaged solutions; `gps_deviation_north_m` and `gps_deviation_east_m` are the means of the
+    `touchdown_sink_m_s` and `touchdown_horizontal_speed_m_s` are the vertical and horizontal speeds at touchdown. `gps_solutions`
+    is the number of averaged solutions; `gps_sd_north_m` and `gps_sd_east_m` are the means of the
     standard deviations that the receiver reports. `landing_after_s` is the time from the second image to touchdown.
-    `landing_turns` and `landing_moved_m` are the number of iterations of flight and filter and the change of the path
+    `landing_iterations` and `landing_path_change_m` are the number of iterations of flight and filter and the change of the path
     in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a touchdown, numbers are NaN, and
     `touchdown_safe` is missing.
     """
@@ -304,7 +304,7 @@ def _navigation_errors(flight: LandingFlight, measurements: LandingMeasurements)
         "pose_motion_error_m": float(np.linalg.norm(motion_error)),
         "pose_tilt_error_deg": float(np.degrees(np.hypot(*first[:2]))),
         "pose_azimuth_error_deg": float(np.degrees(first[2])),
-        "pose_turn_error_deg": float(np.degrees(np.linalg.norm(second - first))),
+        "pose_rotation_error_deg": float(np.degrees(np.linalg.norm(second - first))),
     }
 
 

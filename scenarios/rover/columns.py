@@ -36,7 +36,7 @@ _TARGET = (
     instrument_error("mast_elevation_error_deg", "zero error of the mast's elevation"),
     condition("range_start_m", "range of the target at the first stop", "range at the start"),
     outcome("range_end_m", "range of the target at the last stop"),
-    condition("tilt_max_deg", "maximum tilt of the rover", "maximum rover tilt"),
+    condition("max_tilt_deg", "maximum tilt of the rover", "maximum rover tilt"),
     condition("distance_driven_m", "commanded length of the path"),
     condition("slip_mean", "mean slip of the wheels, weighted with the lengths", "mean wheel slip"),
     condition("slip_max", "maximum slip of the wheels", "maximum wheel slip"),
@@ -46,8 +46,8 @@ _TARGET = (
     ),
     outcome("duration_min", "time from the first to the last stop, minutes"),
     outcome("sun_motion_deg", "angle between the sun's directions at the first and the last stop"),
-    condition("exposure_min_s", "shortest exposure", "shortest exposure"),
-    condition("exposure_max_s", "longest exposure", "longest exposure"),
+    condition("min_exposure_s", "shortest exposure", "shortest exposure"),
+    condition("max_exposure_s", "longest exposure", "longest exposure"),
     condition(
         "obliquity_start_deg",
         "angle between the target's normal and the line of sight at the start",
@@ -93,7 +93,7 @@ _TARGET = (
     error("drift_px", "distance of the tracked from the true pixel in the last image", "drift of the tracked point"),
     error("drift_u_px", "drift along the columns"),
     error("drift_v_px", "drift along the rows"),
-    error("worst_error_px", "largest distance of the tracked from the true pixel"),
+    error("max_error_px", "largest distance of the tracked from the true pixel"),
     error("track_margin_px", "limit of a false track minus the worst error"),
     error("target_motion_m", "distance between the first and the last reported target in the world"),
     error(

@@ -87,7 +87,7 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
         "drift_px": drift,
         "drift_u_px": float(last_error_px[0]),
         "drift_v_px": float(last_error_px[1]),
-        "worst_error_px": _finite_max(error_sizes_px),
+        "max_error_px": _finite_max(error_sizes_px),
         "track_margin_px": p.score.false_track_px - _finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), NAN),
@@ -222,7 +222,7 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
     return {
         "range_start_m": ranges[0],
         "range_end_m": ranges[1],
-        "tilt_max_deg": float(np.degrees(_finite_max(np.array([stop.stance.tilt_rad for stop in stops])))),
+        "max_tilt_deg": float(np.degrees(_finite_max(np.array([stop.stance.tilt_rad for stop in stops])))),
         "distance_driven_m": distance,
         "slip_mean": float(np.sum(slips * lengths[is_moving]) / distance) if distance > 0.0 else 0.0,
         "slip_max": _finite_max(slips) if np.any(is_moving) else 0.0,
@@ -231,8 +231,8 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
         "duration_min": times[1] / 60.0,
         **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
-        "exposure_min_s": -_finite_max(-exposures),  # minimum of the finite values
-        "exposure_max_s": _finite_max(exposures),
+        "min_exposure_s": -_finite_max(-exposures),  # minimum of the finite values
+        "max_exposure_s": _finite_max(exposures),
     }
 
 

@@ -155,7 +155,7 @@ def test_tracked_and_false_track_have_separate_limits() -> None:
     assert (row["tracked"], row["no_false_track"]) == (True, True)
     row = run(0.5 * drift_px)
     assert (row["tracked"], row["target_held"], row["no_false_track"]) == (False, False, True)
-    assert row["track_margin_px"] == pytest.approx(10.0 - float(str(row["worst_error_px"])))
+    assert row["track_margin_px"] == pytest.approx(10.0 - float(str(row["max_error_px"])))
 
 
 #: 95 % slip on level ground; visual odometry measures it.
