@@ -147,14 +147,14 @@ def landing_row(
     """Compute the columns of the touchdown and of the ground under it.
 
     `touchdown_error_gps_m` is the distance from the receiver's averaged solutions to the site's coordinates, as
-    measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which excludes
-    the navigation error at the first image. `touchdown_safe` is true if the ground under the helicopter is safe.
-    `touchdown_sink_m_s` and `touchdown_horizontal_speed_m_s` are the vertical and horizontal speeds at touchdown. `gps_solutions`
-    is the number of averaged solutions; `gps_sd_north_m` and `gps_sd_east_m` are the means of the
-    standard deviations that the receiver reports. `landing_after_s` is the time from the second image to touchdown.
-    `landing_iterations` and `landing_path_change_m` are the number of iterations of flight and filter and the change of the path
-    in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a touchdown, numbers are NaN, and
-    `touchdown_safe` is missing.
+    measured in the paper. `touchdown_error_m` is the distance from the true touchdown to the true site, which
+    excludes the navigation error at the first image. `touchdown_safe` is true if the ground under the helicopter is
+    safe. `touchdown_sink_m_s` and `touchdown_horizontal_speed_m_s` are the vertical and horizontal speeds at
+    touchdown. `gps_solutions` is the number of averaged solutions; `gps_sd_north_m` and `gps_sd_east_m` are the
+    means of the standard deviations that the receiver reports. `landing_after_s` is the time from the second image
+    to touchdown. `landing_iterations` and `landing_path_change_m` are the number of iterations of flight and filter
+    and the change of the path in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a touchdown,
+    numbers are NaN, and `touchdown_safe` is missing.
     """
     site = estimate.site_world
     if touchdown is None or site is None:
