@@ -56,7 +56,7 @@ PROBE_TIMEOUT_S = 30.0
 
 
 class CheckResult(Enum):
-    """Verdict of a check; its value is the colour on the terminal. Only FAIL prevents a campaign from running."""
+    """Result of a check; its value is the colour on the terminal. Only FAIL prevents a campaign from running."""
 
     OK = "green"
     WARN = "yellow"

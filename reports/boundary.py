@@ -172,7 +172,7 @@ def boundary_section(subject: Subject) -> Section | None:
 def list_conditions(run: StoredRun) -> list[str]:
     """List the columns of the dispersed parameters and of the measured conditions of a campaign; not the terrain."""
     frame = run.frame
-    measured = [column for column in map(str, frame.columns) if column.startswith(CONDITIONS)]
+    measured = [name for name in map(str, frame.columns) if name.startswith(CONDITIONS) and run.is_condition(name)]
     dispersed = [path for path in run.dispersed_paths if path in frame and not path.endswith("terrain")]
     names = distinct_columns(frame, [*dict.fromkeys((*dispersed, *measured))])
     return [name for name in names if pd.api.types.is_numeric_dtype(frame[name]) and frame[name].nunique() > 2]

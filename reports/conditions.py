@@ -5,7 +5,7 @@ A condition is a column such as the sun elevation; a bin is one of its values, o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
@@ -56,7 +56,7 @@ def conditions_section(subject: Subject) -> Section | None:
         return None
     tables = {
         column: [_summarize_bin(frame[mask], metric, name) for name, mask in bins]
-        for column, bins in bin_conditions(frame)
+        for column, bins in bin_conditions(frame, subject.run.is_condition)
     }
     terrain_rows = [
         row
@@ -83,10 +83,13 @@ def conditions_section(subject: Subject) -> Section | None:
     return Section("conditions", "Conditions", title, [*blocks, Block(note=note)], data)
 
 
-def bin_conditions(frame: pd.DataFrame) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
+def bin_conditions(
+    frame: pd.DataFrame, is_condition: Callable[[str], bool]
+) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
     """Yield each condition that varies: its column, and the names and masks of its bins."""
+    names = [name for name in map(str, frame.columns) if is_condition(name)]
     for prefix in CONDITIONS:
-        columns = [name for name in map(str, frame.columns) if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_")]
+        columns = [name for name in names if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_")]
         for column in columns[:1]:
             n_values = frame[column].dropna().nunique()
             if 2 <= n_values <= MAX_VALUES and len(frame) >= CASES_PER_VALUE * n_values:

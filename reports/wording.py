@@ -164,15 +164,15 @@ def note_text(key: str, **values: object) -> str:
 
 
 _AXES = ("x", "y", "z")
-#: Pattern of columns that describe the run or the results, for scenarios that do not declare their conditions.
+#: Pattern of columns that describe the run or the results, in scenarios that do not declare their columns.
 _EXCLUDED_COLUMNS = re.compile(
-    r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|^place_|estimated|_true_"
-    r"|^firing_|^touchdown_|^site_|^room|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
+    r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|estimated|_true_"
+    r"|^firing_|^touchdown_|^site_|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
     r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
 )
 #: Prefixes of the condition columns that `driver_columns` lists first.
 _PREFERRED_DRIVERS = (
-    "off_nadir_max", "attitude_rate_max", "altitude_1", "wind_speed", "horizontal_speed", "sun_elevation", "slip_mean",
+    "off_nadir_max", "attitude_rate_max", "altitude_1", "horizontal_speed", "sun_elevation", "slip_mean",
     "pose_error_fraction", "rock_diameter", "disparity_error_goal",
 )  # fmt: skip
 #: Maximum number of distinct values of a column that divides the cases into categories.
@@ -228,11 +228,16 @@ def driver_columns(
     A sampled value that a column of the scenario repeats is not listed again.
     """
     names = [str(name) for name in frame.columns]
-    excluded_names = {metric, *axis_columns(metric, names), "terrain"}
+    terrains = [name for name in names if name.rpartition(".")[2] == "terrain"]
+    excluded_names = {metric, *axis_columns(metric, names), *terrains}
     candidates = [
         name
         for name in names
-        if name not in excluded_names and is_condition(name) and _is_number(frame, name) and frame[name].nunique() > 1
+        if name not in excluded_names
+        and name.rpartition(".")[2] != "terrain"
+        and is_condition(name)
+        and _is_number(frame, name)
+        and frame[name].nunique() > 1
     ]
     candidates = distinct_columns(frame, candidates)
     preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]

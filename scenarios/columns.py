@@ -30,7 +30,7 @@ class Kind(StrEnum):
     - CONDITION: world, motion and images of the case, which do not depend on the algorithm
     - INSTRUMENT_ERROR: error of a measurement that the algorithm receives
     - TRUTH: flag that the flight system cannot know, because it is computed from the truth
-    - CONFIGURED: flag that follows from the parameters of a case, such as its camera
+    - CONFIGURED: column that follows from the parameters of a case, such as its camera or its fault
     - OUTCOME: answer of the algorithm, and quantities of its computation
     - ERROR: difference between answer and truth, or a score of the answer
     - PROVENANCE: identity of case, images, programs and machine; times
@@ -186,9 +186,9 @@ class Columns:
         return tuple(item.name for item in self.columns if item.kind is Kind.CONFIGURED)
 
     def is_condition(self, name: str) -> bool:
-        """Return whether a column is a number that describes the conditions of a case."""
+        """Return whether a column describes the conditions of a case."""
         found = self.find(name)
-        return found is not None and found.type is float and found.kind in (Kind.CONDITION, Kind.INSTRUMENT_ERROR)
+        return found is not None and found.kind in (Kind.CONDITION, Kind.INSTRUMENT_ERROR)
 
     @cached_property
     def _by_name(self) -> dict[str, Column]:

@@ -35,7 +35,7 @@ def preset_terrain(name: str, scale: str) -> TerrainParameters | None:
 
 
 class Location(Parameters):
-    """Terrain and position of the descent."""
+    """Terrain of the bank, and position on it."""
 
     bank: Annotated[int, bounded_field(1, MAX_TERRAINS, "number of terrains in the terrain bank")] = 4
     bank_seed: Annotated[int, Field(ge=0, description="seed of the bank's terrains")] = 1

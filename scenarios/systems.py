@@ -151,9 +151,8 @@ def _load(path: str, earlier_systems: list[System]) -> System:
         raise ValueError(f"it cannot be imported: {error}") from error
     if not isinstance(system, System):
         raise ValueError(f"it is a {type(system).__name__}; allowed: a marsyard.scenarios.systems.System")
-    missing = [] if system.folder is None or system.folder.exists() else [str(system.folder)]
-    if missing:
-        raise ValueError(f"these files do not exist: {', '.join(missing)}")
+    if system.folder is not None and not system.folder.is_dir():
+        raise ValueError(f"the folder {system.folder} does not exist")
     for earlier in earlier_systems:
         conflicts = [f"name '{system.name}'"] if system.name == earlier.name else []
         for kind in ("scenarios", "campaigns", "templates"):

@@ -26,8 +26,8 @@ class ErrorSource:
     remaining: float = 0.0
 
 
-ATTITUDE = ErrorSource("attitude", "attitude: initial error and gyroscopes")
-ACCELERATION = ErrorSource("acceleration", "velocity: initial error and accelerometers")
+ATTITUDE = ErrorSource("attitude", "attitude and gyroscopes")
+ACCELERATION = ErrorSource("acceleration", "velocity and accelerometers")
 INERTIAL = ErrorSource("inertial", "inertial measurement unit", remaining=0.1)
 ALTITUDE = ErrorSource("altitude", "altimeter: scale, noise, boresight")
 SIDE_LOBES = ErrorSource("side-lobes", "radar altimeter: side lobes")

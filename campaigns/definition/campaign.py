@@ -191,10 +191,6 @@ class Campaign:
         """Create the parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
         return self.with_values(self.draws(case))
 
-    def parameters_at(self, point: StudyPoint) -> BaseModel:
-        """Create the parameters of a case at a point of a study. Raises ValueError like `parameters`."""
-        return self.with_values(self.draws_at(point), point.removed)
-
     def with_values(self, values: Mapping[str, Any], removed: Sequence[str] = ()) -> BaseModel:
         """Create the campaign's parameters with other values at some paths, and without the `removed` error sources."""
         tree = replace_values(self.configuration.parameters, values)

@@ -136,7 +136,8 @@ def determine_task(spec: str) -> str:
     for task in tasks().values():
         if task.suite and task.methods and all(hasattr(algorithm, method) for method in task.methods):
             return task.name
-    if hasattr(algorithm, "process_image") and len(inspect.signature(algorithm.start).parameters) > 1:
+    start = getattr(algorithm, "start", None)
+    if hasattr(algorithm, "process_image") and start is not None and len(inspect.signature(start).parameters) > 1:
         # a stream that starts with inputs, in addition to `self`
         return next(task.name for task in tasks().values() if not task.methods)
     annotations = inspect.get_annotations(getattr(algorithm, "estimate", None) or algorithm)

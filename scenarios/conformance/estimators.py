@@ -62,7 +62,7 @@ class Protocol:
 
 @dataclass(frozen=True)
 class EstimatorSuite(Suite):
-    """Suite of one estimator; if the protocol has an interrupted descent, `make` constructs a `StreamedEstimator`."""
+    """Suite of an estimator that receives all measurements at once."""
 
     protocol: Protocol
 

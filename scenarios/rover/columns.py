@@ -29,7 +29,7 @@ _TARGET = (
     ),
     flag("point_lit", "the sun reaches the designated point", kind=Kind.CONDITION),
     flag("point_on_edge", "the designated point is near the occluding edge of its rock", kind=Kind.CONDITION),
-    flag("clear_sky", "no cloud shadow moves over the ground", "without clouds", Kind.CONDITION),
+    flag("clear_sky", "no cloud shadow moves over the ground", "without clouds", Kind.TRUTH),
     instrument_error("disparity_error_start_px", "disparity error at 10 m", "disparity error at the start"),
     instrument_error("disparity_error_goal_px", "disparity error at 2 m", "disparity error at the goal"),
     instrument_error("mast_azimuth_error_deg", "zero error of the mast's azimuth"),
@@ -45,7 +45,7 @@ _TARGET = (
         "pose_error_fraction", "pose error, divided by the distance", "rover pose error / distance driven"
     ),
     outcome("duration_min", "time from the first to the last stop, minutes"),
-    outcome("sun_motion_deg", "angle between the sun's directions at the first and the last stop"),
+    condition("sun_motion_deg", "angle between the sun's directions at the first and the last stop"),
     condition("min_exposure_s", "shortest exposure", "shortest exposure"),
     condition("max_exposure_s", "longest exposure", "longest exposure"),
     condition(
@@ -58,7 +58,7 @@ _TARGET = (
     flag(
         "no_rover_shadow_on_target",
         "the rover's shadow never lies on the target",
-        "with a target that is never in the rover's shadow",
+        "whose target is never in the rover's shadow",
         Kind.TRUTH,
     ),
     condition(
@@ -76,8 +76,8 @@ _TARGET = (
     flag("tracked", "the target is tracked", "with a tracked target"),
     flag("not_tracked", "the target is not tracked", "without a tracked target"),
     flag("target_held", "the target is tracked at the last stop"),
-    flag("stuck", "the rover hardly moves over several steps", "with a stuck rover"),
-    flag("mobile", "the rover is not stuck", "with a rover that is not stuck"),
+    flag("stuck", "the rover hardly moves over several steps", "whose rover is stuck", Kind.TRUTH),
+    flag("mobile", "the rover is not stuck", "whose rover is not stuck", Kind.TRUTH),
     flag("no_false_track", "there is no false track"),
     flag("handed_over", "the target is handed over to the arm"),
     outcome("updates", "updates of the tracker"),
@@ -127,11 +127,11 @@ _UPDATES = {
 COLUMNS = Columns(
     (
         *_TARGET,
-        flag("point_in_view", "the designated point stays visible", "with a point that stays in view", Kind.TRUTH),
+        flag("point_in_view", "the designated point stays visible", "whose point stays in view", Kind.TRUTH),
         flag(
             "placeable",
             "a position within 8 mm of the designated point is free of collisions",
-            "with a target on which the surface permits a placement",
+            "whose target permits a placement",
             Kind.TRUTH,
         ),
         flag("placed", "the instrument is placed", "with a placed instrument"),
@@ -148,11 +148,11 @@ DRIVE_COLUMNS = Columns(
     (
         *_TARGET,
         condition("step", "step between two updates: fraction of the distance, or degrees of a turn or circle"),
-        flag("in_view", "the designated point stays visible", "with a point that stays in view", Kind.TRUTH),
+        flag("in_view", "the designated point stays visible", "whose point stays in view", Kind.TRUTH),
         flag(
             "on_face",
             "the point is on the face seen from both ends",
-            "with a point on the face seen from both ends",
+            "whose point is on the face seen from both ends",
             Kind.TRUTH,
         ),
         flag("with_scale", "the tracker changes the scale of its template", "with template scale", Kind.CONFIGURED),

@@ -267,10 +267,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
             candidate = p.model_copy(update={"algorithm": algorithm})
             run_start_s = start_s if is_tested else time.process_time()
             prepared = first if is_tested else prepare_run(candidate, streams, self.load_ground)
-            tracked = run_tracker(p, lambda: place_target(track_target(candidate, prepared)))
-            if tracked.answer is not None:
-                tracked.answer.row["run_time_s"] = time.process_time() - run_start_s
-            return tracked
+            return run_tracker(p, lambda: place_target(track_target(candidate, prepared)), run_start_s)
 
         def score_run(algorithm: str, runs: Runs[ScoredTrack]) -> Score:
             result = score_track(p, runs[algorithm].answer, is_tested=algorithm == p.algorithm)
@@ -363,12 +360,18 @@ class ScoredTrack:
         return self.run.outcome
 
 
-def run_tracker(p: RoverScenarioParameters, track: Callable[[], RoverRun]) -> AlgorithmRun[ScoredTrack]:
-    """Run a tracker, whose answers move the mast or the rover; an exception is a failure of the tracker."""
+def run_tracker(
+    p: RoverScenarioParameters, track: Callable[[], RoverRun], start_s: float | None = None
+) -> AlgorithmRun[ScoredTrack]:
+    """Run a tracker, whose answers move the mast or the rover; an exception is a failure of the tracker.
+
+    start_s: processor time at the start of a run that takes its own images
+    """
 
     def track_and_score() -> ScoredTrack:
         run = track()
-        return ScoredTrack(run, {**score.score_run(p, run), **score.tracking_row(run)})
+        times = {} if start_s is None else {"run_time_s": time.process_time() - start_s}
+        return ScoredTrack(run, {**score.score_run(p, run), **score.tracking_row(run), **times})
 
     algorithm_run = run_algorithm(track_and_score, lambda answer: cast(ScoredTrack, answer))
     # the time includes that of the images, which follow from the answers

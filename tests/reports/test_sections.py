@@ -75,7 +75,7 @@ def test_condition_bins_have_correct_error_statistics() -> None:
     frame = pd.DataFrame({"answered": rng.random(n) < 0.9, "attitude_rate_max_deg_s": rate, "site": ["a", "b"] * 500})
     # x: a bias proportional to the rate; y: noise with standard deviation 2
     frame = assign_errors(frame, np.column_stack([0.1 * rate, rng.normal(0.0, 2.0, n)]))
-    by_column = dict(bin_conditions(frame))
+    by_column = dict(bin_conditions(frame, lambda name: True))
     assert list(by_column) == ["attitude_rate_max_deg_s", "site"]
     for bins in by_column.values():
         np.testing.assert_array_equal(np.sum([is_in_bin for _, is_in_bin in bins], axis=0), 1)
@@ -94,10 +94,12 @@ def test_condition_bins_have_correct_error_statistics() -> None:
 
 def test_constant_conditions_are_omitted() -> None:
     frame = make_rows(60).assign(sun_elevation_deg=40.0)
-    assert "sun_elevation_deg" not in dict(bin_conditions(frame))
+    assert "sun_elevation_deg" not in dict(bin_conditions(frame, lambda name: True))
     assert conditions_section(make_subject(frame[["answered", METRIC]])) is None
     # too few cases per category
-    assert "site" not in dict(bin_conditions(frame.assign(site=[f"site {index % 10}" for index in range(60)])))
+    assert "site" not in dict(
+        bin_conditions(frame.assign(site=[f"site {index % 10}" for index in range(60)]), lambda name: True)
+    )
 
 
 def test_variance_between_terrains_is_estimated() -> None:

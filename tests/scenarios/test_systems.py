@@ -1,6 +1,7 @@
 """Tests of the registry of systems: systems of installed packages are registered, invalid systems are omitted."""
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
@@ -111,12 +112,19 @@ def test_columns_are_declared_once_with_a_meaning(name: str) -> None:
     declared = [(column.name, column.type) for column in (*columns, *ENGINE)]
     assert len(declared) == len(set(declared))
     assert all(column.meaning for column in columns)
+    results = re.compile(
+        r"estimat|footprint|touchdown|^site_.|^position_error|^velocity_error|^firing_velocity|inliers|tracks|tracked"
+        r"|matche[sd]|^elevation_|_safe$|_unflagged$|_time_s$|residual|nees|_sd_|^lost|^false|^updates$|^update_"
+    )
+    assert [
+        column.name for column in columns if columns.is_condition(column.name) and results.search(column.name)
+    ] == []
     # reports find labels, and texts of flags, by name: declarations of one name agree in all scenarios
     for column in columns:
         found = column_declarations.find_column(column.name)
         assert found is not None
         assert (column.label, column.population) == (found.label, found.population), column.name
-        assert column.type is not bool or column.meaning == found.meaning, column.name
+        assert column.type is not bool or (column.meaning, column.kind) == (found.meaning, found.kind), column.name
 
 
 def test_system_of_another_package_is_registered(install: Install) -> None:
@@ -167,7 +175,7 @@ def test_external_scenario_code_is_part_of_the_identity(install: Install, tmp_pa
             "the system 'vtt' already has the template 'tracking'",
         ),
         (_format_system("mine", ", folder=HERE"), "the system 'hda' already has the campaign 'hda-map'"),
-        (_format_system("mine", ", folder=HERE / 'none'"), "these files do not exist: "),
+        (_format_system("mine", ", folder=HERE / 'none'"), "none does not exist"),
     ],
 )
 def test_invalid_system_does_not_affect_others(install: Install, source: str, reason: str) -> None:

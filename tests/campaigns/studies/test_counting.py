@@ -157,7 +157,7 @@ def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
     step = ((3, 0.995), (4, math.sqrt(1.0 - 0.995**2)))
     for sources, blend in (((), ()), (removed, ()), ((), ()), ((), step)):
         point = StudyPoint((0.1,) * len(campaign.drawn_paths), 3, (), sources, blend)
-        parameters = campaign.parameters_at(point)
+        parameters = campaign.with_values(campaign.draws_at(point), point.removed)
         for shared_input in campaign.scenario.shared_inputs(parameters):
             campaign.scenario.prepare(parameters, shared_input)
         result = campaign.scenario.run(parameters, campaign.streams_at(point))

@@ -62,7 +62,9 @@ class DirectRunner:
         for candidate in candidates:
             stream = self.n_cases if candidate.stream is None else candidate.stream
             point = StudyPoint(candidate.coordinates, stream, candidate.nominal)
-            result = self.campaign.scenario.run(self.campaign.parameters_at(point), self.campaign.streams(stream))
+            result = self.campaign.scenario.run(
+                self.campaign.with_values(self.campaign.draws_at(point)), self.campaign.streams(stream)
+            )
             rows.append({"outcome": result.outcome, "answered": True, **result.row, POINT_COLUMN: point.text})
             self.n_cases += 1
         return rows
