@@ -233,11 +233,7 @@ def driver_columns(
     candidates = [
         name
         for name in names
-        if name not in excluded_names
-        and name.rpartition(".")[2] != "terrain"
-        and is_condition(name)
-        and _is_number(frame, name)
-        and frame[name].nunique() > 1
+        if name not in excluded_names and is_condition(name) and _is_number(frame, name) and frame[name].nunique() > 1
     ]
     candidates = distinct_columns(frame, candidates)
     preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
