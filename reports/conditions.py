@@ -33,7 +33,7 @@ from marsyard.scenarios.columns import split_unit
 
 #: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.
 CONDITIONS = (
-    "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "terrain_kind", "relief", "rms_slope",
+    "altitude_1", "altitude_m", "attitude_rate_max", "off_nadir_max", "site", "relief", "rms_slope",
     "sun_elevation", "sun_azimuth", "image_contrast", "image_patchiness", "dust_opacity", "abundance", "rock_abundance",
     "defocus", "stray_light", "horizontal_speed", "camera", "rock_diameter", "slip_mean", "max_tilt",
     "pose_error_fraction",
@@ -87,9 +87,9 @@ def bin_conditions(
     frame: pd.DataFrame, is_condition: Callable[[str], bool]
 ) -> Iterator[tuple[str, list[tuple[str, Bool[np.ndarray, " n"]]]]]:
     """Yield each condition that varies: its column, and the names and masks of its bins."""
-    names = [name for name in map(str, frame.columns) if is_condition(name)]
+    candidates = [name for name in map(str, frame.columns) if is_condition(name)]
     for prefix in CONDITIONS:
-        columns = [name for name in names if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_")]
+        columns = [name for name in candidates if f"{name.rpartition('.')[2]}_".startswith(f"{prefix}_")]
         for column in columns[:1]:
             n_values = frame[column].dropna().nunique()
             if 2 <= n_values <= MAX_VALUES and len(frame) >= CASES_PER_VALUE * n_values:

@@ -62,10 +62,11 @@ def population_text(population: str) -> str:
     groups: dict[str, list[str]] = {}
     for phrase in phrases:
         preposition, _, rest = phrase.partition(" ")
-        groups.setdefault(preposition, []).append(rest)
+        is_shared = preposition in ("with", "without")
+        groups.setdefault(preposition if is_shared else phrase, []).append(rest if is_shared else "")
     texts = [
-        f"{preposition} {_enumerate(rests, 'or' if preposition == 'without' else 'and')}"
-        for preposition, rests in sorted(groups.items())
+        f"{preposition} {_enumerate(rests, 'or' if preposition == 'without' else 'and')}".rstrip()
+        for preposition, rests in sorted(groups.items(), key=lambda group: (group[0] != "with", group[0]))
     ]
     unknown_text = f" for which {_enumerate(unknown)} {'is' if len(unknown) == 1 else 'are'} true" if unknown else ""
     return f"{base} {' and '.join(texts)}".rstrip() + unknown_text
