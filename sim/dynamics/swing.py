@@ -16,7 +16,7 @@ mass M, S = m_b L_b + m_l L, J = m_b L_b^2 + m_l L^2 and the projection P_x perp
 where g is the gravity vector, w the lander's spin about its axis, s = P_n (e x e' + w e) - n x n' the lander's angular
 rate relative to the line, and c the damping in the bridle; the line has the lander's roll rate. With r'' from (1), (2)
 and (3) are two equations for n'' and e'', solved in closed form (`marsyard.sim.dynamics.kernels.swing`). The force of
-the air on the canopy, at the velocity v relative to the air, is
+the air on the canopy, at the velocity v relative to the air, is::
 
     F = -rho/2 A |v| (C_T |v| n + C_N P_n v),      rho decreasing exponentially with height.
 
@@ -26,8 +26,8 @@ coning. F includes the force on backshell and lander, a few per cent. rho A C_T 
 `descent_rate_m_s` in equilibrium; the dispersion of this rate stands for those of density, area and coefficient.
 
 C_N causes the coning. Let the lander be fixed to the line, and included in S and J. With the normal force per angle of
-attack k, mu = M - S^2 / J, kappa = k / mu, l = J / S, a = |F| / M and the descent rate V, the characteristic equation
-(p: eigenvalue) of small swings is
+attack k, mu = M - S^2 / J, kappa = k / mu, l = J / S, ``a = |F| / M`` and the descent rate V, the characteristic
+equation (p: eigenvalue) of small swings is
 
     (p + kappa / V) (p^2 + kappa / l) = kappa (kappa - a) / (V l).
 
