@@ -37,7 +37,7 @@ def measure_frame(repeats: int) -> list[Measurement]:
 
 def measure_case(repeats: int) -> list[Measurement]:
     """Measure complete `dimes-gusev` cases over one prepared terrain, their stages, and cases over new terrains."""
-    prepared, campaign = (load_campaign("dimes-gusev", settings) for settings in (["location.bank=1"], []))
+    prepared, campaign = (load_campaign("dimes-gusev", overrides) for overrides in (["location.bank=1"], []))
     prepared.scenario.prepare(prepared.base_parameters(), 0)
     case_numbers = itertools.count()
 

@@ -23,8 +23,8 @@ from marsyard.reports.statistics.samples import quantile_bounds
 STORED = Path(options.__file__).with_name("imu_threshold.json")
 #: Version of the derivation; increase it if the result changes for the same inputs.
 VERSION = 2
-#: Campaign whose instruments are simulated, its settings (few terrains, for a short run time) and number of descents.
-CAMPAIGN, SETTINGS, CASES = "dimes-gusev", ("parameters.location.bank=12",), 400
+#: Campaign whose instruments are simulated, its overrides (few terrains, for a short run time) and number of descents.
+CAMPAIGN, OVERRIDES, CASES = "dimes-gusev", ("parameters.location.bank=12",), 400
 #: Stored quantiles of the discrepancy between tracks and IMU.
 QUANTILES = (0.5, 0.9, 0.95, 0.99, 0.995, 0.999)
 #: Minimum and maximum velocity error of the wrong track, m/s: a constant error, and errors up to the search range.
@@ -54,7 +54,7 @@ def derive_threshold(inputs: derivation.ThresholdInputs, instruments: Instrument
         "derivation": "benchmarks.threshold_derivation",
         "derivation_version": VERSION,
         "versions": {name: version(name) for name in ("marsyard", "numpy", "scipy")},
-        "instruments": {"campaign": CAMPAIGN, "settings": SETTINGS, "descents": CASES, **asdict(instruments)},
+        "instruments": {"campaign": CAMPAIGN, "overrides": OVERRIDES, "descents": CASES, **asdict(instruments)},
         "inputs": asdict(inputs),
         "track_error_rms_m_s": float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))),
         "discrepancy_quantiles_m_s": {
@@ -80,7 +80,7 @@ def _quantiles(values: np.ndarray) -> dict[str, float]:
 
 def main() -> None:
     """Derive, store and print the threshold."""
-    instruments = simulate_instruments(load_campaign(CAMPAIGN, list(SETTINGS)), CASES)
+    instruments = simulate_instruments(load_campaign(CAMPAIGN, list(OVERRIDES)), CASES)
     record = derive_threshold(derivation.ThresholdInputs(), instruments)
     STORED.write_text(json.dumps(record, indent=1) + "\n")
     print(json.dumps(record, indent=1))

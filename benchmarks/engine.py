@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 from benchmarks.timing import Measurement
 from marsyard.algorithms.processes import resident_bytes
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
@@ -136,10 +136,10 @@ def measure(repeats: int = 3) -> list[Measurement]:
 
 def _measure_empty_campaign(cases: int = 100_000) -> list[Measurement]:
     """Measure a campaign of empty cases on two workers, and a joblib loop over the same cases without storage."""
-    configuration = CampaignConfiguration(
+    definition = CampaignDefinition(
         name="empty", scenario="benchmarks.engine:BusyScenario", cases=cases, retain=Retain(showcase="none")
     )
-    campaign = Campaign(configuration, BusyScenario())
+    campaign = Campaign(definition, BusyScenario())
     with TemporaryDirectory() as folder:
         start_s = time.perf_counter()
         run_campaign(campaign, Path(folder, "run"), ExecutorConfig(2), Stopwatch(()))
@@ -160,7 +160,7 @@ def _run_case(campaign: Campaign, case: int) -> CaseResult:
 
 def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
     """Run a campaign on one worker; measure from case `first` to case `last`, so that start-up is excluded."""
-    configuration = CampaignConfiguration(
+    definition = CampaignDefinition(
         name="busy",
         scenario="benchmarks.engine:BusyScenario",
         # additional cases, because workers run small batches at the end
@@ -170,14 +170,14 @@ def measure_case_cost(busy_s: float, first: int, last: int) -> CaseCost:
     )
     stopwatch = Stopwatch((first, last))
     with TemporaryDirectory() as folder:
-        run_campaign(Campaign(configuration, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), stopwatch)
+        run_campaign(Campaign(definition, BusyScenario()), Path(folder, "run"), ExecutorConfig(1), stopwatch)
         seconds = pq.read_table(Path(folder, "run", "cases.parquet"), columns=["wall_time_s"])["wall_time_s"]
         inside_case_s = pc.mean(seconds.slice(first, last - first)).as_py()
     (start_s, start_mb), (end_s, end_mb) = stopwatch.records[first], stopwatch.records[last]
     return CaseCost((end_s - start_s) / (last - first), inside_case_s, end_mb - start_mb)
 
 
-def measure_rate(campaign_name: str, settings: Sequence[str] = (), cases: int = 120, jobs: int = 2) -> float:
+def measure_rate(campaign_name: str, overrides: Sequence[str] = (), cases: int = 120, jobs: int = 2) -> float:
     """Measure the rate of a campaign of rendered cases, cases per second (wall-clock time); needs idle cores.
 
     The first 24 cases (start-up of the workers) and the last 8 (small batches) are excluded.
@@ -185,7 +185,7 @@ def measure_rate(campaign_name: str, settings: Sequence[str] = (), cases: int = 
     first, last = 24, cases - 8
     stopwatch = Stopwatch((first, last))
     with TemporaryDirectory() as folder:
-        campaign = load_campaign(campaign_name, [*settings, "retain.showcase=none"], cases)
+        campaign = load_campaign(campaign_name, [*overrides, "retain.showcase=none"], cases)
         run_campaign(campaign, Path(folder, "run"), ExecutorConfig(jobs), stopwatch)
     return (last - first) / (stopwatch.records[last][0] - stopwatch.records[first][0])
 

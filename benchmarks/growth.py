@@ -29,7 +29,7 @@ from benchmarks.images import descent_pose, descent_scene
 from benchmarks.reporting import run_marsyard, synthetic_campaign
 from benchmarks.timing import core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
@@ -154,13 +154,13 @@ def _measure_dask_workers(workers: Sequence[int]) -> list[tuple[float, float]]:
 def _measure_campaign_s(cases: int, waiting_s: float, executor: ExecutorConfig) -> float:
     """Run a campaign; return the wall-clock time from the first to the last completed case."""
     scenario = "benchmarks.growth:WaitingScenario" if waiting_s else "benchmarks.engine:BusyScenario"
-    configuration = CampaignConfiguration(
+    definition = CampaignDefinition(
         name="growth", scenario=scenario, cases=cases, parameters={"busy_s": waiting_s}, retain=Retain(showcase="none")
     )
     stopwatch = Stopwatch((1, cases))
     with TemporaryDirectory() as folder:
         instance = WaitingScenario() if waiting_s else BusyScenario()
-        run_campaign(Campaign(configuration, instance), Path(folder, "run"), executor, stopwatch)
+        run_campaign(Campaign(definition, instance), Path(folder, "run"), executor, stopwatch)
     return stopwatch.records[cases][0] - stopwatch.records[1][0]
 
 

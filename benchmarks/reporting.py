@@ -125,7 +125,7 @@ def _draw_rows(rng: np.random.Generator, start: int, count: int) -> pa.Table:
 def _make_record(cases: int, seed: int, site: str) -> dict[str, Any]:
     """Return the content of `campaign.json`; dates and commits differ between seeds."""
     requirements = [shipped_requirements()[name].model_dump(mode="json") for name in ("DIMES-VEL", "DIMES-HARM")]
-    configuration = {"name": f"dimes-{site}", "scenario": "descent", "cases": cases, "seed": seed}
+    definition = {"name": f"dimes-{site}", "scenario": "descent", "cases": cases, "seed": seed}
     return {
         "schema": SCHEMA,
         "name": f"dimes-{site}",
@@ -135,7 +135,7 @@ def _make_record(cases: int, seed: int, site: str) -> dict[str, Any]:
         "cases": cases,
         "seed": seed,
         "requirements": requirements,
-        "configuration": {**configuration, "parameters": {"site": site}, "requirements": requirements},
+        "definition": {**definition, "parameters": {"site": site}, "requirements": requirements},
         "git_commit": f"{seed % 7:040x}",
     }
 

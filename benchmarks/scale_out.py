@@ -35,7 +35,7 @@ from pydantic import BaseModel
 
 from benchmarks.engine import BusyScenario, Stopwatch
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
 from marsyard.campaigns.execution.batches import MAX_BATCH, batch_duration_s
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
@@ -134,7 +134,7 @@ def _cost_per_case(address: str, scheduler: psutil.Process, batch: int, counts: 
     """Return the processor times of scheduler and program per case: differences between two campaigns."""
     costs = []
     for count in counts:
-        configuration = CampaignConfiguration(
+        definition = CampaignDefinition(
             name="wide",
             scenario="benchmarks.scale_out:WideScenario",
             description="rows without simulation",
@@ -143,7 +143,7 @@ def _cost_per_case(address: str, scheduler: psutil.Process, batch: int, counts: 
         )
         start_scheduler_s, start_s = sum(scheduler.cpu_times()[:2]), time.process_time()
         with TemporaryDirectory() as folder, patch("marsyard.campaigns.execution.batches.MAX_BATCH", batch):
-            campaign = Campaign(configuration, WideScenario())
+            campaign = Campaign(definition, WideScenario())
             run_campaign(campaign, Path(folder) / "run", ExecutorConfig(cluster=address), Stopwatch(()))
         costs.append((sum(scheduler.cpu_times()[:2]) - start_scheduler_s, time.process_time() - start_s))
     (scheduler_s, program_s), cases = np.diff(costs, axis=0)[0], counts[1] - counts[0]

@@ -110,13 +110,13 @@ def measure_runs(repeats: int) -> list[Measurement]:
 
     Odometry has simulated errors, or is visual odometry with rendered images; the second run also maps the terrain.
     """
-    settings: dict[str, Any] = {
+    values: dict[str, Any] = {
         "camera": {"preset": "research-navcam"},
         "target": {"diameter_m": 0.9, "shape": 2, "yaw_deg": 74.0, "across": 0.1},
         "sun": {"azimuth_deg": 260.0, "elevation_deg": 45.0},
         "legs": [{"motion": "approach", "step_fraction": 0.1, "goal_m": 2.0}],
     }
-    navigated = settings | {"legs": [settings["legs"][0] | {"visual_odometry": True, "maps_first": True}]}
+    navigated = values | {"legs": [values["legs"][0] | {"visual_odometry": True, "maps_first": True}]}
 
     def measure_run(name: str, values: dict[str, Any], limit: float) -> Measurement:
         parameters = RoverScenarioParameters.model_validate(values)
@@ -124,7 +124,7 @@ def measure_runs(repeats: int) -> list[Measurement]:
         return Measurement(name, elapsed_s, limit=limit)
 
     return [
-        measure_run("rover run from 10 m to 2 m with 34 rendered images", settings, 1.5),
+        measure_run("rover run from 10 m to 2 m with 34 rendered images", values, 1.5),
         measure_run("the same with rendered visual odometry and terrain maps", navigated, 3.0),
     ]
 

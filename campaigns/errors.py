@@ -39,8 +39,8 @@ class Problem:
         return "".join(character if character.isprintable() else ascii(character)[1:-1] for character in text)
 
 
-class ConfigurationError(CampaignError):
-    """A campaign with an invalid configuration; `problems` lists all problems, at least one."""
+class DefinitionError(CampaignError):
+    """A campaign with an invalid definition; `problems` lists all problems, at least one."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)

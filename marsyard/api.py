@@ -123,9 +123,9 @@ def run(
     if isinstance(campaign, Campaign):
         if cases is not None or seed is not None or changes:
             raise CampaignError("cases, seed and changes are for a campaign that is given by its name or file")
-        name = campaign.configuration.name
+        name = campaign.definition.name
     else:
-        name = loading.load_campaign(str(campaign)).configuration.name
+        name = loading.load_campaign(str(campaign)).definition.name
     folder = default_directory(name) if directory is None else Path(directory)
     specs = _name_algorithms([*([] if algorithm is None else [algorithm]), *compare], folder / "algorithms")
     if compare and algorithm is None:

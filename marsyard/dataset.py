@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.identity import configuration_hash
+from marsyard.campaigns.definition.identity import definition_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.running.preparation import plan_inputs
 from marsyard.scenarios.exposure import ProvidesSamples
@@ -40,11 +40,11 @@ def write_dataset(
     Raises CampaignError if the scenario provides no samples, or the folder is read-only or contains another data set.
     """
     if not isinstance(campaign.scenario, ProvidesSamples):
-        name = campaign.configuration.scenario
+        name = campaign.definition.scenario
         allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), ProvidesSamples))
         raise CampaignError(f"the scenario '{name}' provides no training samples; allowed: {allowed}")
     _write_manifest(campaign, folder, cases_per_shard, bits_per_pixel)
-    total = campaign.configuration.total_cases
+    total = campaign.definition.total_cases
     starts = range(0, total, cases_per_shard)
     paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
     shards = {
@@ -71,20 +71,20 @@ def _prepare_terrains(campaign: Campaign, cases: Iterable[int]) -> None:
 
 def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits_per_pixel: float | None) -> None:
     """Write the manifest of the data set. Raises StoreError if the folder contains another data set."""
-    configuration = campaign.configuration
+    definition = campaign.definition
     manifest = {
-        "campaign": configuration.name,
+        "campaign": definition.name,
         "cases_per_shard": cases_per_shard,
         **({} if bits_per_pixel is None else {"bits_per_pixel": bits_per_pixel}),
-        "configuration_sha256": configuration_hash(configuration),
-        "configuration": configuration.model_dump(mode="json"),
+        "definition_sha256": definition_hash(definition),
+        "definition": definition.model_dump(mode="json"),
     }
     path = folder / MANIFEST
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             previous = json.loads(path.read_text(encoding="utf-8"))
-            for key in ("configuration_sha256", "cases_per_shard", "bits_per_pixel"):
+            for key in ("definition_sha256", "cases_per_shard", "bits_per_pixel"):
                 if previous.get(key) != manifest.get(key):
                     raise StoreError(f"{folder} contains another data set ({key} differs); choose another folder")
             return
@@ -113,7 +113,7 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
     for number, sample in enumerate(scenario.samples(campaign.parameters(case), campaign.streams(case))):
         key = f"{case:07d}-{number}"
         metadata = {
-            "campaign": campaign.configuration.name,
+            "campaign": campaign.definition.name,
             "case": case,
             "image_index": number,
             "dispersed_parameters": draws,

@@ -54,7 +54,7 @@ def budget_sentences(study: Mapping[str, Any]) -> list[str]:
         sentences += [
             f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])}: {number(math.sqrt(total))} "
             f"with all sources of error, {_format_root(budget['remaining'])} without any, from the {budget['common']} "
-            f"of {count(int(result['cases']), 'base case')} that were answered in every configuration.",
+            f"of {count(int(result['cases']), 'base case')} that were answered in every variant.",
             f"Largest contributions to the mean square: {largest}; "
             f"{REMAINING} {signed_percent(budget['remaining'] / total)}.",
             _closure_sentence(budget, float(study["confidence"])),
@@ -140,7 +140,7 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
         f" Sources that this campaign does not have: {'; '.join(result['inactive'])}." if result["inactive"] else ""
     )
     note = (
-        "Each base case runs with the same dispersions and random streams in all configurations. 'With it only' is the "
+        "Each base case runs with the same dispersions and random streams in all variants. 'With it only' is the "
         f"{statistic} with this source and no other, 'Without it' that with all other sources; both include the part "
         "that remains without any source. 'Answered' is the number of answered base cases, with the source only and "
         "without it. The contribution is the mean of two increases of the mean square: if the source is added to no "

@@ -163,7 +163,7 @@ def page_context(
         "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],
         "bound": bound,
         "extra_sections": extra,
-        "outcomes": sections.outcome_grid(run.all_cases, str(run.configuration.get("scenario") or "")),
+        "outcomes": sections.outcome_grid(run.all_cases, str(run.definition.get("scenario") or "")),
         "outcome_figures": sections.outcome_figures(run.all_cases),
         "crashed": sections.crashed_rows(run),
         "dispersions": sections.dispersion_grid(subject.run),
@@ -173,7 +173,7 @@ def page_context(
         "summaries": {case.case: finder.summary(case.case) for case in showcases},
         "provenance": sections.list_provenance(run),
         "versions": sections.list_versions(run),
-        "configuration": json.dumps(run.configuration, indent=2, ensure_ascii=False, default=str),
+        "definition": json.dumps(run.definition, indent=2, ensure_ascii=False, default=str),
         "algorithms": read_algorithms(run.record),
         "rerun": sections.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
@@ -204,7 +204,7 @@ def page_context(
 
 def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
     """List warnings about the sampling: a design that is not random, plots of a part of the cases, a nominal case."""
-    sampling = read_sampling_design(run.configuration)
+    sampling = read_sampling_design(run.definition)
     cautions = []
     if not sampling.independent and not run.recorded("study"):
         cautions.append(

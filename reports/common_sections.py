@@ -263,7 +263,7 @@ def curve_sizes(cases: int) -> list[int]:
 
 def success_rate_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
     """Return name, required rate and convergence curve of each requirement that can be evaluated."""
-    sampling = read_sampling_design(subject.run.configuration)
+    sampling = read_sampling_design(subject.run.definition)
     frame, requirements = subject.all_cases, subject.run.requirements
     sizes = curve_sizes(len(frame))
     evaluated = [(size, evaluate_requirements(frame.head(size), requirements, sampling)) for size in sizes]

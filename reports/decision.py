@@ -44,7 +44,7 @@ def evaluate_requirements(
     - sampling: the sampling design; without independent random samples, verdicts have no bounds
     - from_truth: columns that the flight system cannot know, with their definitions; mentioned in the statement of a
       requirement
-    - configured: columns, or patterns of names, that the configuration of a case determines; they remain conditions
+    - configured: columns, or patterns of names, that the definition of a case determines; they remain conditions
       over all cases
     - earlier: evidence of other confirmations of the same claim for each requirement; may be empty
     """
@@ -65,7 +65,7 @@ def evaluate_requirements(
 def _evaluate_all_cases(
     frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, configured: Sequence[str]
 ) -> AllCases | None:
-    """Evaluate a requirement on all cases of its configuration; None if its population is the same, or has no case."""
+    """Evaluate a requirement on all cases of its definition; None if its population is the same, or has no case."""
     population = str(requirement.get("population", "all"))
     remaining_conditions = tuple(
         name for name in population.split(" and ") if any(fnmatchcase(name, flag) for flag in configured)

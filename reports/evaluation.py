@@ -59,15 +59,15 @@ class Evaluation:
 def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
     """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows."""
     run = read_run(directory, requirements)
-    sampling = read_sampling_design(run.configuration)
+    sampling = read_sampling_design(run.definition)
     study = table(run.record.get("study"))
     if study:
         return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(study, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     joint = read_joint_evidence(evidence)
     evidence = replace(evidence, notes=joint.notes)
-    columns = read_columns(str(run.configuration.get("scenario") or ""))
-    # columns that are computed from the truth, and columns that the configuration of a case determines
+    columns = read_columns(str(run.definition.get("scenario") or ""))
+    # columns that are computed from the truth, and columns that the definition of a case determines
     from_truth, configured = ({}, ()) if columns is None else (columns.from_truth, columns.configured)
     design = sampling.with_open_end if evidence.is_confirmation else sampling
     earlier = [joint.earlier_evidence(requirement) for requirement in run.requirements]

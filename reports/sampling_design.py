@@ -32,7 +32,7 @@ class TerrainSupply:
     in_turn: bool = False
 
     def advice(self, min_terrains: int, probability: float, confidence: float) -> str:
-        """Explain that the campaign needs at least `min_terrains` terrains, not more cases; state the settings."""
+        """Explain that the campaign needs at least `min_terrains` terrains, not more cases; state the options."""
         requirement = f"{format_fraction(probability)} at {format_fraction(confidence)} confidence"
         supply_text = f"{count(self.terrains, 'terrain')} ({self.key} = {self.terrains})"
         shortage = f"The campaign has only {supply_text}."
@@ -42,14 +42,14 @@ class TerrainSupply:
             )
         # "location" or "world": table of the parameters `bank` and `terrain`
         table_name = self.key.removeprefix('dispersions."').partition(".")[0]
-        settings = f"--set {table_name}.bank={min_terrains}"
+        options = f"--set {table_name}.bank={min_terrains}"
         if not self.in_turn or not self.key.endswith(".bank"):
             dispersion = f'{{distribution="in-turn",low=0,high={min_terrains - 1}}}'
-            settings += f" --set 'dispersions.\"{table_name}.terrain\"={dispersion}'"
+            options += f" --set 'dispersions.\"{table_name}.terrain\"={dispersion}'"
         return (
             f"To show a success rate of {requirement}, the cases must include at least {min_terrains:,} different "
             f"terrains. {shortage} Run the campaign again with {min_terrains:,} cases, each on a terrain of its own: "
-            f"{settings} -n {min_terrains}."
+            f"{options} -n {min_terrains}."
         )
 
 
@@ -125,27 +125,27 @@ class SamplingDesign:
 INDEPENDENT = SamplingDesign()
 
 
-def read_sampling_design(configuration: Mapping[str, Any]) -> SamplingDesign:
-    """Read the sampling design from the configuration of a campaign; invalid values are treated as missing."""
-    design = table(configuration.get("design"))
-    dispersions = table(configuration.get("dispersions"))
+def read_sampling_design(definition: Mapping[str, Any]) -> SamplingDesign:
+    """Read the sampling design from the definition of a campaign; invalid values are treated as missing."""
+    design = table(definition.get("design"))
+    dispersions = table(definition.get("dispersions"))
     grids = tuple(str(path) for path, value in dispersions.items() if table(value).get("distribution") == "grid")
-    limit = configuration.get("max_cases")
+    limit = definition.get("max_cases")
     max_cases = limit if isinstance(limit, int) and not isinstance(limit, bool) and limit > 0 else None
-    first_look = configuration.get("cases") if configuration.get("appended") else None
+    first_look = definition.get("cases") if definition.get("appended") else None
     return SamplingDesign(
         str(design.get("kind") or RANDOM),
         grids,
         design.get("nominal") is True,
         max_cases,
         first_look if isinstance(first_look, int) else None,
-        read_terrain_supply(configuration),
+        read_terrain_supply(definition),
     )
 
 
-def read_terrain_supply(configuration: Mapping[str, Any]) -> TerrainSupply | None:
-    """Read the number of available terrains from a configuration; None if unknown."""
-    parameters, dispersions = table(configuration.get("parameters")), table(configuration.get("dispersions"))
+def read_terrain_supply(definition: Mapping[str, Any]) -> TerrainSupply | None:
+    """Read the number of available terrains from a definition; None if unknown."""
+    parameters, dispersions = table(definition.get("parameters")), table(definition.get("dispersions"))
     for name in ("location", "world"):
         bank = table(parameters.get(name)).get("bank")
         if not isinstance(bank, int):

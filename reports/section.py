@@ -53,7 +53,7 @@ _STYLE: Any = mpl.rc_params_from_file(_STYLE_FILE, use_default_template=False)
 
 
 def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a drawing function to use the page's style instead of the user's matplotlib settings."""
+    """Decorate a drawing function to use the page's style instead of the user's matplotlib style."""
 
     @functools.wraps(draw)
     def apply_style(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -64,9 +64,9 @@ def in_page_style(draw: Callable[P, R]) -> Callable[P, R]:
 
 
 @contextmanager
-def _page_style(**settings: str) -> Iterator[None]:
+def _page_style(**changes: str) -> Iterator[None]:
     """Apply the page's style in a context; ignore warnings about characters that are missing from the font."""
-    with mpl.style.context(["default", _STYLE, settings]), warnings.catch_warnings():
+    with mpl.style.context(["default", _STYLE, changes]), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 

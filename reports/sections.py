@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from pydantic import BaseModel
 
 from marsyard.algorithms.faults import Fault
-from marsyard.campaigns.definition.configuration import description_at
+from marsyard.campaigns.definition.campaign_file import description_at
 from marsyard.reports import figures
 from marsyard.reports.presentation import presentations, system_presentation
 from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
@@ -231,7 +231,7 @@ def list_provenance(run: StoredRun) -> list[tuple[str, str]]:
         *algorithms,
         ("State", run.recorded("state")),
         ("Root seed", run.recorded("seed")),
-        ("Sampling", read_sampling_design(run.configuration).text),
+        ("Sampling", read_sampling_design(run.definition).text),
         ("Cases requested", run.recorded("cases")),
         ("Cases stored", len(run.all_cases)),
         ("Started", run.recorded("started_utc")),
@@ -273,7 +273,7 @@ def rerun_commands(run: StoredRun) -> list[str]:
                 words += [option, str(run.recorded(key))]
         return [shlex.join(words)]
     folder, words = hide_folders(run.command[0]), list(run.command[1])
-    stored_blocks = run.configuration.get("appended")
+    stored_blocks = run.definition.get("appended")
     # a sequential campaign appends blocks of cases without a command
     block_sizes = [] if run.recorded("max_cases") or not isinstance(stored_blocks, list | tuple) else stored_blocks
     target = f"runs/{run.name}-again"

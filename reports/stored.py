@@ -55,9 +55,9 @@ class StoredRun:
         return len(self.all_cases) > len(self.frame)
 
     @property
-    def configuration(self) -> Mapping[str, Any]:
-        """The configuration with which the campaign was run."""
-        return table(self.record.get("configuration"))
+    def definition(self) -> Mapping[str, Any]:
+        """The definition with which the campaign was run."""
+        return table(self.record.get("definition"))
 
     @property
     def name(self) -> str:
@@ -95,13 +95,13 @@ class StoredRun:
         return str(stored_command.get("folder") or ""), tuple(str(word) for word in words)
 
     def recorded(self, key: str) -> Any:
-        """Return the value of a key in the record or in its configuration; None if missing."""
+        """Return the value of a key in the record or in its definition; None if missing."""
         value = self.record.get(key)
-        return value if value is not None else self.configuration.get(key)
+        return value if value is not None else self.definition.get(key)
 
     def parameter(self, *path: str) -> Any:
         """Return a parameter of the campaign's file; None if missing."""
-        value: Any = self.configuration.get("parameters")
+        value: Any = self.definition.get("parameters")
         for name in path:
             value = table(value).get(name)
         return value
@@ -131,9 +131,9 @@ def read_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None =
         record = dict(table(json.loads((directory / RECORD_FILE).read_text(encoding="utf-8"))))
     except (OSError, ValueError):
         record = {}
-    configuration = table(record.get("configuration"))
-    record["configuration"] = configuration
-    record["requirements"] = configuration.get("requirements", record.get("requirements"))
+    definition = table(record.get("definition"))
+    record["definition"] = definition
+    record["requirements"] = definition.get("requirements", record.get("requirements"))
     if requirements is not None:
         record["requirements"] = list(requirements)
     with report_damage(path, StoreError, "cannot be read"):
@@ -183,18 +183,18 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
 
 
 def _read_requirements(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the requirements of a record or of its configuration; empty if they are invalid."""
+    """Return the requirements of a record or of its definition; empty if they are invalid."""
     stored = record.get("requirements")
-    stored = table(record.get("configuration")).get("requirements") if stored is None else stored
+    stored = table(record.get("definition")).get("requirements") if stored is None else stored
     return [item for item in stored if isinstance(item, Mapping)] if isinstance(stored, list | tuple) else []
 
 
 def _is_condition(record: Mapping[str, Any], name: str) -> bool:
-    configuration = table(record.get("configuration"))
-    paths = table(record.get("dispersions") or configuration.get("dispersions"))
+    definition = table(record.get("definition"))
+    paths = table(record.get("dispersions") or definition.get("dispersions"))
     if any(name == path or name.startswith(f"{path}.") for path in paths):
         return True
-    columns = read_columns(str(record.get("scenario") or configuration.get("scenario") or ""))
+    columns = read_columns(str(record.get("scenario") or definition.get("scenario") or ""))
     return looks_like_condition(name) if columns is None else columns.is_condition(name)
 
 
@@ -214,7 +214,7 @@ def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def read_study(record: Mapping[str, Any], kind: str) -> Mapping[str, Any]:
-    """Return the settings of a study of a kind with its `result`; empty for another run, or without a result."""
+    """Return the parameters of a study of a kind with its `result`; empty for another run, or without a result."""
     study = table(record.get("study"))
     return study if study.get("kind") == kind and table(study.get("result")) else {}
 

@@ -51,7 +51,7 @@ class AllCases:
     """Result of a requirement on all cases instead of its population; the numbers are defined as in `Verdict`.
 
     Cases without a value of the metric are failures. `configured` are the conditions that remain, because the
-    configuration of a case determines them; empty for all cases of the campaign.
+    definition of a case determines them; empty for all cases of the campaign.
     """
 
     status: Status

@@ -38,10 +38,10 @@ Algorithm = TypeVar("Algorithm")
 Options = TypeVar("Options")
 
 
-def configurations(
+def definitions(
     name: str, create: Callable[[Any], Any], improvements: Mapping[str, Any]
 ) -> dict[str, Callable[[Any], Any]]:
-    """Return the configurations of an algorithm of a paper, by name.
+    """Return the variants of an algorithm of a paper, by name.
 
     - `name`: the published algorithm; ValueError if one of its improvements is selected
     - `name`-plus: with all improvements; ValueError if one of them is set explicitly

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from marsyard.sim.parameters import Parameters, bounded_field, merge_settings
+from marsyard.sim.parameters import Parameters, bounded_field, merge_parameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.terrain import MAX_TERRAINS, TerrainParameters, site, sites
 
@@ -26,7 +26,7 @@ def complete_terrain(
     terrain = find(name, parameters) if isinstance(name, str) else None
     if terrain is None:
         return parameters
-    return {"terrain_site": name, **parameters, "terrain": merge_settings(terrain.model_dump(), changes)}
+    return {"terrain_site": name, **parameters, "terrain": merge_parameters(terrain.model_dump(), changes)}
 
 
 def preset_terrain(name: str, scale: str) -> TerrainParameters | None:

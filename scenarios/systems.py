@@ -54,7 +54,7 @@ class System:
       `requirements.toml` (docs/reports.md)
     - columns: columns of the rows, each a `marsyard.scenarios.columns.Columns`, by scenario. Without them, requirements
       are checked against the first finished case.
-    - compilation_campaigns: campaigns of the catalogue, each with settings (``KEY=VALUE``) that make it small. One case
+    - compilation_campaigns: campaigns of the catalogue, each with overrides (``KEY=VALUE``) for a small one. One case
       of each calls, and so compiles, all numeric kernels of its scenario (`marsyard compile`).
     - templates: of campaign files, by the values of ``marsyard new --system``
     - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder

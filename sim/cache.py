@@ -52,15 +52,15 @@ def limit_bytes(folder: Path, stored_bytes: int) -> int:
     ``MARSYARD_CACHE_GB`` if it is set; otherwise 40 % of the space that is free without the cached files, at most
     10 GB. Raises ValueError if the variable is not a positive number.
     """
-    setting = os.environ.get("MARSYARD_CACHE_GB")
-    if not setting:
+    text = os.environ.get("MARSYARD_CACHE_GB")
+    if not text:
         return int(min(FREE_FRACTION * (shutil.disk_usage(folder).free + stored_bytes), LIMIT_GB * GIGA))
     try:
-        gigabytes = float(setting)
+        gigabytes = float(text)
     except ValueError:
         gigabytes = 0.0
     if not 0.0 < gigabytes < float("inf"):
-        raise ValueError(f"MARSYARD_CACHE_GB is '{setting}'; a number of gigabytes above 0 is needed")
+        raise ValueError(f"MARSYARD_CACHE_GB is '{text}'; a number of gigabytes above 0 is needed")
     return int(gigabytes * GIGA)
 
 

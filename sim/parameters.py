@@ -73,15 +73,15 @@ def _complete_table(preset: BaseModel, table: Mapping[Any, Any]) -> Mapping[Any,
     return values
 
 
-def merge_settings(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge changes into nested settings: tables are merged, other values replaced."""
-    settings = dict(base)
+def merge_parameters(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge changes into nested parameters: tables are merged, other values replaced."""
+    merged = dict(base)
     for key, value in changes.items():
-        current = settings.get(key)
+        current = merged.get(key)
         if isinstance(current, Mapping) and isinstance(value, Mapping):
-            value = merge_settings(current, value)
-        settings[key] = value
-    return settings
+            value = merge_parameters(current, value)
+        merged[key] = value
+    return merged
 
 
 def list_models(annotation: Any) -> list[type[BaseModel]]:

@@ -1,4 +1,4 @@
-"""Settings and fixtures of all tests. The statements at module level run before any import of Marsyard's packages."""
+"""Options and fixtures of all tests. The statements at module level run before any import of Marsyard's packages."""
 
 from __future__ import annotations
 

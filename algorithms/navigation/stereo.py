@@ -153,11 +153,11 @@ def track_features(
     """
     if len(pixels) == 0:
         return np.empty((0, 2)), np.zeros(0, dtype=np.bool_)
-    settings: dict[str, Any] = {"winSize": (_FEATURE_PX, _FEATURE_PX), "maxLevel": _LEVELS}
-    settings["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
+    options: dict[str, Any] = {"winSize": (_FEATURE_PX, _FEATURE_PX), "maxLevel": _LEVELS}
+    options["flags"] = cv2.OPTFLOW_USE_INITIAL_FLOW
     start, initial = pixels.astype(np.float32), predicted_pixels.astype(np.float32)
-    end, status, _ = cv2.calcOpticalFlowPyrLK(first, second, start, initial.copy(), **settings)
-    reverse_end, reverse_status, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **settings)
+    end, status, _ = cv2.calcOpticalFlowPyrLK(first, second, start, initial.copy(), **options)
+    reverse_end, reverse_status, _ = cv2.calcOpticalFlowPyrLK(second, first, end, start.copy(), **options)
     valid = (status.ravel() == 1) & (reverse_status.ravel() == 1)
     valid &= np.hypot(*(reverse_end - start).T) <= _FORWARD_BACKWARD_PX
     return end.astype(np.float64), np.asarray(valid)

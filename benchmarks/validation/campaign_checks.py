@@ -55,29 +55,29 @@ def check_rows(quick: bool) -> Iterator[Measure]:
     faulty_fraction, cases, kills = (0.03, 60, 3) if quick else (0.03, 400, 10)
     with TemporaryDirectory() as directory:
         folder = Path(directory)
-        settings = [f"faulty_fraction={faulty_fraction}", f"cases={cases}"]
+        overrides = [f"faulty_fraction={faulty_fraction}", f"cases={cases}"]
         population = f"cases, {100 * faulty_fraction:g} % of which misbehave"
-        yield from _compare_executors(str(_write_campaign(folder)), folder / "chaos", settings, kills, population)
-        settings = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
-        yield from _compare_executors("dimes-smoke", folder / "rendered", settings, kills, "rendered descents")
+        yield from _compare_executors(str(_write_campaign(folder)), folder / "chaos", overrides, kills, population)
+        overrides = ["cases=8" if quick else "cases=40", "retain.showcase=none"]
+        yield from _compare_executors("dimes-smoke", folder / "rendered", overrides, kills, "rendered descents")
 
 
 def _compare_executors(
-    campaign: str, folder: Path, settings: Sequence[str], kills: int, population: str
+    campaign: str, folder: Path, overrides: Sequence[str], kills: int, population: str
 ) -> Iterator[Measure]:
     """Compare the rows of each executor, of interrupted runs and of replays with those of one worker.
 
-    `settings` change the campaign file; `population` describes the cases in the table of results.
+    `overrides` change the campaign file; `population` describes the cases in the table of results.
     """
     folder.mkdir()
-    expected_rows = _run_campaign(campaign, folder / "one", ExecutorConfig(1), settings)
+    expected_rows = _run_campaign(campaign, folder / "one", ExecutorConfig(1), overrides)
     cases = len(expected_rows)
     replay_cases = range(0, cases, max(cases // 8, 1))
     cluster = ExecutorConfig(cluster="local:2")
     runs: dict[str, Callable[[], list[dict[str, Any]]]] = {
-        "two workers": lambda: _run_campaign(campaign, folder / "two", ExecutorConfig(2), settings),
-        "a Dask cluster of two": lambda: _run_campaign(campaign, folder / "cluster", cluster, settings),
-        f"a runner killed {kills} times": lambda: _run_with_kills(campaign, folder / "killed", settings, kills),
+        "two workers": lambda: _run_campaign(campaign, folder / "two", ExecutorConfig(2), overrides),
+        "a Dask cluster of two": lambda: _run_campaign(campaign, folder / "cluster", cluster, overrides),
+        f"a runner killed {kills} times": lambda: _run_with_kills(campaign, folder / "killed", overrides, kills),
         "single replays": lambda: [dict(replay(folder / "one", case).row) for case in replay_cases],
     }
     for name, run in runs.items():
@@ -118,7 +118,7 @@ def check_survival(quick: bool) -> Iterator[Measure]:
         yield Measure("outcomes that do not match the fault of the case", wrong_count, "", 0, how)
         healthy_how = f"{how}; {len(healthy_cases)} without fault"
         yield Measure("cases without fault whose rows changed", changed_count, "", 0, healthy_how)
-        limits_s = faults.count("loop") * campaign.configuration.limits.case_time_s
+        limits_s = faults.count("loop") * campaign.definition.limits.case_time_s
         ratio = (elapsed_s[faulty_fraction] - limits_s) / elapsed_s[0.0]
         yield Measure(
             "time minus time limits, divided by the time without faults",
@@ -144,19 +144,19 @@ def _write_campaign(folder: Path) -> Path:
 
 
 def _run_campaign(
-    campaign: str | Path, directory: Path, executor: ExecutorConfig, settings: Sequence[str]
+    campaign: str | Path, directory: Path, executor: ExecutorConfig, overrides: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Run a campaign with changed settings; return its rows."""
-    run_campaign(load_campaign(str(campaign), settings), directory, executor, SilentProgress())
+    """Run a campaign with changed overrides; return its rows."""
+    run_campaign(load_campaign(str(campaign), overrides), directory, executor, SilentProgress())
     return read_rows(directory / "cases.parquet")
 
 
-def _run_with_kills(campaign: str, directory: Path, settings: Sequence[str], kills: int) -> list[dict[str, Any]]:
+def _run_with_kills(campaign: str, directory: Path, overrides: Sequence[str], kills: int) -> list[dict[str, Any]]:
     """Run a campaign that is killed at random times and resumed each time; return its rows."""
     rng = np.random.default_rng(7)
     program = [sys.executable, "-m", "marsyard"]
     command = [*program, "run", campaign, "--out", str(directory), "--jobs", "2"]
-    command += [argument for setting in settings for argument in ("--set", setting)]
+    command += [argument for override in overrides for argument in ("--set", override)]
     for _ in range(kills):
         runner = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while not (directory / "campaign.json").exists() and runner.poll() is None:

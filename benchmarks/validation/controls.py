@@ -37,7 +37,7 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Settings:
+class ControlRun:
     """Cases of a campaign on which the controls run, and changes of its file (``KEY=VALUE``)."""
 
     cases: Sequence[int] = (0, 1, 2, 3)
@@ -46,43 +46,43 @@ class Settings:
 
 #: Campaigns whose first four cases are expensive or do not contain the populations of their requirements. Fault
 #: campaigns run without a fault, because a refusal is right with one.
-SETTINGS: Mapping[str, Settings] = {
+RUNS: Mapping[str, ControlRun] = {
     # two runs of the helicopter; two noisy runs and the run with an intact cable
-    "dimes-fieldtest": Settings((12, 36, 42, 5, 13, 20)),
-    "dimes-fieldtest-noise": Settings((0, 5, 1, 7, 4, 13)),
-    "dimes-offnominal": Settings(overrides=("faults={}",)),
-    "hda-faults": Settings(tuple(range(12)), ("faults={}",)),
-    "hda-mars": Settings(tuple(range(12))),
-    "hda-threshold": Settings((0, 1, 2, 3, 22)),
+    "dimes-fieldtest": ControlRun((12, 36, 42, 5, 13, 20)),
+    "dimes-fieldtest-noise": ControlRun((0, 5, 1, 7, 4, 13)),
+    "dimes-offnominal": ControlRun(overrides=("faults={}",)),
+    "hda-faults": ControlRun(tuple(range(12)), ("faults={}",)),
+    "hda-mars": ControlRun(tuple(range(12))),
+    "hda-threshold": ControlRun((0, 1, 2, 3, 22)),
     # each descent has a terrain of 178 MB
-    "loc-faults": Settings((0, 1), ("faults={}",)),
-    **dict.fromkeys(("loc-coarse", "loc-jezero", "loc-light", "loc-map-error", "loc-sensitivity"), Settings((0, 1))),
+    "loc-faults": ControlRun((0, 1), ("faults={}",)),
+    **dict.fromkeys(("loc-coarse", "loc-jezero", "loc-light", "loc-map-error", "loc-sensitivity"), ControlRun((0, 1))),
     # drives of many updates, of which one that fails is sufficient
-    "vtt-checkout-1": Settings((0, 1)),
-    "vtt-checkout-2": Settings((0, 1)),
-    "vtt-checkout-3": Settings((0,)),
-    "vtt-regression": Settings((0, 1)),
-    "vtt-terrains": Settings((0, 1, 2)),
+    "vtt-checkout-1": ControlRun((0, 1)),
+    "vtt-checkout-2": ControlRun((0, 1)),
+    "vtt-checkout-3": ControlRun((0,)),
+    "vtt-regression": ControlRun((0, 1)),
+    "vtt-terrains": ControlRun((0, 1, 2)),
     # targets of one drive that stay in view
-    "vtt-sideways": Settings((70, 71, 72)),
-    "vtt-straight": Settings((0, 2, 8)),
-    "vtt-turn": Settings((45, 46, 54, 55)),
+    "vtt-sideways": ControlRun((70, 71, 72)),
+    "vtt-straight": ControlRun((0, 2, 8)),
+    "vtt-turn": ControlRun((45, 46, 54, 55)),
 }
 
 
-def run_controls(campaign_name: str, settings: Settings) -> tuple[Campaign, dict[str, pd.DataFrame]]:
+def run_controls(campaign_name: str, run: ControlRun) -> tuple[Campaign, dict[str, pd.DataFrame]]:
     """Run all controls on cases of a campaign; return the campaign and the rows of each control, by its class.
 
     A hanging algorithm has the rows of one that crashes, with the outcome TIMED_OUT.
     """
     rows: dict[str, list[Row]] = {name: [] for name in TITLES}
     groups: list[tuple[str, ...]] = [tuple(ANSWERING), tuple(FAILING)]
-    if load_campaign(campaign_name, settings.overrides).configuration.scenario in CLOSED_LOOP:
+    if load_campaign(campaign_name, run.overrides).definition.scenario in CLOSED_LOOP:
         groups = [(name,) for names in groups for name in names]
     for names in groups:
         specs = [f"{MODULE}:{name}" for name in names]
-        campaign = load_campaign(campaign_name, settings.overrides, algorithms=specs)
-        for case in settings.cases:
+        campaign = load_campaign(campaign_name, run.overrides, algorithms=specs)
+        for case in run.cases:
             rows_by_name = _run_case(campaign, names, case)
             for name, row in rows_by_name.items():
                 rows[name].append(row)
@@ -106,21 +106,21 @@ def _run_case(campaign: Campaign, names: Sequence[str], case: int) -> dict[str, 
 
 def find_failed_requirements(campaign: Campaign, frame: pd.DataFrame) -> list[str]:
     """Evaluate a campaign's requirements on rows; return the ids of those that fail."""
-    requirements = [item.model_dump() for item in campaign.configuration.requirements]
-    sampling = read_sampling_design(campaign.configuration.model_dump(mode="json"))
+    requirements = [item.model_dump() for item in campaign.definition.requirements]
+    sampling = read_sampling_design(campaign.definition.model_dump(mode="json"))
     verdicts = evaluate_requirements(frame, requirements, sampling)
     return [verdict.requirement_id for verdict in verdicts if verdict.status is Status.FAIL]
 
 
-def measure_campaign(campaign_name: str, settings: Settings) -> Measure:
+def measure_campaign(campaign_name: str, run: ControlRun) -> Measure:
     """Count the controls that fail no requirement of a campaign."""
-    return create_measure(*run_controls(campaign_name, settings))
+    return create_measure(*run_controls(campaign_name, run))
 
 
 def create_measure(campaign: Campaign, frames: Mapping[str, pd.DataFrame]) -> Measure:
     """Create the row of a campaign from the rows of each control."""
     failed = [find_failed_requirements(campaign, frame) for frame in frames.values()]
-    claim = f"`{campaign.configuration.name}`, cases: {len(frames['Crash'])}"
+    claim = f"`{campaign.definition.name}`, cases: {len(frames['Crash'])}"
     cells = " | ".join(", ".join(names) or "**none**" for names in failed)
     return Measure(claim, float(failed.count([])), "1", 0.0, cells)
 
@@ -130,10 +130,10 @@ def _check_controls(quick: bool) -> Iterator[Measure]:
     if quick:
         for system in systems():
             for name, overrides in system.compilation_campaigns.items():
-                yield measure_campaign(name, Settings((0, 1), overrides))
+                yield measure_campaign(name, ControlRun((0, 1), overrides))
         return
     for name in catalogue():
-        yield measure_campaign(name, SETTINGS.get(name, Settings()))
+        yield measure_campaign(name, RUNS.get(name, ControlRun()))
 
 
 CHECKS = (Check("controls", "Negative controls", _check_controls, tuple(TITLES.values())),)

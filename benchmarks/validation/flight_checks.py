@@ -23,9 +23,9 @@ ALTITUDES_M = (1433.0, 1983.0)
 AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
 
 
-def _render_statistics(site: str, camera: str, **settings: float | int) -> ImageStatistics:
-    """Compute the statistics of one rendered image; `settings` are those of `ImageRequest`."""
-    image = render_images(ImageRequest.from_defaults(site, camera, **settings), both=False)[0]
+def _render_statistics(site: str, camera: str, **values: float | int) -> ImageStatistics:
+    """Compute the statistics of one rendered image; `values` are those of `ImageRequest`."""
+    image = render_images(ImageRequest.from_defaults(site, camera, **values), both=False)[0]
     return compute_image_statistics(image.to_uint16().astype(np.float64))
 
 

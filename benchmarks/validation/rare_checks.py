@@ -21,7 +21,7 @@ from marsyard.campaigns.studies.interval import (
     replicate_interval,
     weighted_interval,
 )
-from marsyard.campaigns.studies.rare import RareSettings
+from marsyard.campaigns.studies.rare import RareParameters
 from marsyard.campaigns.studies.rare_decision import MIN_EFFECTIVE_VIOLATIONS
 from marsyard.campaigns.studies.subset import SubsetResult
 from marsyard.sim.streams import Blend
@@ -44,7 +44,7 @@ def run_importance(
     density = fit_density(np.concatenate([result.violations for result in results]))
     if density is None:
         return None
-    count = RareSettings.importance_cases
+    count = RareParameters.importance_cases
     coordinates, weights = density.draw(count, np.random.default_rng((seed, dimension)))
     # streams that no subset simulation uses
     blends: list[Blend] = [((10**12 + seed * count + number, 1.0),) for number in range(count)]
@@ -98,7 +98,7 @@ def run_rare(quick: bool) -> Iterator[Measure]:
         )
         n_importance = len(importance_intervals)
         claim = f"rare violations, studies with an interval of importance sampling: {name}"
-        how = f"at least {MIN_EFFECTIVE_VIOLATIONS:.0f} effective violations of {RareSettings.importance_cases} cases"
+        how = f"at least {MIN_EFFECTIVE_VIOLATIONS:.0f} effective violations of {RareParameters.importance_cases} cases"
         yield Measure(claim, n_importance / trials, "", None, how)
         if n_importance >= min(MIN_STUDIES, trials):
             for which, limit, intervals in (

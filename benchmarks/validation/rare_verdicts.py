@@ -16,12 +16,12 @@ from benchmarks.validation.limit_states import KnownState, discontinuous_states,
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.counting import find_units_needed
 from marsyard.campaigns.studies.interval import replicate_interval
-from marsyard.campaigns.studies.rare import MIN_PROBABILITY_FRACTION, RareSettings
+from marsyard.campaigns.studies.rare import MIN_PROBABILITY_FRACTION, RareParameters
 from marsyard.campaigns.studies.rare_decision import Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.subset import SubsetResult
 
-#: Settings of `marsyard rare` without options, and its one-sided risk of a wrong verdict.
-DEFAULTS = RareSettings("", 1e-4)
+#: Parameters of `marsyard rare` without options, and its one-sided risk of a wrong verdict.
+DEFAULTS = RareParameters("", 1e-4)
 NOMINAL_RISK = 0.5 * (1.0 - DEFAULTS.confidence)
 #: Limits of the probability, divided by the true one: PASS is wrong at the first one, FAIL at the last ones.
 FALSE_PASS_RATIO, FALSE_FAIL_RATIO = 0.5, 2.0

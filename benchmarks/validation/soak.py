@@ -142,8 +142,8 @@ def _build_command(folder: Path, name: str, fault_fraction: float | None) -> lis
     program = [sys.executable, "-m", "marsyard"]
     if fault_fraction is None:
         return [*program, "resume", str(folder / name), "--jobs", "2"]
-    settings = ["--set", f"misbehaving={fault_fraction}", "--jobs", "2", "--out", str(folder / name)]
-    return [*program, "run", str(folder / "soak.toml"), *settings]
+    options = ["--set", f"misbehaving={fault_fraction}", "--jobs", "2", "--out", str(folder / name)]
+    return [*program, "run", str(folder / "soak.toml"), *options]
 
 
 def _run(folder: Path, name: str, fault_fraction: float | None, environment: Mapping[str, str], cases: int) -> int:

@@ -46,15 +46,15 @@ def draw_exact_parameters(number: int, camera: str) -> RoverScenarioParameters:
     case_parameters = campaign.with_values(
         {**campaign.draws(number), "camera.preset": camera, "world.terrain": number % 8}
     )
-    settings = case_parameters.model_dump()
-    (leg,) = settings["legs"]
+    values = case_parameters.model_dump()
+    (leg,) = values["legs"]
     return RoverScenarioParameters.model_validate(
-        settings
+        values
         | NO_ERRORS
         # error-free visual odometry measures the slip; it takes no time, so that the sun moves as in the campaign
-        | {"navigation": settings["navigation"] | {"odometry": "oracle-motion"}}
-        | {"legs": [leg | {"visual_odometry": True}], "timing": settings["timing"] | {"visual_odometry_s": 0.0}}
-        | {"camera": settings["camera"] | {"detector_noise": False}}
+        | {"navigation": values["navigation"] | {"odometry": "oracle-motion"}}
+        | {"legs": [leg | {"visual_odometry": True}], "timing": values["timing"] | {"visual_odometry_s": 0.0}}
+        | {"camera": values["camera"] | {"detector_noise": False}}
     )
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.sampling.design import (
     MIN_DRAW,
     build_stratified_design,
@@ -41,7 +41,7 @@ CONFIRMATIONS_FILE = "confirmations.jsonl"
 class Campaign:
     """A campaign ready to run.
 
-    - configuration: contents of the campaign file, changed by command-line options, with complete parameters
+    - definition: contents of the campaign file, changed by command-line options, with complete parameters
     - scenario: scenario of the campaign's cases
     - command: words of the command that repeats the campaign; empty if no command started it
     - confirms: whether the run is a confirmation (`marsyard.campaigns.definition.evidence`)
@@ -49,7 +49,7 @@ class Campaign:
     - calibration_overlap: fraction of the cases of a confirmation on terrains of calibration runs; None if unknown
     """
 
-    configuration: CampaignConfiguration
+    definition: CampaignDefinition
     scenario: Scenario
     command: tuple[str, ...] = ()
     confirms: bool = False
@@ -57,21 +57,21 @@ class Campaign:
     calibration_overlap: float | None = None
 
     def _repr_html_(self) -> str:
-        """Table of the campaign's settings for notebooks."""
-        configuration = self.configuration
+        """Table of the campaign's definition for notebooks."""
+        definition = self.definition
         rows = {
-            "scenario": configuration.scenario,
-            "cases": configuration.total_cases,
-            "seed": configuration.seed,
-            "dispersions": ", ".join(configuration.dispersions),
-            "requirements": ", ".join(item.id for item in configuration.requirements),
+            "scenario": definition.scenario,
+            "cases": definition.total_cases,
+            "seed": definition.seed,
+            "dispersions": ", ".join(definition.dispersions),
+            "requirements": ", ".join(item.id for item in definition.requirements),
         }
         cells = (f"<tr><th>{name}</th><td>{html.escape(str(value))}</td></tr>" for name, value in rows.items())
-        return f"<div><h4>{html.escape(configuration.name)}</h4><table>{''.join(cells)}</table></div>"
+        return f"<div><h4>{html.escape(definition.name)}</h4><table>{''.join(cells)}</table></div>"
 
     def streams(self, case: int) -> Streams:
         """Create the random streams of a case."""
-        return Streams(seed=self.configuration.seed, campaign=self.configuration.name, case=case)
+        return Streams(seed=self.definition.seed, campaign=self.definition.name, case=case)
 
     def streams_at(self, point: StudyPoint) -> Streams:
         """Create the random streams of a case at a point of a study."""
@@ -87,7 +87,7 @@ class Campaign:
 
     def draws_at(self, point: StudyPoint) -> dict[str, Any]:
         """Compute the values of the dispersions at a point of a study. Raises ValueError like `draws`."""
-        uniform = transform_to_uniform(point.coordinates, self.drawn_paths, self.configuration.correlations)
+        uniform = transform_to_uniform(point.coordinates, self.drawn_paths, self.definition.correlations)
         return self._evaluate(uniform, point.stream, point.nominal)
 
     def _evaluate(
@@ -98,7 +98,7 @@ class Campaign:
         Dispersions in `nominal` have the value of the campaign's parameter; all of them if `probabilities` is None.
         Dispersions without a random number are evaluated at the probability 0.5, which does not affect their values.
         """
-        parameters = self.configuration.parameters
+        parameters = self.definition.parameters
         values: dict[str, Any] = {}
         for path in self.order:
             dispersion = self.marginals[path]
@@ -116,41 +116,41 @@ class Campaign:
 
     def probabilities(self, case: int) -> dict[str, float] | None:
         """Compute the cumulative probability of each random or grid dispersion of a case; None for the nominal case."""
-        configuration, paths = self.configuration, self.drawn_paths
-        position = locate_case(configuration.design, configuration.blocks, configuration.grid_size, case)
+        definition, paths = self.definition, self.drawn_paths
+        position = locate_case(definition.design, definition.blocks, definition.grid_size, case)
         if position is None:
             return None
         grid_point, first_case, case_count, index = position
-        if configuration.design.kind == "random":
+        if definition.design.kind == "random":
             streams = self.streams(case)
             uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
             numbers = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
-            for group in configuration.correlations:
+            for group in definition.correlations:
                 correlated = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
                 numbers.update(zip(group.parameters, correlated.tolist(), strict=True))
         else:
             groups = tuple(
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
-                for group in configuration.correlations
+                for group in definition.correlations
             )
             design = build_stratified_design(
-                configuration.design.kind,
-                configuration.seed,
-                configuration.name,
+                definition.design.kind,
+                definition.seed,
+                definition.name,
                 first_case,
                 case_count,
                 tuple(map(stream_name, paths)),
                 groups,
             )
             numbers = dict(zip(paths, design[index].tolist(), strict=True))
-        grids = {path: len(grid.points) for path, grid in configuration.grids.items()}
+        grids = {path: len(grid.points) for path, grid in definition.grids.items()}
         return {**numbers, **compute_grid_quantiles(grids, grid_point)}
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:
         """Dispersions by path; dispersions in a covariance matrix have the standard deviations of the matrix."""
-        marginals: dict[str, Dispersion] = dict(self.configuration.dispersions)
-        for group in self.configuration.correlations:
+        marginals: dict[str, Dispersion] = dict(self.definition.dispersions)
+        for group in self.definition.correlations:
             for index, row in enumerate(group.covariance or ()):
                 path, standard_deviation = group.parameters[index], math.sqrt(row[index])
                 marginals[path] = Normal.model_validate({**marginals[path].model_dump(), "sd": standard_deviation})
@@ -159,7 +159,7 @@ class Campaign:
     @cached_property
     def drawn_paths(self) -> tuple[str, ...]:
         """Paths of the dispersions that use a random number, in the order of the file."""
-        dispersions = self.configuration.dispersions.items()
+        dispersions = self.definition.dispersions.items()
         return tuple(
             path for path, item in dispersions if not isinstance(item, GridDispersion | Fixed | Derived | CyclicInteger)
         )
@@ -167,13 +167,13 @@ class Campaign:
     @cached_property
     def cyclic_paths(self) -> tuple[str, ...]:
         """Paths of the dispersions whose number follows the number of the case or, in a study, of its streams."""
-        dispersions = self.configuration.dispersions.items()
+        dispersions = self.definition.dispersions.items()
         return tuple(path for path, item in dispersions if isinstance(item, CyclicInteger))
 
     @cached_property
     def order(self) -> tuple[str, ...]:
         """Paths in the order of evaluation: a path follows those in its formulas. Raises ValueError for a cycle."""
-        inputs = {path: dispersion.names for path, dispersion in self.configuration.dispersions.items()}
+        inputs = {path: dispersion.names for path, dispersion in self.definition.dispersions.items()}
         sequence: dict[str, None] = {}
         while len(sequence) < len(inputs):
             remaining = [path for path in inputs if path not in sequence]
@@ -185,7 +185,7 @@ class Campaign:
 
     def base_parameters(self) -> BaseModel:
         """Create the parameters of the campaign without sampled values."""
-        return self.scenario.parameters_type.model_validate(self.configuration.parameters)
+        return self.scenario.parameters_type.model_validate(self.definition.parameters)
 
     def parameters(self, case: int) -> BaseModel:
         """Create the parameters of a case. Raises ValueError if sampling fails or the scenario rejects the values."""
@@ -193,8 +193,8 @@ class Campaign:
 
     def with_values(self, values: Mapping[str, Any], removed: Sequence[str] = ()) -> BaseModel:
         """Create the campaign's parameters with other values at some paths, and without the `removed` error sources."""
-        tree = replace_values(self.configuration.parameters, values)
-        for source in error_sources(self.configuration.scenario) if removed else ():
+        tree = replace_values(self.definition.parameters, values)
+        for source in error_sources(self.definition.scenario) if removed else ():
             if source.name in removed:
                 tree = replace_values(tree, source.exact_values(tree))
         return self.scenario.parameters_type.model_validate(tree)

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, value_at
-from marsyard.campaigns.definition.configuration import POPULATIONS, Key, Requirement, key_text, validation_problems
+from marsyard.campaigns.definition.campaign_file import POPULATIONS, Key, Requirement, key_text, validation_problems
 from marsyard.campaigns.definition.identity import list_algorithms
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
@@ -36,14 +36,14 @@ def find_campaign_problems(campaign: Campaign) -> list[tuple[Key, str]]:
 
 def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
     """List problems of the campaign's dispersions: keys, and messages with the allowed values."""
-    if campaign.configuration.design.kind == ADAPTIVE:
+    if campaign.definition.design.kind == ADAPTIVE:
         return [
             (("design", "kind"), "adaptive is for studies (marsyard rare); allowed: random, latin-hypercube, sobol")
         ]
-    problems = [*campaign.configuration.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
-    if problems or not campaign.configuration.dispersions:
+    problems = [*campaign.definition.find_sampling_problems(), *_check_names(campaign)] or _check_ranges(campaign)
+    if problems or not campaign.definition.dispersions:
         return problems
-    for case in range(min(campaign.configuration.cases, _CHECKED_CASES)):
+    for case in range(min(campaign.definition.cases, _CHECKED_CASES)):
         try:
             error_text = _find_validation_error(campaign, campaign.draws(case))
         except ValueError as error:
@@ -55,8 +55,8 @@ def _check_sampling(campaign: Campaign) -> list[tuple[Key, str]]:
 
 def _check_calibration(campaign: Campaign) -> list[tuple[Key, str]]:
     """List unknown parameters among the calibrated options: keys, and messages with the allowed parameters."""
-    calibration, problems = campaign.configuration.calibration, []
-    parameters = dict(leaves(campaign.configuration.parameters))
+    calibration, problems = campaign.definition.calibration, []
+    parameters = dict(leaves(campaign.definition.parameters))
     for index, run in enumerate(() if calibration is None else calibration.runs):
         for number, path in enumerate(run.options):
             if path not in parameters and not any(leaf.startswith(f"{path}.") for leaf in parameters):
@@ -67,8 +67,8 @@ def _check_calibration(campaign: Campaign) -> list[tuple[Key, str]]:
 
 def _check_names(campaign: Campaign) -> list[tuple[Key, str]]:
     """List unknown parameters in dispersions or formulas, and cycles of formulas."""
-    parameters = dict(leaves(campaign.configuration.parameters))
-    dispersions = campaign.configuration.dispersions
+    parameters = dict(leaves(campaign.definition.parameters))
+    dispersions = campaign.definition.dispersions
     problems: list[tuple[Key, str]] = []
     for path, dispersion in dispersions.items():
         has_values = not isinstance(dispersion, GridDispersion) or dispersion.values is not None
@@ -130,7 +130,7 @@ def _check_extremes(campaign: Campaign, path: str, extremes: Mapping[str, list[A
 
     Raises ValueError for the first invalid value.
     """
-    dispersion, parameters = campaign.marginals[path], campaign.configuration.parameters
+    dispersion, parameters = campaign.marginals[path], campaign.definition.parameters
     varying = [name for name in dispersion.names if name in extremes]
     if len(varying) > _MAX_VARYING:
         raise ValueError(f"its formulas contain {len(varying)} varying parameters; allowed: up to {_MAX_VARYING}")
@@ -181,14 +181,14 @@ def _check_metrics(campaign: Campaign) -> list[tuple[Key, str]]:
         return [(("scenario",), str(error))]
     if columns is None:
         return []
-    compared = labels(list_algorithms(campaign.configuration))[1:]
+    compared = labels(list_algorithms(campaign.definition))[1:]
 
     def is_known(name: str, kind: str) -> bool:
         column = next((name.removeprefix(f"{spec}.") for spec in compared if name.startswith(f"{spec}.")), name)
         return columns.has(column, float if kind == NUMBERS else bool)
 
     flags, numbers = columns.names(bool), columns.names(float)
-    return find_unknown_columns(campaign.configuration.requirements, flags, numbers, is_known)
+    return find_unknown_columns(campaign.definition.requirements, flags, numbers, is_known)
 
 
 def find_unknown_columns(
@@ -212,20 +212,20 @@ def find_unknown_columns(
 
 def _collect_columns(campaign: Campaign) -> Columns | None:
     """Collect the columns of the scenario, of the engine and of the campaign's parameters; None if they are unknown."""
-    configuration = campaign.configuration
-    columns = row_columns(configuration.scenario)
+    definition = campaign.definition
+    columns = row_columns(definition.scenario)
     if columns is None:
         return None
     scores: list[Column] = []
     keys = campaign.scenario.part_keys if isinstance(campaign.scenario, HasParts) else {}
     for path in (path for path, kind in keys.items() if kind is SCORE):
-        if path in configuration.dispersions:
+        if path in definition.dispersions:
             return None
-        for label in labels(find_value(configuration.parameters, path)):
+        for label in labels(find_value(definition.parameters, path)):
             scores += [Column(f"{label}_*", Kind.ERROR, "custom score", type=kind) for kind in (float, bool)]
-    draws = [Column(path, Kind.CONDITION, "sampled value") for path in configuration.dispersions]
+    draws = [Column(path, Kind.CONDITION, "sampled value") for path in definition.dispersions]
     declared = list(columns)
     if columns.named_flags:  # flags that the campaign file names
         declared = [column for column in columns if column.type is not bool or "*" not in column.name]
-        declared += [flag(str(item["name"]), "") for item in find_value(configuration.parameters, columns.named_flags)]
+        declared += [flag(str(item["name"]), "") for item in find_value(definition.parameters, columns.named_flags)]
     return Columns((*declared, *ENGINE, *draws, *scores))

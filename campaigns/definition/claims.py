@@ -20,7 +20,7 @@ from typing import Any, Self
 
 from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, replace_values
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import (
     custom_sources,
     describe_algorithms,
@@ -33,7 +33,9 @@ from marsyard.scenarios.interface import HasAlgorithms, IdentifiesTerrains
 from marsyard.scenarios.systems import scenario_source
 from marsyard.sim.terrain.bank import IMPORTED_TERRAIN
 
-#: Keys that the hash `configuration` of a frozen algorithm does not contain: names and texts, the seed, the number of
+#: Name, in the record of confirmations, of the hash of a campaign's definition.
+DEFINITION = "configuration"
+#: Keys that the hash of the definition of a frozen algorithm does not contain: names and texts, the seed, the number of
 #: cases, limits of the run, and the requirements, which have their own hash.
 _KEYS_NOT_HASHED = frozenset(
     {"appended", "calibration", "cases", "description", "limits", "max_cases", "name", "requirements", "retain", "seed"}
@@ -50,7 +52,7 @@ class FrozenAlgorithm:
 
     - algorithm: name of the algorithm under test
     - options: options of all algorithms of the campaign, under the algorithm's name, and values under `parameters`
-    - hashes: SHA-256 of `sources` (of the algorithms, with their options), `configuration` (parameters, dispersions,
+    - hashes: SHA-256 of `sources` (of the algorithms, with their options), `DEFINITION` (parameters, dispersions,
       sampling design, input files), `requirements`, and `code` (of the simulation)
     """
 
@@ -81,8 +83,8 @@ class FrozenAlgorithm:
                 texts.append(f"{name} ({json.dumps(old)}, now {json.dumps(new)})")
         names = sorted({*self.hashes, *other.hashes})
         changed_hashes = [name for name in names if self.hashes.get(name) != other.hashes.get(name)]
-        if texts and "configuration" in changed_hashes:
-            changed_hashes.remove("configuration")  # it includes the named parameters
+        if texts and DEFINITION in changed_hashes:
+            changed_hashes.remove(DEFINITION)  # it includes the named parameters
         return [*texts, *changed_hashes]
 
 
@@ -93,19 +95,19 @@ def hash_json(content: Any) -> str:
 
 def freeze_algorithm(campaign: Campaign) -> FrozenAlgorithm:
     """Describe all choices that a confirmation of a campaign freezes."""
-    configuration = campaign.configuration
+    definition = campaign.definition
     algorithms = describe_algorithms(campaign)
-    algorithm = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), configuration.scenario)
+    algorithm = next((entry["spec"] for entry in algorithms if entry["role"] == "tested"), definition.scenario)
     options = {f"{entry['spec']}.{name}": value for entry in algorithms for name, value in entry["options"].items()}
-    values = configuration.model_dump(mode="json")
+    values = definition.model_dump(mode="json")
     options |= dict(leaves(values["parameters"], "parameters"))
     frozen_values = {name: value for name, value in values.items() if name not in _KEYS_NOT_HASHED}
     frozen_values["parameters"] = _remove_names(campaign, values["parameters"])
     contents = {
         "sources": [[entry["role"], _algorithm_content(campaign, entry), entry["options"]] for entry in algorithms],
-        "configuration": [frozen_values, sorted(hash_inputs(configuration).values())],
+        DEFINITION: [frozen_values, sorted(hash_inputs(definition).values())],
         "requirements": sorted(map(requirement_key, values["requirements"])),
-        "code": hash_code((scenario_source(configuration.scenario), *list_parts(configuration))),
+        "code": hash_code((scenario_source(definition.scenario), *list_parts(definition))),
     }
     return FrozenAlgorithm(algorithm, options, {name: hash_json(content) for name, content in contents.items()})
 
@@ -171,19 +173,19 @@ def confirmation_seed(claim: str, head: str) -> int:
     return _derive("seed", claim, head)
 
 
-def bank_seeds(configuration: CampaignConfiguration) -> dict[str, int]:
+def bank_seeds(definition: CampaignDefinition) -> dict[str, int]:
     """Return the seeds of the terrain banks of a campaign by parameter path, except dispersed ones."""
-    values = leaves(configuration.parameters)
+    values = leaves(definition.parameters)
     return {
         path: value
         for path, value in values
-        if path.rpartition(".")[2] == _BANK_SEED and path not in configuration.dispersions
+        if path.rpartition(".")[2] == _BANK_SEED and path not in definition.dispersions
     }
 
 
-def confirmation_bank_seeds(configuration: CampaignConfiguration, claim: str, head: str) -> dict[str, int]:
+def confirmation_bank_seeds(definition: CampaignDefinition, claim: str, head: str) -> dict[str, int]:
     """Compute the seeds of the terrain banks of a confirmation, by parameter path; see `confirmation_seed`."""
-    return {path: _derive(path, claim, head) for path in bank_seeds(configuration)}
+    return {path: _derive(path, claim, head) for path in bank_seeds(definition)}
 
 
 def _derive(purpose: str, claim: str, head: str) -> int:
@@ -199,16 +201,16 @@ def calibration_overlap(campaign: Campaign, original_bank_seeds: Mapping[str, in
 
     Calibration runs are assumed to have as many cases as the campaign.
     """
-    configuration, calibration = campaign.configuration, campaign.configuration.calibration
+    definition, calibration = campaign.definition, campaign.definition.calibration
     runs = () if calibration is None else calibration.runs
-    seeds = {run.seed for run in runs if run.campaign == configuration.name}
+    seeds = {run.seed for run in runs if run.campaign == definition.name}
     if not isinstance(campaign.scenario, IdentifiesTerrains):
         return None if seeds else 0.0
-    parameters = replace_values(configuration.parameters, original_bank_seeds)
+    parameters = replace_values(definition.parameters, original_bank_seeds)
     known_terrains: set[str] = set()
     for seed in seeds:
         changes = {"seed": seed, "parameters": parameters}
-        calibration_run = Campaign(configuration.model_copy(update=changes), campaign.scenario)
+        calibration_run = Campaign(definition.model_copy(update=changes), campaign.scenario)
         known_terrains.update(*_list_terrains(calibration_run))
     if not known_terrains:
         return 0.0
@@ -228,7 +230,7 @@ def _list_terrains(campaign: Campaign) -> list[tuple[str, ...]]:
     """List the identities of the terrains of each case; a case with invalid draws has none."""
     assert isinstance(campaign.scenario, IdentifiesTerrains)  # noqa: S101  (checked by the caller)
     terrains = []
-    for case in range(campaign.configuration.total_cases):
+    for case in range(campaign.definition.total_cases):
         try:
             terrains.append(campaign.scenario.terrain_identities(campaign.parameters(case), case))
         except ValueError:

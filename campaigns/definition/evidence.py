@@ -185,12 +185,12 @@ def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation],
 
     confirmations: entries of the record of confirmations
     """
-    configuration = campaign.configuration
-    name, seed = configuration.name, configuration.seed
+    definition = campaign.definition
+    name, seed = definition.name, definition.seed
     for entry in confirmations:
         if entry.seed != seed or (not entry.is_chained and entry.campaign != name):
             continue
-        own_bank_seeds = bank_seeds(configuration)
+        own_bank_seeds = bank_seeds(definition)
         changes = entry.frozen.differences(frozen)
         changes += [
             f"{path} ({json.dumps(value)}, now {json.dumps(own_bank_seeds.get(path))})"
@@ -199,7 +199,7 @@ def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation],
         ]
         kind = EvidenceKind.REUSED_SEED if changes else EvidenceKind.REPETITION
         return Evidence(kind, entry.number, entry.claim, overlap=entry.overlap, changes=tuple(changes))
-    runs = () if configuration.calibration is None else configuration.calibration.runs
+    runs = () if definition.calibration is None else definition.calibration.runs
     calibration_runs = [run for run in runs if (run.campaign, run.seed) == (name, seed)]
     if calibration_runs:
         options = dict.fromkeys(option for run in calibration_runs for option in run.options)

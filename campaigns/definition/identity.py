@@ -22,7 +22,7 @@ from pydantic import ValidationError
 
 from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits, parse_command
 from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
 from marsyard.scenarios.estimators import algorithm_sources, custom_path, describe_custom
@@ -35,7 +35,7 @@ from marsyard.scenarios.user_files import input_files
 
 #: Folders of the packages whose code determines rows; reports and commands do not affect rows.
 _CODE_FOLDERS = ("sim", "algorithms", "scenarios", "campaigns")
-#: Keys of a configuration that do not affect the row of a finished case.
+#: Keys of a definition that do not affect the row of a finished case.
 _KEYS_WITHOUT_EFFECT = frozenset(
     {"appended", "calibration", "description", "limits", "max_cases", "requirements", "retain"}
 )
@@ -46,13 +46,13 @@ _PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 class Identity:
     """All values that determine the row of a case; with equal identity, two runs on one machine have equal rows.
 
-    - configuration: hash of the keys that determine the cases
+    - definition: hash of the keys that determine the cases
     - code: hash of the sources of `sim`, `algorithms`, `scenarios`, `campaigns`, and of custom code
     - versions: versions of Python, Marsyard and the packages that Marsyard requires
     - inputs: hashes of the parameters' input files, by path as in the parameters; missing files are omitted
     """
 
-    configuration: str
+    definition: str
     code: str
     versions: Mapping[str, str]
     inputs: Mapping[str, str]
@@ -61,11 +61,11 @@ class Identity:
     def read(cls, stored: Mapping[str, Any]) -> Self:
         """Read an identity from a record."""
         versions, inputs = dict(stored["versions"]), dict(stored["inputs"])
-        return cls(str(stored["configuration"]), str(stored["code"]), versions, inputs)
+        return cls(str(stored["definition"]), str(stored["code"]), versions, inputs)
 
     def differences(self, other: Identity) -> list[str]:
         """Describe the differences from another identity, each in a few words."""
-        pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("configuration", "code")}
+        pairs = {name: (getattr(self, name)[:12], getattr(other, name)[:12]) for name in ("definition", "code")}
         for name in sorted({*self.versions, *other.versions}):
             pairs[name] = (str(self.versions.get(name)), str(other.versions.get(name)))
         common_names = sorted({*self.inputs} & {*other.inputs})
@@ -73,30 +73,30 @@ class Identity:
         return [f"{name} ({old}, now {new})" for name, (old, new) in pairs.items() if old != new]
 
 
-def create_identity(configuration: CampaignConfiguration) -> Identity:
+def create_identity(definition: CampaignDefinition) -> Identity:
     """Create the identity of a campaign with the current code, versions and input files.
 
     Raises CampaignError if an input file is no longer valid.
     """
-    custom_components = (*list_algorithms(configuration), *list_parts(configuration))
-    code = hash_code((scenario_source(configuration.scenario), *custom_components))
-    return Identity(configuration_hash(configuration), code, read_versions(), hash_inputs(configuration))
+    custom_components = (*list_algorithms(definition), *list_parts(definition))
+    code = hash_code((scenario_source(definition.scenario), *custom_components))
+    return Identity(definition_hash(definition), code, read_versions(), hash_inputs(definition))
 
 
-def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
+def hash_inputs(definition: CampaignDefinition) -> dict[str, str]:
     """Compute the SHA-256 of each input file of the parameters or their dispersions, by path.
 
     Raises CampaignError if the scenario rejects the parameters, for example because a file is missing or has changed.
     """
     try:
-        parameters = scenario(configuration.scenario).parameters_type.model_validate(configuration.parameters)
+        parameters = scenario(definition.scenario).parameters_type.model_validate(definition.parameters)
     except UnknownScenarioError:
         return {}
     except ValidationError as error:
         reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors(include_url=False))
         raise CampaignError(f"the campaign's parameters are no longer valid: {reasons}") from error
     dispersions = [
-        item for item in configuration.dispersions.values() if isinstance(item, Choice | Fixed | GridDispersion)
+        item for item in definition.dispersions.values() if isinstance(item, Choice | Fixed | GridDispersion)
     ]
     values = [value for item in dispersions for extreme in item.extremes() for _, value in leaves(extreme)]
     hashes: dict[str, str] = {}
@@ -110,40 +110,40 @@ def hash_inputs(configuration: CampaignConfiguration) -> dict[str, str]:
     return hashes
 
 
-def list_algorithms(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """List the algorithms in a configuration or its dispersions: under test, then compared."""
-    selected_scenario = find_scenario(configuration.scenario)
+def list_algorithms(definition: CampaignDefinition) -> tuple[str, ...]:
+    """List the algorithms in a definition or its dispersions: under test, then compared."""
+    selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasAlgorithms):
         return ()
     tested_key, compared_key = (
         ".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared")
     )
-    specs = [find_value(configuration.parameters, tested_key), *find_value(configuration.parameters, compared_key)]
-    if tested_key in configuration.dispersions:
-        specs += configuration.dispersions[tested_key].extremes()
+    specs = [find_value(definition.parameters, tested_key), *find_value(definition.parameters, compared_key)]
+    if tested_key in definition.dispersions:
+        specs += definition.dispersions[tested_key].extremes()
     return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
 
 
-def own_limits(configuration: CampaignConfiguration) -> tuple[float, float]:
+def own_limits(definition: CampaignDefinition) -> tuple[float, float]:
     """Return the time (s) and memory (bytes) that the algorithms in processes of their own may use for one case."""
-    selected_scenario = find_scenario(configuration.scenario)
+    selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasAlgorithms):
         return 0.0, 0.0
-    found = find_value(configuration.parameters, ".".join((*selected_scenario.algorithm_table, "executable")))
+    found = find_value(definition.parameters, ".".join((*selected_scenario.algorithm_table, "executable")))
     limits = ExecutableLimits.model_validate(found if isinstance(found, Mapping) else {})
     shipped = selected_scenario.task.shipped
-    custom = [spec for spec in list_algorithms(configuration) if spec not in shipped and not is_offline(spec)]
+    custom = [spec for spec in list_algorithms(definition) if spec not in shipped and not is_offline(spec)]
     count = len([spec for spec in custom if limits.isolated or spec.startswith(tuple(PREFIXES))])
     return count * (limits.loading_s + limits.total_s), count * limits.memory_gb * 1e9
 
 
-def list_parts(configuration: CampaignConfiguration) -> tuple[str, ...]:
-    """List the import paths (``module:name``) of the custom parts in a configuration or its dispersions."""
-    selected_scenario = find_scenario(configuration.scenario)
+def list_parts(definition: CampaignDefinition) -> tuple[str, ...]:
+    """List the import paths (``module:name``) of the custom parts in a definition or its dispersions."""
+    selected_scenario = find_scenario(definition.scenario)
     if not isinstance(selected_scenario, HasParts):
         return ()
-    parameter_trees = [configuration.parameters]
-    for path, dispersion in configuration.dispersions.items():
+    parameter_trees = [definition.parameters]
+    for path, dispersion in definition.dispersions.items():
         if any(f"{key}.".startswith(f"{path}.") for key in selected_scenario.part_keys):
             for tree in dispersion.extremes():
                 for name in reversed(path.split(".")):
@@ -166,9 +166,9 @@ def find_scenario(name: object) -> Scenario | None:
         return None
 
 
-def configuration_hash(configuration: CampaignConfiguration) -> str:
-    """Compute the hash of the configuration keys that determine the cases."""
-    values = configuration.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
+def definition_hash(definition: CampaignDefinition) -> str:
+    """Compute the hash of the definition keys that determine the cases."""
+    values = definition.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
@@ -238,12 +238,12 @@ def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
     selected_scenario = campaign.scenario
     if not isinstance(selected_scenario, HasAlgorithms):
         return []
-    compared = find_value(campaign.configuration.parameters, ".".join((*selected_scenario.algorithm_table, "compared")))
+    compared = find_value(campaign.definition.parameters, ".".join((*selected_scenario.algorithm_table, "compared")))
     parameters: Any = campaign.base_parameters()
     for name in selected_scenario.algorithm_table:
         parameters = getattr(parameters, name)
     entries = []
-    for spec in list_algorithms(campaign.configuration):
+    for spec in list_algorithms(campaign.definition):
         # shipped algorithms are installed with Marsyard; their sources are all of `marsyard.algorithms`
         is_shipped = spec in selected_scenario.task.shipped
         sources = list(source_files("marsyard.algorithms:") if is_shipped else custom_sources(spec))

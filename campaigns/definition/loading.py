@@ -12,17 +12,17 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.checks import find_campaign_problems
-from marsyard.campaigns.definition.configuration import (
-    CampaignConfiguration,
+from marsyard.campaigns.definition.campaign_file import (
+    CampaignDefinition,
     Key,
     key_text,
     read_tables,
     validation_problems,
 )
+from marsyard.campaigns.definition.checks import find_campaign_problems
 from marsyard.campaigns.definition.identity import find_scenario
 from marsyard.campaigns.definition.requirements import fill_requirements
-from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
+from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
 from marsyard.campaigns.sampling.design import MATRICES
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.systems import UnknownScenarioError, catalogue, scenario
@@ -38,17 +38,17 @@ Model = TypeVar("Model", bound=BaseModel)
 def find_campaign(name_or_path: str) -> Path:
     """Return the file of a campaign, from its name in the catalogue or from the path of a TOML file.
 
-    Raises ConfigurationError if there is no such file.
+    Raises DefinitionError if there is no such file.
     """
     path = Path(name_or_path)
     if path.suffix == ".toml" or len(path.parts) > 1:
         if not path.is_file():
-            raise ConfigurationError([Problem(str(path), "", "is a folder" if path.is_dir() else "no such file")])
+            raise DefinitionError([Problem(str(path), "", "is a folder" if path.is_dir() else "no such file")])
         return path
     files = catalogue()
     if name_or_path not in files:
         message = f"{unknown_name_message('campaign', name_or_path, files)}, or the path of a TOML file"
-        raise ConfigurationError([Problem("", "", message)])
+        raise DefinitionError([Problem("", "", message)])
     return files[name_or_path]
 
 
@@ -66,7 +66,7 @@ def load_campaign(
       TOML syntax or plain text. An overridden parameter is not dispersed
     - cases, seed, algorithms: replace those of the file; the first algorithm is under test, the others are compared
 
-    Raises ConfigurationError with all problems: file (or option), key and allowed values.
+    Raises DefinitionError with all problems: file (or option), key and allowed values.
     """
     path = find_campaign(name_or_path)
     tables = read_tables(path)
@@ -91,7 +91,7 @@ def create_campaign(tables: Mapping[str, Any], source: str = "the campaign") -> 
     """Create a campaign from tables of the form of a campaign file.
 
     source: name of the tables in messages
-    Raises ConfigurationError with all problems: key and allowed values.
+    Raises DefinitionError with all problems: key and allowed values.
     """
     return _validate(source, dict(tables), {})
 
@@ -100,14 +100,14 @@ def _parse_override(override: str, option: str) -> dict[str, Any]:
     """Parse ``KEY=VALUE`` into nested tables of a campaign file; a value that is not TOML is a text."""
     key, separator, value = override.partition("=")
     if not separator or not key.strip() or "\n" in override:
-        raise ConfigurationError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
+        raise DefinitionError([Problem(option, "", "expected KEY=VALUE, such as --set render.backend=egl")])
     try:
         try:
             values = tomllib.loads(f"{key} = {value.strip()}")
         except ValueError:
             values = tomllib.loads(f"{key} = {json.dumps(value.strip())}")
     except (ValueError, RecursionError) as error:
-        raise ConfigurationError([Problem(option, "", f"'{key}' is not a dotted key: {error}")]) from error
+        raise DefinitionError([Problem(option, "", f"'{key}' is not a dotted key: {error}")]) from error
     return values if next(iter(values)) in _FILE_KEYS else {"parameters": values}
 
 
@@ -120,12 +120,12 @@ def _select_algorithms(
     if selected_scenario is None:
         return tables
     if not isinstance(selected_scenario, HasAlgorithms):
-        raise ConfigurationError([Problem(options[0], "", f"the scenario of {source} has no selectable algorithms")])
-    settings: tuple[tuple[str, Any, str], ...] = (
+        raise DefinitionError([Problem(options[0], "", f"the scenario of {source} has no selectable algorithms")])
+    changes: tuple[tuple[str, Any, str], ...] = (
         ("algorithm", algorithms[0], options[0]),
         ("compared", list(algorithms[1:]), " ".join(options[1:]) or options[0]),
     )
-    for key, value, option in settings:
+    for key, value, option in changes:
         nested_table: dict[str, Any] = {key: value}
         for part in reversed(("parameters", *selected_scenario.algorithm_table)):
             nested_table = {part: nested_table}
@@ -136,40 +136,34 @@ def _select_algorithms(
 def replace_algorithms(campaign: Campaign, algorithms: Sequence[str]) -> Campaign:
     """Return a campaign with other algorithms: the first is under test, the others are compared.
 
-    Raises ConfigurationError if the scenario has no selectable algorithms, or rejects them.
+    Raises DefinitionError if the scenario has no selectable algorithms, or rejects them.
     """
     if not algorithms:
         return campaign
-    selected, configuration, source = (
-        campaign.scenario,
-        campaign.configuration,
-        f"campaign '{campaign.configuration.name}'",
-    )
+    selected, definition, source = (campaign.scenario, campaign.definition, f"campaign '{campaign.definition.name}'")
     if not isinstance(selected, HasAlgorithms):
-        raise ConfigurationError([Problem(source, "", "its scenario has no selectable algorithms")])
-    settings: dict[str, Any] = {"algorithm": algorithms[0], "compared": list(algorithms[1:])}
+        raise DefinitionError([Problem(source, "", "its scenario has no selectable algorithms")])
+    changes: dict[str, Any] = {"algorithm": algorithms[0], "compared": list(algorithms[1:])}
     for part in reversed(selected.algorithm_table):
-        settings = {part: settings}
-    paths = {".".join(path) for path in _list_paths(settings)}
-    values = _merge(configuration.parameters, settings)
+        changes = {part: changes}
+    paths = {".".join(path) for path in _list_paths(changes)}
+    values = _merge(definition.parameters, changes)
     try:
         parameters = selected.parameters_type.model_validate(values).model_dump(mode="json", round_trip=True)
     except ValidationError as error:
         found = validation_problems(error, selected.parameters_type)
-        raise ConfigurationError(
-            [Problem(source, key_text(("parameters", *key)), text) for key, text in found]
-        ) from error
-    dispersions = {path: item for path, item in configuration.dispersions.items() if path not in paths}
-    changed = configuration.model_copy(update={"parameters": parameters, "dispersions": dispersions})
-    return replace(campaign, configuration=changed)
+        raise DefinitionError([Problem(source, key_text(("parameters", *key)), text) for key, text in found]) from error
+    dispersions = {path: item for path, item in definition.dispersions.items() if path not in paths}
+    changed = definition.model_copy(update={"parameters": parameters, "dispersions": dispersions})
+    return replace(campaign, definition=changed)
 
 
 def _apply_option(
-    tables: Mapping[str, Any], settings: Mapping[str, Any], option: str, options_by_key: dict[tuple[str, ...], str]
+    tables: Mapping[str, Any], changes: Mapping[str, Any], option: str, options_by_key: dict[tuple[str, ...], str]
 ) -> dict[str, Any]:
     """Merge the tables with those of an option; parameters that the option sets are not dispersed."""
-    merged = _merge(tables, settings)
-    paths = _list_paths(settings)
+    merged = _merge(tables, changes)
+    paths = _list_paths(changes)
     options_by_key.update(dict.fromkeys(paths, option))
     parameter_paths = [".".join(path[1:]) for path in paths if path[0] == "parameters"]
     dispersions = merged.get("dispersions")
@@ -243,8 +237,8 @@ def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tu
     tables, requirement_problems = fill_requirements(tables)
     add_problems(requirement_problems)
     if problems:
-        raise ConfigurationError(problems)
-    configuration, selected_scenario, parameters = validate(CampaignConfiguration, tables), None, None
+        raise DefinitionError(problems)
+    definition, selected_scenario, parameters = validate(CampaignDefinition, tables), None, None
     try:
         if isinstance(name := tables.get("scenario"), str) and name:
             selected_scenario = scenario(name)
@@ -253,11 +247,11 @@ def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tu
     values = tables.get("parameters", {})
     if selected_scenario is not None and isinstance(values, Mapping):
         parameters = validate(selected_scenario.parameters_type, values, ("parameters",))
-    if configuration is None or selected_scenario is None or parameters is None:
-        raise ConfigurationError(problems)
+    if definition is None or selected_scenario is None or parameters is None:
+        raise DefinitionError(problems)
     complete_parameters = parameters.model_dump(mode="json", round_trip=True)
-    campaign = Campaign(configuration.model_copy(update={"parameters": complete_parameters}), selected_scenario)
+    campaign = Campaign(definition.model_copy(update={"parameters": complete_parameters}), selected_scenario)
     add_problems(find_campaign_problems(campaign))
     if problems:
-        raise ConfigurationError(problems)
+        raise DefinitionError(problems)
     return campaign

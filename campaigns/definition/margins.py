@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.errors import ENGINE_FAILURES
 
 #: Margin of a case whose boolean metric is false, although its margin column is not negative.

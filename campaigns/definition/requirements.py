@@ -10,8 +10,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from marsyard.campaigns.definition.configuration import Key, Requirement, read_table
-from marsyard.campaigns.errors import ConfigurationError, Problem, unknown_name_message
+from marsyard.campaigns.definition.campaign_file import Key, Requirement, read_table
+from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters
 
@@ -38,13 +38,13 @@ class _RequirementsFile(Parameters):
 def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
     """Read the requirements of a file.
 
-    Raises ConfigurationError if it is unreadable or invalid; every problem has its key.
+    Raises DefinitionError if it is unreadable or invalid; every problem has its key.
     """
     requirements = read_table(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
     repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
     if repeated_ids:
-        raise ConfigurationError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated_ids)}")])
+        raise DefinitionError([Problem(str(path), "requirements", f"share an id: {', '.join(repeated_ids)}")])
     return requirements
 
 
@@ -62,7 +62,7 @@ def _read_shipped() -> tuple[Mapping[str, SharedRequirement], tuple[str, ...]]:
     for path in dict.fromkeys(system.requirements for system in systems() if system.requirements):
         try:
             by_id = {requirement.id: requirement for requirement in read_requirements(path)} | by_id
-        except ConfigurationError as error:
+        except DefinitionError as error:
             problems.append(str(error))
     return by_id, tuple(problems)
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from marsyard.algorithms.faults import describe_error
 from marsyard.campaigns.definition.campaign import Campaign, leaves
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, CaseLimits, Requirement
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, CaseLimits, Requirement
 from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
@@ -46,16 +46,16 @@ class CompletedCase:
     note: str = ""
 
 
-def configuration_text(configuration: CampaignConfiguration) -> str:
-    """Convert a configuration to the JSON text that is sent to the workers."""
-    return configuration.model_dump_json()
+def definition_text(definition: CampaignDefinition) -> str:
+    """Convert a definition to the JSON text that is sent to the workers."""
+    return definition.model_dump_json()
 
 
 @lru_cache(maxsize=1)
-def _load_campaign(configuration: str) -> Campaign:
-    """Create the campaign of a configuration text; the result is cached because loading is slow."""
-    campaign_configuration = CampaignConfiguration.model_validate_json(configuration)
-    campaign = Campaign(campaign_configuration, scenario(campaign_configuration.scenario))
+def _load_campaign(definition: str) -> Campaign:
+    """Create the campaign of a definition text; the result is cached because loading is slow."""
+    campaign_definition = CampaignDefinition.model_validate_json(definition)
+    campaign = Campaign(campaign_definition, scenario(campaign_definition.scenario))
     with suppress(ValueError):  # imports and constructs custom parts; the case reports an error
         campaign.base_parameters()
     worker_process.limit_threads()
@@ -63,15 +63,15 @@ def _load_campaign(configuration: str) -> Campaign:
     return campaign
 
 
-def create_loader(configuration: CampaignConfiguration) -> Callable[[], object]:
+def create_loader(definition: CampaignDefinition) -> Callable[[], object]:
     """Return the function that loads a campaign in a worker (`Work.load`)."""
-    return partial(_load_campaign, configuration_text(configuration))
+    return partial(_load_campaign, definition_text(definition))
 
 
 def run_case(
-    configuration: str, selection: ProductSelection, points: Mapping[int, StudyPoint], case: int
+    definition: str, selection: ProductSelection, points: Mapping[int, StudyPoint], case: int
 ) -> CompletedCase:
-    """Run one case of the campaign of a `configuration_text`; the row of a failed case contains its exception.
+    """Run one case of the campaign of a `definition_text`; the row of a failed case contains its exception.
 
     - selection: decides whether the products of the case are returned with the row
     - points: points of the cases of a study; other cases are drawn by the sampling design
@@ -80,7 +80,7 @@ def run_case(
     products: Mapping[str, Any] = {}
     point, draws = points.get(case), {}
     try:
-        campaign = _load_campaign(configuration)
+        campaign = _load_campaign(definition)
         wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
         values = campaign.draws(case) if point is None else campaign.draws_at(point)
         draws = list_draws(values)
@@ -88,7 +88,7 @@ def run_case(
             parameters = campaign.with_values(values, () if point is None else point.removed)
             streams = campaign.streams(case) if point is None else campaign.streams_at(point)
             result = campaign.scenario.run(parameters, streams)
-        row = _build_finished_row(case, result, draws, campaign.configuration.requirements)
+        row = _build_finished_row(case, result, draws, campaign.definition.requirements)
         products = result.products
     except BaseException as error:
         outcome = OUT_OF_MEMORY if isinstance(error, MemoryError) else CRASHED
@@ -105,9 +105,9 @@ def run_case(
         return CompletedCase(row, None, f"the products of case {case} could not be stored: {error}")
 
 
-def prepare_input(configuration: str, shared_input: int) -> str:
+def prepare_input(definition: str, shared_input: int) -> str:
     """Build or verify the shared input (such as a terrain) with this number; return the warnings of its cache."""
-    campaign = _load_campaign(configuration)
+    campaign = _load_campaign(definition)
     with warnings.catch_warnings(record=True) as cache_warnings:
         warnings.simplefilter("always", CacheWarning)
         campaign.scenario.prepare(campaign.base_parameters(), shared_input)
@@ -116,7 +116,7 @@ def prepare_input(configuration: str, shared_input: int) -> str:
 
 def run_cases(
     executor: Executor,
-    configuration: CampaignConfiguration,
+    definition: CampaignDefinition,
     cases: Iterable[int],
     *,
     selection: ProductSelection,
@@ -127,19 +127,19 @@ def run_cases(
 
     points: see `run_case`; rows of these cases contain their point
     """
-    task: Callable[[int], CompletedCase] = partial(run_case, configuration_text(configuration), selection, dict(points))
+    task: Callable[[int], CompletedCase] = partial(run_case, definition_text(definition), selection, dict(points))
     note_counts: Counter[str] = Counter()
-    limits = work_limits(configuration.limits, configuration.limits.case_time_s)
+    limits = work_limits(definition.limits, definition.limits.case_time_s)
     # algorithms in processes of their own have their own limits: one that uses them up must not end the case
-    time_s, memory_bytes = own_limits(configuration)
+    time_s, memory_bytes = own_limits(definition)
     case_memory = None if limits.memory_bytes is None else limits.memory_bytes + memory_bytes
     limits = replace(limits, time_s=limits.time_s + time_s, memory_bytes=case_memory)
-    for results in executor.run(Work(task, cases, limits, total, create_loader(configuration))):
+    for results in executor.run(Work(task, cases, limits, total, create_loader(definition))):
         completed_cases = []
         for task_result in results:
             times = {"wall_time_s": float("nan"), "cpu_time_s": float("nan")}
             case_result = task_result.result or CompletedCase(
-                {**_build_terminated_row(configuration, task_result, points.get(task_result.item)), **times}
+                {**_build_terminated_row(definition, task_result, points.get(task_result.item)), **times}
             )
             note = "; ".join(filter(None, (case_result.note, *_describe_changes(task_result, note_counts))))
             row, point = case_result.row, points.get(task_result.item)
@@ -154,12 +154,10 @@ def work_limits(limits: CaseLimits, time_s: float) -> WorkLimits:
     return WorkLimits(time_s, memory, limits.output_mb * 1e6)
 
 
-def _build_terminated_row(
-    configuration: CampaignConfiguration, result: TaskResult[Any], point: StudyPoint | None
-) -> Row:
+def _build_terminated_row(definition: CampaignDefinition, result: TaskResult[Any], point: StudyPoint | None) -> Row:
     """Create the row of a case whose process ended early, with the sampled values of the case."""
     case, error, draws = result.item, result.error, {}
-    campaign = Campaign(configuration, scenario(configuration.scenario))
+    campaign = Campaign(definition, scenario(definition.scenario))
     with suppress(ValueError):  # an undefined formula also ends the case in its worker
         draws = list_draws(campaign.draws(case) if point is None else campaign.draws_at(point))
     if not isinstance(error, WorkerExitError):

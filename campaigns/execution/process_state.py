@@ -78,7 +78,7 @@ _PARTS: Mapping[str, Callable[[], object]] = {
     "the locale": partial(locale.setlocale, locale.LC_ALL),
     "the recursion limit": sys.getrecursionlimit,
     "the decimal context": lambda: (decimal.getcontext().prec, decimal.getcontext().rounding),
-    "OpenCV's settings (optimised code, threads)": _read_opencv,
+    "OpenCV's state (optimised code, threads)": _read_opencv,
     "the floating-point rounding mode": _read_arithmetic,
     "handlers of signals, or timers": _read_signals,
     "standard output or error": _read_streams,

@@ -238,7 +238,7 @@ def free_memory() -> float:
 
 @dataclass(frozen=True)
 class ExecutorConfig:
-    """Configuration of an executor: `jobs` worker processes on this machine, or a cluster if `cluster` is set.
+    """Parameters of an executor: `jobs` worker processes on this machine, or a cluster if `cluster` is set.
 
     `cluster` is the address of a Dask scheduler (`tcp://host:8786`), or `local:N` for a new local cluster of N workers.
     """

@@ -13,15 +13,15 @@ from typing import Any, Protocol
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, CaseLimits, key_text
 from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, CaseLimits, key_text
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
-from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, ConfigurationError, Problem, StoreError
+from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, DefinitionError, Problem, StoreError
 from marsyard.campaigns.execution.cases import (
     CompletedCase,
-    configuration_text,
     create_loader,
+    definition_text,
     prepare_input,
     run_cases,
     work_limits,
@@ -65,7 +65,7 @@ class ProgressObserver(Protocol):
 
 @dataclass(frozen=True)
 class _CampaignRun:
-    """A campaign to run, with its folder, the configuration of its workers, and the receiver of its progress.
+    """A campaign to run, with its folder, the parameters of its workers, and the receiver of its progress.
 
     shard: part of the campaign that runs; None for all cases
     """
@@ -79,7 +79,7 @@ class _CampaignRun:
     @property
     def cases(self) -> range:
         """Numbers of the cases to run."""
-        total = self.campaign.configuration.total_cases
+        total = self.campaign.definition.total_cases
         return range(total) if self.shard is None else self.shard.cases(total)
 
 
@@ -100,20 +100,20 @@ def run_campaign(
     with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock
         record.claim_folder(directory)
-        identity = create_identity(campaign.configuration)
+        identity = create_identity(campaign.definition)
         algorithms = describe_algorithms(campaign)
-        create_store(directory / ROWS_FILE, {"identity": identity.configuration})
-        command, configuration = campaign.command, campaign.configuration
+        create_store(directory / ROWS_FILE, {"identity": identity.definition})
+        command, definition = campaign.command, campaign.definition
         evidence = reserve_confirmation(campaign, directory) if campaign.confirms else classify_run(campaign)
         record.write_first_record(
             directory,
-            configuration,
+            definition,
             identity,
             executor.describe(),
             command=command,
             algorithms=algorithms,
             evidence=evidence.to_table(),
-            origin=describe_origin(configuration),
+            origin=describe_origin(definition),
         )
         if shard is not None:
             record.update(directory, {SHARD_KEY: str(shard)})
@@ -124,7 +124,7 @@ def run_campaign(
 def finish_campaign(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
     """Run the missing cases of a campaign without checks of its identity; write the table and the showcase."""
     with folder_lock(directory), RowStore(directory / ROWS_FILE) as store:
-        campaign = load_stored_campaign(directory, record.stored_configuration(directory))
+        campaign = load_stored_campaign(directory, record.stored_definition(directory))
         _execute(_CampaignRun(campaign, directory, executor, observer), store, ())
 
 
@@ -147,15 +147,15 @@ def resume_campaign(
     """
     record.read(directory)  # no lock file is created in a folder without a campaign
     with folder_lock(directory):
-        configuration = record.stored_configuration(directory)
-        _reject_study(directory, configuration)
+        definition = record.stored_definition(directory)
+        _reject_study(directory, definition)
         if case_time_s is not None:
             try:
-                limits = CaseLimits.model_validate({**configuration.limits.model_dump(), "case_time_s": case_time_s})
+                limits = CaseLimits.model_validate({**definition.limits.model_dump(), "case_time_s": case_time_s})
             except ValidationError as error:
                 raise CampaignError(f"--case-time {case_time_s}: {error.errors()[0]['msg'].lower()}") from error
-            configuration = configuration.model_copy(update={"limits": limits})
-        campaign = load_stored_campaign(directory, configuration)
+            definition = definition.model_copy(update={"limits": limits})
+        campaign = load_stored_campaign(directory, definition)
         shard = read_shard(record.read(directory))
         _continue_campaign(_CampaignRun(campaign, directory, executor, observer, shard), "resume", allow_changed, retry)
 
@@ -179,36 +179,36 @@ def append_cases(
 
 def campaign_with_block(directory: Path, cases: int) -> Campaign:
     """Load a stored campaign with a block of `cases` additional cases. Raises CampaignError like `append_cases`."""
-    configuration = record.stored_configuration(directory)
-    _reject_study(directory, configuration)
-    extended_configuration = configuration.model_copy(update={"appended": (*configuration.appended, cases)})
-    problems = [message for _, message in extended_configuration.find_sampling_problems()]
+    definition = record.stored_definition(directory)
+    _reject_study(directory, definition)
+    extended_definition = definition.model_copy(update={"appended": (*definition.appended, cases)})
+    problems = [message for _, message in extended_definition.find_sampling_problems()]
     if cases < 1 or problems:
         raise CampaignError(f"{cases} cases cannot be added to {directory}: {'; '.join(problems) or 'at least 1'}")
-    return load_stored_campaign(directory, extended_configuration)
+    return load_stored_campaign(directory, extended_definition)
 
 
-def _reject_study(directory: Path, configuration: CampaignConfiguration) -> None:
+def _reject_study(directory: Path, definition: CampaignDefinition) -> None:
     """Raise CampaignError for the folder of a study, whose cases a campaign cannot continue."""
-    if configuration.design.kind == ADAPTIVE:
+    if definition.design.kind == ADAPTIVE:
         raise CampaignError(f"{directory} contains a study, which chooses its cases; this command is for campaigns")
 
 
 def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, retry: Sequence[str] = ()) -> None:
     """Run the missing cases of a stored campaign, and cases with the outcomes in `retry` again."""
     campaign, directory, observer = run.campaign, run.directory, run.observer
-    configuration, stored = campaign.configuration, record.read(directory)
-    previous, identity = Identity.read(stored["identity"]), create_identity(configuration)
+    definition, stored = campaign.definition, record.read(directory)
+    previous, identity = Identity.read(stored["identity"]), create_identity(definition)
     changes = previous.differences(identity)
     if changes and not allow_changed:
         changes_text = "\n  ".join(changes)
         raise CampaignError(
-            f"{directory} was run with another program, configuration or input files; rows would not be comparable. "
+            f"{directory} was run with another program, definition or input files; rows would not be comparable. "
             f"Changed:\n  {changes_text}\nTo continue nevertheless, with a note in the record: --allow-changed"
         )
     check_rows(directory)
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
-        if store.about.get("identity") != stored["identity"]["configuration"] and not stored["changes"]:
+        if store.about.get("identity") != stored["identity"]["definition"] and not stored["changes"]:
             raise StoreError(f"{directory}: {ROWS_FILE} and {record.RECORD_FILE} belong to different campaigns")
         count = store.count()
         retries = store.list_cases_with_outcomes(RETRYABLE[word] for word in retry)
@@ -220,7 +220,7 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
             return
         evidence = Evidence.read(stored.get("evidence"))
         if evidence.kind is EvidenceKind.CONFIRMATION and evidence.claim:
-            extend_confirmation(evidence, configuration.total_cases)
+            extend_confirmation(evidence, definition.total_cases)
         session = record.describe_session(command, run.executor.describe(), count)
         updates: dict[str, Any] = {"state": "running", "exit_code": None, "finished_utc": None}
         updates["sessions"] = [*stored["sessions"], session]
@@ -228,7 +228,7 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
             updates["changes"] = [*stored["changes"], {"utc": record.utc_now(), "cases_before": count, "in": changes}]
             updates["algorithms"] = describe_algorithms(campaign)
             updates["identity"] = asdict(identity)
-        updates.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
+        updates.update(cases=definition.total_cases, definition=definition.model_dump(mode="json"))
         record.update(directory, updates)
         old, new = stored["environment"], session["environment"]
         if any(old.get(key) != new[key] for key in ("machine", "processor", "processor_features")):
@@ -239,7 +239,7 @@ def _continue_campaign(run: _CampaignRun, command: str, allow_changed: bool, ret
 
 def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None:
     """Run the missing cases and those of `retries`; write the table, store products, and record the progress."""
-    configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
+    definition, table = run.campaign.definition, run.directory / TABLE_FILE
 
     def record_end(state: str) -> None:
         progress = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
@@ -249,10 +249,10 @@ def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None
         with create_executor(run.executor) as executor:
             missing = _list_missing_cases(run, store)
             if missing or retries:
-                compile_kernels(executor, configuration.scenario, run.observer.note)
+                compile_kernels(executor, definition.scenario, run.observer.note)
                 prepare_inputs(run.campaign, executor, run.observer, itertools.chain(*missing, retries))
                 _run_cases(run, store, executor, [*missing, retries])
-            write_table(table, store, numeric_metrics(configuration.requirements))
+            write_table(table, store, numeric_metrics(definition.requirements))
             if run.shard is None:
                 _rerun_for_products(run, store, executor)
     except BaseException:
@@ -265,7 +265,7 @@ def _execute(run: _CampaignRun, store: RowStore, retries: Sequence[int]) -> None
 
 def _list_missing_cases(run: _CampaignRun, store: RowStore) -> list[range]:
     """List the cases of the run that have no row, as ranges."""
-    ranges = store.list_missing_cases(run.campaign.configuration.total_cases)
+    ranges = store.list_missing_cases(run.campaign.definition.total_cases)
     limited = [range(max(part.start, run.cases.start), min(part.stop, run.cases.stop)) for part in ranges]
     return [part for part in limited if part]
 
@@ -277,7 +277,7 @@ def prepare_inputs(
 
     A case whose input could not be prepared builds it; if this fails, its row contains the error.
     """
-    configuration = campaign.configuration
+    definition = campaign.definition
     plan = plan_inputs(campaign, cases)
     inputs = plan.to_prepare
     if plan.build_bytes > plan.limit_bytes:
@@ -287,9 +287,9 @@ def prepare_inputs(
     if not inputs:
         return
     observer.begin("preparing", len(inputs))
-    task = partial(prepare_input, configuration_text(configuration))
-    limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
-    work = Work(task, inputs, limits, len(inputs), create_loader(configuration))
+    task = partial(prepare_input, definition_text(definition))
+    limits = work_limits(definition.limits, definition.limits.prepare_time_s)
+    work = Work(task, inputs, limits, len(inputs), create_loader(definition))
     for result in itertools.chain.from_iterable(executor.run(work)):
         if result.error is not None:
             error = f"{type(result.error).__name__}: {result.error}"
@@ -301,21 +301,19 @@ def prepare_inputs(
 
 def _run_cases(run: _CampaignRun, store: RowStore, executor: Executor, case_groups: Sequence[Sequence[int]]) -> None:
     """Run cases; store products before their rows, and the rows of one batch in one transaction."""
-    configuration, observer = run.campaign.configuration, run.observer
+    definition, observer = run.campaign.definition, run.observer
     total = sum(len(group) for group in case_groups)
-    products = ProductStore(run.directory, configuration.retain.budget_gb)
+    products = ProductStore(run.directory, definition.retain.budget_gb)
     cases = itertools.chain.from_iterable(case_groups)
     observer.begin("cases", total)
     is_checked = False
-    for batch in run_cases(
-        executor, configuration, cases, selection=create_product_selection(configuration), total=total
-    ):
+    for batch in run_cases(executor, definition, cases, selection=create_product_selection(definition), total=total):
         for completed in batch:
             _store_products(products, completed, observer)
         store.add(completed.row for completed in batch)
         finished_row = next((item.row for item in batch if item.row["outcome"] not in ENGINE_FAILURES), None)
         if not is_checked and finished_row is not None:
-            check_metrics(configuration, finished_row, run.directory)
+            check_metrics(definition, finished_row, run.directory)
             is_checked = True
         for _ in batch:
             observer.step()
@@ -332,14 +330,14 @@ def _store_products(products: ProductStore, completed: CompletedCase, observer: 
         observer.note(f"the disk space for products (retain.budget_gb) is used: none are stored from case {case} on")
 
 
-def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Path) -> None:
+def check_metrics(definition: CampaignDefinition, row: Row, directory: Path) -> None:
     """Check the columns of the requirements against a finished case, before more cases run.
 
     Columns that the scenario declares may be missing in the row; they were checked when the campaign was loaded
-    (`marsyard.campaigns.definition.loading`). Raises ConfigurationError if a column of a requirement is missing or has
+    (`marsyard.campaigns.definition.loading`). Raises DefinitionError if a column of a requirement is missing or has
     the wrong type: a metric with a bound needs numbers, a metric without a bound and a population need booleans.
     """
-    declared_columns = row_columns(configuration.scenario) or Columns(())
+    declared_columns = row_columns(definition.scenario) or Columns(())
     flags = [name for name, value in row.items() if isinstance(value, bool)]
     numbers = [name for name, value in row.items() if isinstance(value, int | float) and name not in (*flags, "case")]
 
@@ -347,27 +345,27 @@ def check_metrics(configuration: CampaignConfiguration, row: Row, directory: Pat
         is_declared = name not in row and (declared_columns.has(name, bool) or declared_columns.has(name, float))
         return is_declared or name in (numbers if kind == NUMBERS else flags)
 
-    unknown_columns = find_unknown_columns(configuration.requirements, flags, numbers, is_known)
-    problems = [Problem(configuration.name, key_text(key), message) for key, message in unknown_columns]
+    unknown_columns = find_unknown_columns(definition.requirements, flags, numbers, is_known)
+    problems = [Problem(definition.name, key_text(key), message) for key, message in unknown_columns]
     if problems:
         consequence = Problem(str(directory), "", "the campaign was stopped; its rows are stored")
-        raise ConfigurationError([*problems, consequence])
+        raise DefinitionError([*problems, consequence])
 
 
 def _rerun_for_products(run: _CampaignRun, store: RowStore, executor: Executor) -> None:
     """Run the showcase again, and the worst cases if the campaign stores their products, to store the products."""
-    configuration, table = run.campaign.configuration, run.directory / TABLE_FILE
-    showcase = find_showcase(configuration, table, store)
+    definition, table = run.campaign.definition, run.directory / TABLE_FILE
+    showcase = find_showcase(definition, table, store)
     cases = [] if showcase is None else [showcase]
-    if configuration.retain.products == "worst":
-        cases += find_worst_cases(configuration, table, configuration.retain.worst)
+    if definition.retain.products == "worst":
+        cases += find_worst_cases(definition, table, definition.retain.worst)
     if not cases:
         return
     cases = list(dict.fromkeys(cases))
     run.observer.begin("showcase", len(cases))
-    products = ProductStore(run.directory, configuration.retain.budget_gb)
+    products = ProductStore(run.directory, definition.retain.budget_gb)
     for case in cases:
-        rerun = replay_in_executor(executor, configuration, case, store.row(case), timeline=case == showcase)
+        rerun = replay_in_executor(executor, definition, case, store.row(case), timeline=case == showcase)
         if rerun.differing:
             record.update(run.directory, {"showcase_differs": list(rerun.differing)})
             run.observer.note(f"case {case}, run again, differs from its stored row in: {', '.join(rerun.differing)}")

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.campaign import Campaign, replace_value
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Retain
-from marsyard.campaigns.definition.identity import configuration_hash
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
+from marsyard.campaigns.definition.identity import definition_hash
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.engine import ProgressObserver, resume_campaign, run_campaign
@@ -49,8 +49,8 @@ def export_campaign(
     if truth.resolve().is_relative_to(directory.resolve()):
         raise CampaignError(f"--truth {truth}: is inside {directory}, which the team under test receives")
     if (truth / record.RECORD_FILE).is_file():
-        stored = record.stored_configuration(truth)
-        if configuration_hash(stored) != configuration_hash(campaign.configuration):
+        stored = record.stored_definition(truth)
+        if definition_hash(stored) != definition_hash(campaign.definition):
             raise StoreError(f"{truth} contains the truth of another export; choose other folders")
         resume_campaign(truth, executor, observer)
     else:
@@ -62,7 +62,7 @@ def export_campaign(
 
 def _write_manifest(campaign: Campaign, directory: Path) -> None:
     """Write the manifest and the README of an exported folder."""
-    task, name, cases = _find_task(campaign), campaign.configuration.name, campaign.configuration.total_cases
+    task, name, cases = _find_task(campaign), campaign.definition.name, campaign.definition.total_cases
     answer_format = task.offline
     columns = () if answer_format is None else answer_format.columns
     has_one_line = answer_format is None or answer_format.join is None
@@ -104,7 +104,7 @@ def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Camp
         raise StoreError(f"{directory} contains no finished export: {reason}") from error
     except (KeyError, TypeError, ValueError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
-    stored = record.stored_configuration(truth)
+    stored = record.stored_definition(truth)
     if record.read(truth)["state"] != "finished":
         raise CampaignError(f"{truth} is not finished: export again to continue")
     if export_identity != (stored.name, stored.total_cases):
@@ -114,18 +114,18 @@ def create_scoring_campaign(directory: Path, truth: Path, answers: Path) -> Camp
     table = export.scenario.algorithm_table if isinstance(export.scenario, HasAlgorithms) else ()
     parameters = replace_value(stored.parameters, [*table, "algorithm"], f"{ANSWERS}{answers.resolve()}")
     scoring = stored.model_copy(update={"parameters": parameters, "retain": Retain()})
-    return Campaign(CampaignConfiguration.model_validate(scoring.model_dump()), export.scenario)
+    return Campaign(CampaignDefinition.model_validate(scoring.model_dump()), export.scenario)
 
 
-def _check_answers(task: Task[Any, Any], configuration: CampaignConfiguration, answers: Path) -> None:
+def _check_answers(task: Task[Any, Any], definition: CampaignDefinition, answers: Path) -> None:
     """Raise CampaignError unless the table answers each case of the export once."""
     if task.offline is None:
-        raise CampaignError(f"{configuration.name} cannot be answered in a table")
+        raise CampaignError(f"{definition.name} cannot be answered in a table")
     try:
         answers_by_case = read_answers(answers, task.offline)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    total = configuration.total_cases
+    total = definition.total_cases
     unknown_cases = sorted(case for case in answers_by_case if case >= total)
     if unknown_cases:
         raise CampaignError(f"{answers}: unknown case {_list_first(unknown_cases)}; allowed: 0 to {total - 1}")
@@ -146,7 +146,7 @@ def _list_first(cases: Sequence[int]) -> str:
 def _find_task(campaign: Campaign) -> Task[Any, Any]:
     """Return the task of a campaign's algorithms. Raises CampaignError if the scenario has none."""
     if not isinstance(campaign.scenario, HasAlgorithms):
-        raise CampaignError(f"the scenario of {campaign.configuration.name} has no selectable algorithms")
+        raise CampaignError(f"the scenario of {campaign.definition.name} has no selectable algorithms")
     return campaign.scenario.task
 
 

@@ -19,8 +19,8 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError
 from marsyard.campaigns.execution.cases import (
     CompletedCase,
-    configuration_text,
     create_loader,
+    definition_text,
     prepare_input,
     run_cases,
     work_limits,
@@ -135,7 +135,7 @@ def _find_case_inputs(campaign: Campaign, scenario: SelectsInputs, case: int) ->
 def list_compilations(scenario: str | None = None) -> list[tuple[str, str, tuple[str, ...]]]:
     """List the campaigns that compile the kernels of a scenario's system, or of all systems.
 
-    Returns the scenario, the campaign, and the settings that make its cases small.
+    Returns the scenario, the campaign, and the overrides that make its cases small.
     """
     compilations = (
         item
@@ -143,14 +143,14 @@ def list_compilations(scenario: str | None = None) -> list[tuple[str, str, tuple
         if scenario is None or scenario in system.scenarios
         for item in system.compilation_campaigns.items()
     )
-    return [(load_campaign(name, settings).configuration.scenario, name, settings) for name, settings in compilations]
+    return [(load_campaign(name, overrides).definition.scenario, name, overrides) for name, overrides in compilations]
 
 
-def compile_campaign(name: str, settings: Sequence[str]) -> None:
+def compile_campaign(name: str, overrides: Sequence[str]) -> None:
     """Run one small case of a campaign, which compiles the kernels of its scenario."""
-    campaign = load_campaign(name, settings)
+    campaign = load_campaign(name, overrides)
     campaign.scenario.run(campaign.parameters(0), campaign.streams(0))
-    mark_ready(campaign.configuration.scenario)
+    mark_ready(campaign.definition.scenario)
 
 
 def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], None]) -> None:
@@ -173,8 +173,8 @@ def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], Non
 
 
 def _compile_item(compilations: Sequence[tuple[str, str, tuple[str, ...]]], number: int) -> None:
-    _scenario, name, settings = compilations[number]
-    compile_campaign(name, settings)
+    _scenario, name, overrides = compilations[number]
+    compile_campaign(name, overrides)
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ class CampaignEstimate:
 
 def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
     """Estimate a campaign from evenly spaced trial cases in one worker; only their shared inputs remain on disk."""
-    configuration, total = campaign.configuration, campaign.configuration.total_cases
+    definition, total = campaign.definition, campaign.definition.total_cases
     plan = plan_inputs(campaign, range(total))
     trials: list[CompletedCase] = []
     times: list[float] = []
@@ -218,14 +218,14 @@ def estimate_campaign(campaign: Campaign, jobs: int) -> CampaignEstimate:
                 break
             build_times += _build_inputs(campaign, executor, plan, case)
             case_start_s = time.monotonic()
-            ((completed,),) = run_cases(executor, configuration, [case], selection=ALL_PRODUCTS)
+            ((completed,),) = run_cases(executor, definition, [case], selection=ALL_PRODUCTS)
             trials.append(completed)
             times.append(time.monotonic() - case_start_s)
     times = times[1:] or times
     case_s, input_s = statistics.fmean(times), statistics.fmean(build_times or [0.0])
     row_bytes = statistics.fmean(len(json.dumps(list(trial.row.values()))) for trial in trials)
     product_bytes = statistics.fmean(trial.products.size if trial.products else 0 for trial in trials)
-    retain = configuration.retain
+    retain = definition.retain
     # the number of failed cases is unknown before the campaign, so the upper bound (all cases) is used
     stored_cases = {"none": 0, "worst": retain.worst, "every": -(-total // retain.every), "all": total, "failed": total}
     products = min(total, stored_cases[retain.products] + int(retain.showcase != "none")) * product_bytes
@@ -249,17 +249,17 @@ def _build_inputs(campaign: Campaign, executor: Executor, plan: InputPlan, case:
 
     If the scenario does not report the inputs of a case, only the first input is built, for case 0.
     """
-    configuration, scenario = campaign.configuration, campaign.scenario
+    definition, scenario = campaign.definition, campaign.scenario
     if isinstance(scenario, SelectsInputs):
         base, numbers = campaign.base_parameters(), _find_case_inputs(campaign, scenario, case)
         missing = [number for number in plan.to_build if number in numbers and scenario.missing_bytes(base, number)]
     else:
         missing = list(plan.to_build)[:1] if case == 0 else []
-    task = partial(prepare_input, configuration_text(configuration))
+    task = partial(prepare_input, definition_text(definition))
     times = []
     for number in missing:
         start_s = time.monotonic()
-        limits = work_limits(configuration.limits, configuration.limits.prepare_time_s)
-        list(executor.run(Work(task, [number], limits, load=create_loader(configuration))))
+        limits = work_limits(definition.limits, definition.limits.prepare_time_s)
+        list(executor.run(Work(task, [number], limits, load=create_loader(definition))))
         times.append(time.monotonic() - start_s)
     return times

@@ -10,9 +10,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, key_text, validation_problems
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, key_text, validation_problems
 from marsyard.campaigns.definition.identity import Identity, create_identity
-from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, ConfigurationError, Problem, WorkerExitError
+from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, DefinitionError, Problem, WorkerExitError
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.worker_process import Executor, Work, WorkLimits, accept_process_state
 from marsyard.campaigns.execution.workers import LocalExecutor
@@ -35,7 +35,7 @@ class Replay:
     - differing: columns in which the two rows differ, except those with `time` in their name
     - products: products for figures; None if the scenario returned none, or none that can be stored
     - note: reason why there are no products; empty without a problem
-    - changed: differences in configuration, code and package versions from the stored campaign
+    - changed: differences in definition, code and package versions from the stored campaign
     """
 
     case: int
@@ -59,22 +59,22 @@ def replay(directory: Path, case: int) -> Replay:
     Raises CampaignError if the folder contains no campaign, the case does not exist, or the scenario or an algorithm
     cannot be imported.
     """
-    configuration = record.stored_configuration(directory)
-    if not 0 <= case < configuration.total_cases:
-        raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {configuration.total_cases - 1}")
-    load_stored_campaign(directory, configuration)
+    definition = record.stored_definition(directory)
+    if not 0 <= case < definition.total_cases:
+        raise CampaignError(f"{directory} has no case {case}; allowed: 0 to {definition.total_cases - 1}")
+    load_stored_campaign(directory, definition)
     check_rows(directory)
     stored = stored_row(directory, case)
-    changed = Identity.read(record.read(directory)["identity"]).differences(create_identity(configuration))
-    if stored is None and configuration.design.kind == ADAPTIVE:
+    changed = Identity.read(record.read(directory)["identity"]).differences(create_identity(definition))
+    if stored is None and definition.design.kind == ADAPTIVE:
         raise CampaignError(f"{directory}: the study has not run case {case}")
     with LocalExecutor(1) as workers:
-        return replay_in_executor(workers, configuration, case, stored, tuple(changed))
+        return replay_in_executor(workers, definition, case, stored, tuple(changed))
 
 
 def replay_in_executor(
     executor: Executor,
-    configuration: CampaignConfiguration,
+    definition: CampaignDefinition,
     case: int,
     stored: Row | None,
     changed: tuple[str, ...] = (),
@@ -88,7 +88,7 @@ def replay_in_executor(
     text = None if stored is None else stored.get(POINT_COLUMN)
     points = {case: StudyPoint.read(text)} if isinstance(text, str) else {}
     selection = REPLAYED_PRODUCTS if timeline else ALL_PRODUCTS
-    ((completed,),) = run_cases(executor, configuration, [case], selection=selection, points=points)
+    ((completed,),) = run_cases(executor, definition, [case], selection=selection, points=points)
     differing = differing_columns(completed.row, stored) if stored is not None else ()
     return Replay(case, completed.row, stored, differing, completed.products, completed.note, changed)
 
@@ -108,15 +108,15 @@ def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
     return tuple(differing)
 
 
-def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) -> Campaign:
-    """Create the campaign of a stored configuration; imports its scenario and algorithms.
+def load_stored_campaign(directory: Path, definition: CampaignDefinition) -> Campaign:
+    """Create the campaign of a stored definition; imports its scenario and algorithms.
 
-    Raises CampaignError if the folder was created elsewhere and names code, and ConfigurationError if the scenario or
+    Raises CampaignError if the folder was created elsewhere and names code, and DefinitionError if the scenario or
     an algorithm cannot be imported, or a parameter is invalid.
     """
-    check_origin(directory, configuration)
+    check_origin(directory, definition)
     try:
-        campaign = Campaign(configuration, scenario(configuration.scenario))
+        campaign = Campaign(definition, scenario(definition.scenario))
         campaign.base_parameters()
     except (UnknownScenarioError, ValidationError) as error:
         problems = [("scenario", str(error))]
@@ -125,7 +125,7 @@ def load_stored_campaign(directory: Path, configuration: CampaignConfiguration) 
             problems = [(key_text(("parameters", *key)), message) for key, message in errors]
         hint = "custom modules are imported from the current folder: start the command in the campaign's first folder"
         problems.append(("", f"nothing was run or changed; {hint}"))
-        raise ConfigurationError([Problem(str(directory), *problem) for problem in problems]) from error
+        raise DefinitionError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign
 
 

@@ -77,8 +77,8 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
         if stored["state"] != SHARD_STATE:
             raise CampaignError(f"{directory} is not finished ({stored['state']}): marsyard resume {directory}")
         changes = identity.differences(Identity.read(stored["identity"]))
-        if stored["configuration"] != first["configuration"]:
-            changes.insert(0, "the configuration")
+        if stored["definition"] != first["definition"]:
+            changes.insert(0, "the definition")
         if changes:
             raise CampaignError(
                 f"{directory} and {directories[0]} differ in {', '.join(changes)}: rows cannot be merged"
@@ -96,7 +96,7 @@ def merge_shards(directories: Sequence[Path], target: Path) -> None:
     for directory in directories:
         check_rows(directory)
     with create_folder(target) as folder:
-        create_store(folder / ROWS_FILE, {"identity": identity.configuration})
+        create_store(folder / ROWS_FILE, {"identity": identity.definition})
         with RowStore(folder / ROWS_FILE) as store:
             for directory in directories:
                 _copy_rows(directory, store)

@@ -22,6 +22,7 @@ from typing import IO, Any
 
 from marsyard.campaigns.definition.campaign import Campaign, find_value, replace_values
 from marsyard.campaigns.definition.claims import (
+    DEFINITION,
     FrozenAlgorithm,
     bank_seeds,
     calibration_overlap,
@@ -185,7 +186,7 @@ def _derive_seeds(campaign: Campaign, claim: str, record: ConfirmationRecord) ->
         entry = entries[-1]
         return _Seeds(entry.number, entry.seed, entry.bank_seeds, entry)
     head = entries[-1].head if entries else ""
-    banks = confirmation_bank_seeds(campaign.configuration, claim, head)
+    banks = confirmation_bank_seeds(campaign.definition, claim, head)
     return _Seeds(len(entries) + 1, confirmation_seed(claim, head), banks)
 
 
@@ -195,19 +196,19 @@ def select_confirmation_seed(campaign: Campaign) -> Campaign:
     Raises StoreError if the record is invalid, and CampaignError if custom algorithms would run inside of the workers.
     """
     table = campaign.scenario.algorithm_table if isinstance(campaign.scenario, HasAlgorithms) else ()
-    if find_value(campaign.configuration.parameters, ".".join((*table, "executable", "isolated"))) is False:
+    if find_value(campaign.definition.parameters, ".".join((*table, "executable", "isolated"))) is False:
         raise CampaignError(
             "executable.isolated is false; allowed in a confirmation: true, so that no algorithm can reach the truth"
         )
     seeds = _derive_seeds(campaign, freeze_algorithm(campaign).claim, read_record(campaign.confirmations))
-    parameters = replace_values(campaign.configuration.parameters, seeds.bank_seeds)
-    configuration = campaign.configuration.model_copy(update={"seed": seeds.seed, "parameters": parameters})
-    overlap = calibration_overlap(replace(campaign, configuration=configuration), bank_seeds(campaign.configuration))
+    parameters = replace_values(campaign.definition.parameters, seeds.bank_seeds)
+    definition = campaign.definition.model_copy(update={"seed": seeds.seed, "parameters": parameters})
+    overlap = calibration_overlap(replace(campaign, definition=definition), bank_seeds(campaign.definition))
     command = campaign.command
     if command:
-        settings = (word for path, seed in seeds.bank_seeds.items() for word in ("--set", f"{path}={seed}"))
-        command = (*command, "--seed", str(seeds.seed), *settings)
-    return replace(campaign, configuration=configuration, command=command, confirms=True, calibration_overlap=overlap)
+        overrides = (word for path, seed in seeds.bank_seeds.items() for word in ("--set", f"{path}={seed}"))
+        command = (*command, "--seed", str(seeds.seed), *overrides)
+    return replace(campaign, definition=definition, command=command, confirms=True, calibration_overlap=overlap)
 
 
 def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
@@ -216,26 +217,26 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
     Raises StoreError if the record is invalid or not writable, or another run has taken the seed in the meantime, and
     CampaignError if the run repeats an unfinished confirmation with another number of cases.
     """
-    path, frozen, configuration = campaign.confirmations, freeze_algorithm(campaign), campaign.configuration
+    path, frozen, definition = campaign.confirmations, freeze_algorithm(campaign), campaign.definition
     registration = find_registration_problem(path) or find_campaign_file_problem(path, campaign.command)
     with _open_locked(path) as file:
         record = _start_chain(file, path)
         seeds = _derive_seeds(campaign, frozen.claim, record)
-        if seeds.seed != configuration.seed:
-            raise StoreError(f"{path}: another confirmation has taken the seed {configuration.seed}; run again")
+        if seeds.seed != definition.seed:
+            raise StoreError(f"{path}: another confirmation has taken the seed {definition.seed}; run again")
         if seeds.resumed is None:
             entry = {
-                "campaign": configuration.name,
+                "campaign": definition.name,
                 "claim": frozen.claim,
                 "number": seeds.number,
                 "seed": seeds.seed,
                 "bank_seeds": dict(seeds.bank_seeds),
-                "cases": configuration.total_cases,
-                "first_cases": configuration.cases,
-                "max_cases": configuration.max_cases,
+                "cases": definition.total_cases,
+                "first_cases": definition.cases,
+                "max_cases": definition.max_cases,
                 "overlap": campaign.calibration_overlap,
                 "requirements": {
-                    requirement_key(item.model_dump(mode="json")): item.id for item in configuration.requirements
+                    requirement_key(item.model_dump(mode="json")): item.id for item in definition.requirements
                 },
                 "folder": directory.name,
                 "started_utc": utc_now(),
@@ -244,7 +245,7 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
             }
             _append(file, "start", entry, record.head)
         else:
-            _check_repetition(configuration.total_cases, configuration.max_cases, seeds.resumed)
+            _check_repetition(definition.total_cases, definition.max_cases, seeds.resumed)
     return Evidence(
         EvidenceKind.CONFIRMATION,
         seeds.number,
@@ -347,7 +348,7 @@ def list_related_claims(record: ConfirmationRecord, own: Sequence[Confirmation])
 
     - own: the confirmations of the claim
 
-    Another claim is related by the name of the campaign, the algorithm, the content of its configuration, or a
+    Another claim is related by the name of the campaign, the algorithm, the content of its definition, or a
     requirement.
     """
     entries = record.confirmations
@@ -368,6 +369,6 @@ def list_related_claims(record: ConfirmationRecord, own: Sequence[Confirmation])
 
 
 def is_variant(entry: Confirmation, other: Confirmation) -> bool:
-    """Whether two claims are about the same campaign: by its name, or by the content of its configuration."""
-    own_content, other_content = (item.frozen.hashes.get("configuration") for item in (entry, other))
+    """Whether two claims are about the same campaign: by its name, or by the content of its definition."""
+    own_content, other_content = (item.frozen.hashes.get(DEFINITION) for item in (entry, other))
     return entry.campaign == other.campaign or own_content == other_content

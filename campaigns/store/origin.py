@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import custom_sources, hash_sources, list_algorithms, list_parts
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
@@ -21,20 +21,20 @@ from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, readable_store
 from marsyard.scenarios.imports import search_current_folder
 from marsyard.scenarios.offline import is_offline
 
-#: Keys of a configuration that can name code.
+#: Keys of a definition that can name code.
 _KEYS = {"scenario", "parameters", "dispersions"}
 
 
-def describe_origin(configuration: CampaignConfiguration) -> dict[str, Any]:
+def describe_origin(definition: CampaignDefinition) -> dict[str, Any]:
     """Create the origin for the record of a new campaign: hashes of the code that it names, and the signature."""
-    names = [*([configuration.scenario] if ":" in configuration.scenario else []), *_list_names(configuration)]
-    return {"code": _hash_code(names), "signature": _sign(configuration)}
+    names = [*([definition.scenario] if ":" in definition.scenario else []), *_list_names(definition)]
+    return {"code": _hash_code(names), "signature": _sign(definition)}
 
 
-def check_origin(directory: Path, configuration: CampaignConfiguration) -> None:
+def check_origin(directory: Path, definition: CampaignDefinition) -> None:
     """Raise CampaignError if a folder that was created elsewhere names code; nothing is executed."""
-    names = _list_code(configuration)
-    if names and not _is_own(directory, configuration):
+    names = _list_code(definition)
+    if names and not _is_own(directory, definition):
         raise CampaignError(
             f"{directory} was created or changed elsewhere, and this command would execute code that it names: "
             f"{', '.join(names)}. Nothing was executed. If you trust this code: --trust"
@@ -62,11 +62,11 @@ def check_rows(directory: Path) -> str:
 
 def adopt(directory: Path) -> None:
     """Accept a folder that was created elsewhere. Raises CampaignError if its code is not the recorded one."""
-    configuration, origin = record.stored_configuration(directory), _read_origin(directory)
+    definition, origin = record.stored_definition(directory), _read_origin(directory)
     recorded = origin.get("code")
     names = dict(recorded) if isinstance(recorded, dict) else {}
     changed = [name for name, digest in _hash_code(list(names)).items() if digest != names[name]]
-    if changed or not names.keys() >= set(_list_code(configuration)):
+    if changed or not names.keys() >= set(_list_code(definition)):
         raise CampaignError(
             f"--trust: the code here is not the code that {directory} recorded: {', '.join(changed) or 'none'}"
         )
@@ -74,30 +74,30 @@ def adopt(directory: Path) -> None:
         with RowStore(directory / ROWS_FILE) as store:
             store.verify()
             store.sign()
-    record.update(directory, {"origin": {**origin, "signature": _sign(configuration)}})
+    record.update(directory, {"origin": {**origin, "signature": _sign(definition)}})
 
 
-def _list_code(configuration: CampaignConfiguration) -> list[str]:
-    """List all code that a configuration names; only a custom scenario knows which of its parameters name code."""
-    return [configuration.scenario] if ":" in configuration.scenario else _list_names(configuration)
+def _list_code(definition: CampaignDefinition) -> list[str]:
+    """List all code that a definition names; only a custom scenario knows which of its parameters name code."""
+    return [definition.scenario] if ":" in definition.scenario else _list_names(definition)
 
 
 def _is_own_folder(directory: Path) -> bool:
     """Whether this user created a folder; False if its record is damaged."""
     try:
-        return _is_own(directory, record.stored_configuration(directory))
+        return _is_own(directory, record.stored_definition(directory))
     except StoreError:
         return False
 
 
-def _is_own(directory: Path, configuration: CampaignConfiguration) -> bool:
-    """Whether this user created or adopted a folder with a configuration."""
-    return is_signature(str(_read_origin(directory).get("signature")), _signed_content(configuration))
+def _is_own(directory: Path, definition: CampaignDefinition) -> bool:
+    """Whether this user created or adopted a folder with a definition."""
+    return is_signature(str(_read_origin(directory).get("signature")), _signed_content(definition))
 
 
-def _list_names(configuration: CampaignConfiguration) -> list[str]:
+def _list_names(definition: CampaignDefinition) -> list[str]:
     """List the algorithms and parts that are not installed: ``module:name``, ``FILE.pkl:name`` and programs."""
-    names = (*list_algorithms(configuration), *list_parts(configuration))
+    names = (*list_algorithms(definition), *list_parts(definition))
     return [name for name in names if ":" in name and not name.startswith("marsyard.") and not is_offline(name)]
 
 
@@ -112,10 +112,10 @@ def _read_origin(directory: Path) -> dict[str, Any]:
     return origin if isinstance(origin, dict) else {}
 
 
-def _sign(configuration: CampaignConfiguration) -> str:
-    return sign(_signed_content(configuration))
+def _sign(definition: CampaignDefinition) -> str:
+    return sign(_signed_content(definition))
 
 
-def _signed_content(configuration: CampaignConfiguration) -> bytes:
-    """Return everything in a configuration that can name code."""
-    return json.dumps(configuration.model_dump(mode="json", include=_KEYS), sort_keys=True).encode()
+def _signed_content(definition: CampaignDefinition) -> bytes:
+    """Return everything in a definition that can name code."""
+    return json.dumps(definition.model_dump(mode="json", include=_KEYS), sort_keys=True).encode()

@@ -18,7 +18,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.lock import partial_suffix
@@ -176,15 +176,15 @@ ALL_PRODUCTS = ProductSelection(every=1)
 REPLAYED_PRODUCTS = ProductSelection(every=1, timelines=True)
 
 
-def create_product_selection(configuration: CampaignConfiguration) -> ProductSelection:
+def create_product_selection(definition: CampaignDefinition) -> ProductSelection:
     """Create the selection for a campaign's first run of its cases; the worst cases run again at the end."""
-    retain = configuration.retain
+    retain = definition.retain
     if retain.products == "all":
         return ALL_PRODUCTS
     if retain.products == "every":
         return ProductSelection(every=retain.every)
     if retain.products == "failed":
-        return ProductSelection(requirements=configuration.requirements)
+        return ProductSelection(requirements=definition.requirements)
     return ProductSelection()
 
 

@@ -1,4 +1,4 @@
-"""Record `campaign.json` of a campaign's folder (configuration, program, machine, progress)."""
+"""Record `campaign.json` of a campaign's folder (definition, program, machine, progress)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.store.lock import replace_file
@@ -33,7 +33,7 @@ _KEY_TYPES: Mapping[str, tuple[type, str]] = {
     **dict.fromkeys(("name", "state"), (str, "a text")),
     **dict.fromkeys(("cases", "cases_finished", "cases_crashed"), (int, "a whole number")),
     **dict.fromkeys(("requirements", "sessions", "changes"), (list, "a list")),
-    **dict.fromkeys(("configuration", "identity", "environment"), (dict, "a table")),
+    **dict.fromkeys(("definition", "identity", "environment"), (dict, "a table")),
 }
 
 
@@ -72,7 +72,7 @@ def claim_folder(directory: Path) -> None:
 
 def write_first_record(
     directory: Path,
-    configuration: CampaignConfiguration,
+    definition: CampaignDefinition,
     identity: Identity,
     executor: str,
     *,
@@ -89,22 +89,22 @@ def write_first_record(
     - evidence: see `marsyard.campaigns.definition.evidence.Evidence`
     - origin: see `marsyard.campaigns.store.origin`
     """
-    contents = configuration.model_dump(mode="json")
+    contents = definition.model_dump(mode="json")
     write(
         directory,
         {
             "schema": SCHEMA,
-            "name": configuration.name,
+            "name": definition.name,
             "state": "running",
             "exit_code": None,
             "started_utc": utc_now(),
             "finished_utc": None,
-            "cases": configuration.total_cases,
+            "cases": definition.total_cases,
             "cases_finished": 0,
             "cases_crashed": 0,
-            "seed": configuration.seed,
+            "seed": definition.seed,
             "requirements": contents["requirements"],
-            "configuration": contents,
+            "definition": contents,
             "identity": asdict(identity),
             "command": {"words": [*map(hide_folders, command)], "folder": hide_folders(str(Path.cwd()))}
             if command
@@ -181,8 +181,8 @@ def read(directory: Path) -> dict[str, Any]:
     if not problems:
         identity, sessions = record["identity"], record["sessions"]
         has_tables = all(isinstance(identity.get(key), dict) for key in ("versions", "inputs"))
-        if not has_tables or not {"configuration", "code"} <= set(identity):
-            problems.append("identity has no configuration, code, versions or inputs")
+        if not has_tables or not {"definition", "code"} <= set(identity):
+            problems.append("identity has no definition, code, versions or inputs")
         if not sessions or not isinstance(sessions[-1], dict):
             problems.append("sessions is empty")
     if problems:
@@ -190,10 +190,10 @@ def read(directory: Path) -> dict[str, Any]:
     return record
 
 
-def stored_configuration(directory: Path) -> CampaignConfiguration:
-    """Read the configuration of a stored campaign. Raises StoreError if the record is missing or damaged."""
+def stored_definition(directory: Path) -> CampaignDefinition:
+    """Read the definition of a stored campaign. Raises StoreError if the record is missing or damaged."""
     try:
-        return CampaignConfiguration.model_validate(read(directory)["configuration"])
+        return CampaignDefinition.model_validate(read(directory)["definition"])
     except (ValueError, KeyError) as error:
         raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
 

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, Requirement
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.origin import check_rows
-from marsyard.campaigns.store.record import stored_configuration
+from marsyard.campaigns.store.record import stored_definition
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
 from marsyard.sim.files import report_damage
 
@@ -154,7 +154,7 @@ def refresh_table(directory: Path) -> None:
     """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
         return  # a folder of which only the table was copied
-    requirements = stored_configuration(directory).requirements
+    requirements = stored_definition(directory).requirements
     check_rows(directory)
     with RowStore(directory / ROWS_FILE) as store:
         write_table(directory / TABLE_FILE, store, numeric_metrics(requirements))
@@ -174,18 +174,18 @@ def stored_row(directory: Path, case: int) -> Row | None:
     return next(iter(read_rows(table, case)), None) if table.exists() else None
 
 
-def find_showcase(configuration: CampaignConfiguration, table: Path, store: RowStore) -> int | None:
+def find_showcase(definition: CampaignDefinition, table: Path, store: RowStore) -> int | None:
     """Select the case that the report shows; None if the campaign requests none, or no case is finished."""
-    if configuration.retain.showcase == "none":
+    if definition.retain.showcase == "none":
         return None
-    worst = find_worst_cases(configuration, table, 1) if configuration.retain.showcase == "worst" else []
+    worst = find_worst_cases(definition, table, 1) if definition.retain.showcase == "worst" else []
     return worst[0] if worst else store.find_first_finished_case()
 
 
-def find_worst_cases(configuration: CampaignConfiguration, table: Path, number: int) -> list[int]:
+def find_worst_cases(definition: CampaignDefinition, table: Path, number: int) -> list[int]:
     """List the answered cases with the largest metric of the first requirement with a single column, worst first."""
     # metrics that are sums of columns are computation times, which are not suitable to rank cases
-    ranking = (item for item in configuration.requirements if item.bound is not None and len(item.metric_columns) == 1)
+    ranking = (item for item in definition.requirements if item.bound is not None and len(item.metric_columns) == 1)
     metric = next((item.metric for item in ranking), None)
     if metric is None:
         return []

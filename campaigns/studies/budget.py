@@ -19,7 +19,7 @@ from SALib.sample import sobol as sobol_design
 from scipy.special import ndtri
 
 from marsyard.campaigns.definition.campaign import Campaign, value_at
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -41,7 +41,7 @@ from marsyard.campaigns.studies.runner import (
 from marsyard.scenarios.error_sources import ScenarioSource, error_sources
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the settings of this study.
+#: Value of the key `kind` in the parameters of this study.
 KIND = "budget"
 #: Name of the variable of the random streams among Sobol's indices.
 STREAMS = "random streams"
@@ -50,11 +50,11 @@ _BATCH = 8
 
 
 @dataclass(frozen=True)
-class BudgetSettings:
-    """Settings of the study.
+class BudgetParameters:
+    """Parameters of the study.
 
     - requirement: id of the requirement whose metric is the error; without a bound, its margin is used
-    - cases: number of base cases; each runs once per configuration
+    - cases: number of base cases; each runs once per variant
     - sobol: base samples of Saltelli's design, a power of 2; 0: no indices
     - confidence: two-sided confidence of the intervals
     """
@@ -77,8 +77,8 @@ class BudgetSettings:
 
 
 @dataclass(frozen=True)
-class Configuration:
-    """A configuration of the base cases: the sources of error that act in them.
+class Variant:
+    """A variant of the base cases: the sources of error that act in them.
 
     - name: `all`, `none`, `without SOURCE`, or `only SOURCE`; removed: names of the sources that do not act
     """
@@ -129,28 +129,32 @@ class BudgetResult:
 
 
 def start_budget(
-    campaign: Campaign, settings: BudgetSettings, directory: Path, executor: ExecutorConfig, observer: ProgressObserver
+    campaign: Campaign,
+    parameters: BudgetParameters,
+    directory: Path,
+    executor: ExecutorConfig,
+    observer: ProgressObserver,
 ) -> BudgetResult:
     """Run the study in a new folder.
 
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
     stored, and `continue_budget` continues.
     """
-    check_margin(find_requirement(campaign, settings.requirement))
+    check_margin(find_requirement(campaign, parameters.requirement))
     sources, _ = active_sources(campaign)
-    if not sources and not settings.sobol:
-        scenario = campaign.configuration.scenario
+    if not sources and not parameters.sobol:
+        scenario = campaign.definition.scenario
         reason = "has no active source of error"
         if not error_sources(scenario):
             reason = f"has the scenario '{scenario}', which names no sources of error"
-        raise CampaignError(f"campaign '{campaign.configuration.name}' {reason}; allowed: --sobol N")
+        raise CampaignError(f"campaign '{campaign.definition.name}' {reason}; allowed: --sobol N")
     # Saltelli's design has d + 2 cases per base sample for d variables: the dispersions and the random streams
-    n_cases = settings.cases * len(list_configurations(sources)) if sources else 0
-    n_cases += settings.sobol * (len(campaign.drawn_paths) + 3) if settings.sobol else 0
+    n_cases = parameters.cases * len(list_variants(sources)) if sources else 0
+    n_cases += parameters.sobol * (len(campaign.drawn_paths) + 3) if parameters.sobol else 0
     session = StudySession(
-        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, parameters, runner).run(observer)
     )
-    return start_study(campaign, n_cases, directory, session, {"kind": KIND, **asdict(settings)})
+    return start_study(campaign, n_cases, directory, session, {"kind": KIND, **asdict(parameters)})
 
 
 def continue_budget(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> BudgetResult:
@@ -158,11 +162,11 @@ def continue_budget(directory: Path, executor: ExecutorConfig, observer: Progres
     study = read_study(directory) or {}
     if study.get("kind") != KIND:
         raise CampaignError(f"{directory} does not contain an error budget (marsyard budget)")
-    settings = BudgetSettings(**{name: study[name] for name in BudgetSettings.__dataclass_fields__})
+    parameters = BudgetParameters(**{name: study[name] for name in BudgetParameters.__dataclass_fields__})
     session = StudySession(
-        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, parameters, runner).run(observer)
     )
-    return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
+    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)})
 
 
 def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:
@@ -170,10 +174,10 @@ def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tupl
 
     A source acts if one of its parameters is dispersed, or differs from its value without the error.
     """
-    parameters, dispersed = campaign.configuration.parameters, campaign.configuration.dispersions
+    parameters, dispersed = campaign.definition.parameters, campaign.definition.dispersions
     active: list[ScenarioSource] = []
     inactive: list[str] = []
-    for source in error_sources(campaign.configuration.scenario):
+    for source in error_sources(campaign.definition.scenario):
         exact = source.exact_values(parameters)
         is_active = any(path in dispersed or value_at(parameters, path) != value for path, value in exact.items())
         if is_active:
@@ -183,49 +187,49 @@ def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tupl
     return tuple(active), tuple(inactive)
 
 
-def list_configurations(sources: Sequence[ScenarioSource]) -> list[Configuration]:
-    """List the configurations of an error budget: all sources, none, without each one, and each one alone."""
+def list_variants(sources: Sequence[ScenarioSource]) -> list[Variant]:
+    """List the variants of an error budget: all sources, none, without each one, and each one alone."""
     names = tuple(source.name for source in sources)
     return [
-        Configuration("all", ()),
-        Configuration("none", names),
-        *(Configuration(f"without {name}", (name,)) for name in names),
-        *(Configuration(f"only {name}", tuple(other for other in names if other != name)) for name in names),
+        Variant("all", ()),
+        Variant("none", names),
+        *(Variant(f"without {name}", (name,)) for name in names),
+        *(Variant(f"only {name}", tuple(other for other in names if other != name)) for name in names),
     ]
 
 
 class _BudgetStudy:
     """A running error budget."""
 
-    def __init__(self, campaign: Campaign, settings: BudgetSettings, runner: PointRunner) -> None:
-        self._campaign, self._settings, self._runner = campaign, settings, runner
-        self._requirement: Requirement = find_requirement(campaign, settings.requirement)
+    def __init__(self, campaign: Campaign, parameters: BudgetParameters, runner: PointRunner) -> None:
+        self._campaign, self._parameters, self._runner = campaign, parameters, runner
+        self._requirement: Requirement = find_requirement(campaign, parameters.requirement)
         self._sources, self._inactive = active_sources(campaign)
 
     def run(self, observer: ProgressObserver) -> BudgetResult:
-        """Evaluate all configurations and Saltelli's design; compute contributions and indices."""
-        settings = self._settings
-        configurations = list_configurations(self._sources) if self._sources else []
-        n = len(configurations)
-        errors = np.full((n, settings.cases), np.nan)
-        groups = np.arange(settings.cases)
+        """Evaluate all variants and Saltelli's design; compute contributions and indices."""
+        parameters = self._parameters
+        variants = list_variants(self._sources) if self._sources else []
+        n = len(variants)
+        errors = np.full((n, parameters.cases), np.nan)
+        groups = np.arange(parameters.cases)
         violations, reason, index_samples = 0, "", 0
         indices: tuple[SobolIndex, ...] = ()
         try:
             if n:
-                observer.begin("cases", n * settings.cases)
-                errors, groups, violations = self._run_configurations(configurations)
-            if settings.sobol:
-                observer.begin("cases of Saltelli's design", settings.sobol * (len(self._campaign.drawn_paths) + 3))
+                observer.begin("cases", n * parameters.cases)
+                errors, groups, violations = self._run_variants(variants)
+            if parameters.sobol:
+                observer.begin("cases of Saltelli's design", parameters.sobol * (len(self._campaign.drawn_paths) + 3))
                 indices, index_samples = self._run_design()
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
         budget = compute_budget(
-            errors, groups, [item.source for item in self._sources], self._is_centred, settings.confidence
+            errors, groups, [item.source for item in self._sources], self._is_centred, parameters.confidence
         )
         if budget is None and n and not reason:
             reason = (
-                f"No budget: fewer than {MIN_COMMON} base cases were answered in every configuration, all are on one "
+                f"No budget: fewer than {MIN_COMMON} base cases were answered in every variant, all are on one "
                 "terrain, or all errors are equal."
             )
         return BudgetResult(
@@ -233,7 +237,7 @@ class _BudgetStudy:
             self._is_centred,
             self._inactive,
             budget,
-            settings.cases if n else 0,
+            parameters.cases if n else 0,
             violations,
             indices,
             index_samples,
@@ -259,29 +263,27 @@ class _BudgetStudy:
 
     def _generator(self, name: str) -> np.random.Generator:
         """Create a random generator of the study, which does not depend on the cases."""
-        configuration = self._campaign.configuration
-        return Streams(configuration.seed, configuration.name, 0).generator(f"budget: {name}")
+        variant = self._campaign.definition
+        return Streams(variant.seed, variant.name, 0).generator(f"budget: {name}")
 
-    def _run_configurations(
-        self, configurations: Sequence[Configuration]
-    ) -> tuple[Float64[np.ndarray, "configurations n"], np.ndarray, int]:
-        """Evaluate the base cases in all configurations; return errors, terrain groups, and number of violations."""
-        n, dimension = self._settings.cases, len(self._campaign.drawn_paths)
+    def _run_variants(self, variants: Sequence[Variant]) -> tuple[Float64[np.ndarray, "variants n"], np.ndarray, int]:
+        """Evaluate the base cases in all variants; return errors, terrain groups, and number of violations."""
+        n, dimension = self._parameters.cases, len(self._campaign.drawn_paths)
         points = self._generator("base cases").standard_normal((n, dimension))
-        errors = np.full((len(configurations), n), np.nan)
+        errors = np.full((len(variants), n), np.nan)
         terrains: list[str] = []
         violations = 0
         for first in range(0, n, _BATCH):
             cases = range(first, min(first + _BATCH, n))
             candidates = [
-                Candidate(tuple(points[case].tolist()), case, (), configuration.removed)
+                Candidate(tuple(points[case].tolist()), case, (), variant.removed)
                 for case in cases
-                for configuration in configurations
+                for variant in variants
             ]
             rows = self._runner.run(candidates)
             errors[:, list(cases)] = np.reshape([self._error(row) for row in rows], (len(cases), -1)).T
-            # the first configuration is that with all sources
-            rows_all_sources = rows[:: len(configurations)]
+            # the first variant is that with all sources
+            rows_all_sources = rows[:: len(variants)]
             violations += sum(compute_margin(row, self._requirement) < 0.0 for row in rows_all_sources)
             names = [str(row.get("terrain", f"case {case}")) for case, row in zip(cases, rows_all_sources, strict=True)]
             terrains += names
@@ -295,7 +297,7 @@ class _BudgetStudy:
         paths = [*self._campaign.drawn_paths, STREAMS]
         problem = {"num_vars": len(paths), "names": paths, "bounds": [[0.0, 1.0]] * len(paths)}
         seed = int(self._generator("Saltelli's design").integers(2**31))
-        uniform = sobol_design.sample(problem, self._settings.sobol, calc_second_order=False, seed=seed)
+        uniform = sobol_design.sample(problem, self._parameters.sobol, calc_second_order=False, seed=seed)
         coordinates = ndtri(np.clip(uniform[:, :-1], MIN_DRAW, MAX_DRAW))
         streams = np.minimum(uniform[:, -1] * 2.0**31, 2.0**31 - 1.0).astype(np.int64)
         errors: list[float] = []
@@ -304,7 +306,7 @@ class _BudgetStudy:
             cases = range(first, first + block)
             rows = self._runner.run([Candidate(tuple(coordinates[i].tolist()), int(streams[i])) for i in cases])
             errors += [self._error(row) for row in rows]
-        return compute_indices(np.array(errors), problem, self._settings.confidence, seed)
+        return compute_indices(np.array(errors), problem, self._parameters.confidence, seed)
 
 
 def compute_indices(

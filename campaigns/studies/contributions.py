@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 from marsyard.campaigns.studies.bootstrap import studentized_intervals
 from marsyard.sim.error_sources import ErrorSource
 
-#: Minimum number of base cases whose error has a value in all configurations.
+#: Minimum number of base cases whose error has a value in all variants.
 MIN_COMMON = 10
 
 
@@ -40,7 +40,7 @@ class Contribution:
 
 @dataclass(frozen=True)
 class Budget:
-    """An error budget: mean squares of the error over the base cases whose error has a value in all configurations.
+    """An error budget: mean squares of the error over the base cases whose error has a value in all variants.
 
     - contributions: one per source, the largest first
     - total, total_lower, total_upper: mean square with all sources, and bounds of its interval
@@ -61,19 +61,19 @@ class Budget:
 
 
 def compute_budget(
-    errors: Float64[np.ndarray, "configurations n"],
+    errors: Float64[np.ndarray, "variants n"],
     groups: np.ndarray,
     sources: Sequence[ErrorSource],
     is_centred: bool,
     confidence: float,
 ) -> Budget | None:
-    """Compute the contributions from the base cases whose error has a value in all configurations.
+    """Compute the contributions from the base cases whose error has a value in all variants.
 
     None for too few of these cases, for one group, or if all errors are equal. The intervals are those of
     `studentized_intervals`; groups of cases (terrains) are resampled.
 
-    - errors: error of each case in each configuration, in the order of
-      `marsyard.campaigns.studies.budget.list_configurations`; NaN without a value
+    - errors: error of each case in each variant, in the order of
+      `marsyard.campaigns.studies.budget.list_variants`; NaN without a value
     - groups: number of the group of each case
     """
     has_error = np.isfinite(errors)
@@ -126,18 +126,18 @@ def compute_budget(
 
 @dataclass(frozen=True)
 class _MeanSquares:
-    """Sums of the errors and their squares over groups of cases, for each configuration; sizes of the groups.
+    """Sums of the errors and their squares over groups of cases, for each variant; sizes of the groups.
 
     If mean squares are not centred (`BudgetResult.centred`), the sums of the errors are 0.
     """
 
-    sums: Float64[np.ndarray, "groups configurations"]
-    squares: Float64[np.ndarray, "groups configurations"]
+    sums: Float64[np.ndarray, "groups variants"]
+    squares: Float64[np.ndarray, "groups variants"]
     sizes: Float64[np.ndarray, " groups"]
 
     @classmethod
     def from_errors(
-        cls, errors: Float64[np.ndarray, "configurations n"], groups: np.ndarray, is_centred: bool
+        cls, errors: Float64[np.ndarray, "variants n"], groups: np.ndarray, is_centred: bool
     ) -> _MeanSquares:
         """Sum errors over groups of cases."""
         number = np.unique(groups, return_inverse=True)[1]
@@ -146,7 +146,7 @@ class _MeanSquares:
 
     def evaluate(
         self, weights: Float64[np.ndarray, " groups"]
-    ) -> tuple[Float64[np.ndarray, " configurations"], Float64[np.ndarray, "groups configurations"]]:
+    ) -> tuple[Float64[np.ndarray, " variants"], Float64[np.ndarray, "groups variants"]]:
         """Compute the mean squares for the weights of the groups, and their change by each group (influence)."""
         n = weights @ self.sizes
         means, squares = weights @ self.sums / n, weights @ self.squares / n
@@ -157,7 +157,7 @@ class _MeanSquares:
 
 def _combine(
     mean_squares: _MeanSquares,
-    combinations: Float64[np.ndarray, "outputs configurations"],
+    combinations: Float64[np.ndarray, "outputs variants"],
     weights: Float64[np.ndarray, " groups"],
 ) -> tuple[Float64[np.ndarray, " outputs"], Float64[np.ndarray, " outputs"]]:
     """Compute combinations of mean squares with their standard errors (linearisation).

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -39,7 +39,7 @@ from marsyard.campaigns.studies.subset import (
 )
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the settings of this study.
+#: Value of the key `kind` in the parameters of this study.
 KIND = "rare"
 #: Subset simulation alone, or with importance sampling around the violations that it found.
 METHODS = ("subset", "importance")
@@ -50,8 +50,8 @@ _IMPORTANCE_BATCH, _RANDOM_BATCH = 100, 1000
 
 
 @dataclass(frozen=True)
-class RareSettings:
-    """Settings of the study.
+class RareParameters:
+    """Parameters of the study.
 
     - requirement: id of the requirement; max_probability: limit of the probability that a case violates it
     - method: see `METHODS`
@@ -121,7 +121,7 @@ class RareResult:
 
 def start_rare(
     campaign: Campaign,
-    settings: RareSettings,
+    parameters: RareParameters,
     max_cases: int,
     directory: Path,
     executor: ExecutorConfig,
@@ -132,12 +132,12 @@ def start_rare(
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
     stored, and `continue_rare` continues.
     """
-    check_margin(find_requirement(campaign, settings.requirement))
+    check_margin(find_requirement(campaign, parameters.requirement))
     session = StudySession(
-        executor, observer, lambda campaign, runner: _RareStudy(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
     )
-    total_cases = max_cases + sum(settings.random_cases)
-    return start_study(campaign, total_cases, directory, session, {"kind": KIND, **asdict(settings)})
+    total_cases = max_cases + sum(parameters.random_cases)
+    return start_study(campaign, total_cases, directory, session, {"kind": KIND, **asdict(parameters)})
 
 
 def continue_rare(
@@ -151,50 +151,52 @@ def continue_rare(
     study = read_study(directory) or {}
     if study.get("kind") != KIND:
         raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
-    values = {name: study[name] for name in RareSettings.__dataclass_fields__}
+    values = {name: study[name] for name in RareParameters.__dataclass_fields__}
     blocks = {name: tuple(values[name]) for name in ("replicates", "random_cases")}
-    settings = RareSettings(**{**values, **blocks})
-    if replicates and settings.method == "importance":
+    parameters = RareParameters(**{**values, **blocks})
+    if replicates and parameters.method == "importance":
         raise CampaignError(
             f"{directory}: no replicates can be added to a study with importance sampling; start a new study with more"
         )
     if replicates or random_cases:
-        settings = replace(
-            settings, replicates=(*settings.replicates, replicates), random_cases=(*settings.random_cases, random_cases)
+        parameters = replace(
+            parameters,
+            replicates=(*parameters.replicates, replicates),
+            random_cases=(*parameters.random_cases, random_cases),
         )
     session = StudySession(
-        executor, observer, lambda campaign, runner: _RareStudy(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
     )
-    return continue_study(directory, session, {"kind": KIND, **asdict(settings)}, random_cases)
+    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)}, random_cases)
 
 
 class _RareStudy:
     """State of a running study: number of violations, independent cases, and random cases that are not yet run."""
 
-    def __init__(self, campaign: Campaign, settings: RareSettings, runner: PointRunner) -> None:
-        self._campaign, self._settings, self._runner = campaign, settings, runner
-        self._requirement: Requirement = find_requirement(campaign, settings.requirement)
+    def __init__(self, campaign: Campaign, parameters: RareParameters, runner: PointRunner) -> None:
+        self._campaign, self._parameters, self._runner = campaign, parameters, runner
+        self._requirement: Requirement = find_requirement(campaign, parameters.requirement)
         self._violations = 0
         self._is_violation: list[bool] = []
         self._terrains: list[str | None] = []
-        self._reserved_cases = sum(settings.random_cases)
+        self._reserved_cases = sum(parameters.random_cases)
 
     def run(self, observer: ProgressObserver) -> RareResult:
         """Run random cases, replicates and importance sampling; estimate the probability and decide."""
-        settings = self._settings
+        parameters = self._parameters
         results: list[SubsetResult] = []
         violation_weights: list[float] | None = None
         shortfall = ""
         for block, (replicates, random_cases) in enumerate(
-            zip(settings.replicates, settings.random_cases, strict=True)
+            zip(parameters.replicates, parameters.random_cases, strict=True)
         ):
             observer.begin("cases", random_cases + self._max_cases(replicates))
             self._run_random(block, random_cases)
-            first = sum(settings.replicates[:block])
+            first = sum(parameters.replicates[:block])
             try:
                 results += self._run_replicates(range(first, first + replicates))
-                if settings.method == "importance" and block == 0:
-                    observer.begin("cases", settings.importance_cases)
+                if parameters.method == "importance" and block == 0:
+                    observer.begin("cases", parameters.importance_cases)
                     violation_weights = self._run_importance(results)
                     if not violation_weights:
                         shortfall = "The replicates found too few violations to fit a density for importance sampling."
@@ -203,8 +205,8 @@ class _RareStudy:
         sample = RareSample(
             results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
         )
-        evaluations = len(settings.replicates)
-        decision = decide_rare(sample, settings.max_probability, settings.confidence, evaluations)
+        evaluations = len(parameters.replicates)
+        decision = decide_rare(sample, parameters.max_probability, parameters.confidence, evaluations)
         evidence = self._runner.evidence
         if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
             reason = f"The verdict would be PASS. {evidence.text}"
@@ -223,13 +225,13 @@ class _RareStudy:
 
     def _max_cases(self, replicates: int) -> int:
         """Compute the number of cases of replicates that reach their least likely level."""
-        min_probability = MIN_PROBABILITY_FRACTION * self._settings.max_probability
+        min_probability = MIN_PROBABILITY_FRACTION * self._parameters.max_probability
         levels = math.ceil(math.log(min_probability) / math.log(LEVEL_FRACTION))
-        return math.ceil(replicates * self._settings.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
+        return math.ceil(replicates * self._parameters.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
 
     def _generator(self, name: str) -> np.random.Generator:
         """Create a random generator of the study, which does not depend on the cases."""
-        return Streams(self._campaign.configuration.seed, self._campaign.configuration.name, 0).generator(name)
+        return Streams(self._campaign.definition.seed, self._campaign.definition.name, 0).generator(name)
 
     def _run_random(self, block: int, count: int) -> None:
         """Run independent cases of the nominal distribution."""
@@ -242,11 +244,11 @@ class _RareStudy:
 
     def _run_replicates(self, numbers: range) -> list[SubsetResult]:
         """Run subset simulations in parallel: the next cases of all of them are evaluated together."""
-        settings, dimension = self._settings, len(self._campaign.drawn_paths)
-        min_probability = MIN_PROBABILITY_FRACTION * settings.max_probability
+        parameters, dimension = self._parameters, len(self._campaign.drawn_paths)
+        min_probability = MIN_PROBABILITY_FRACTION * parameters.max_probability
         simulations = {
             number: subset_simulation(
-                dimension, settings.samples, min_probability, self._generator(f"subset simulation {number}")
+                dimension, parameters.samples, min_probability, self._generator(f"subset simulation {number}")
             )
             for number in numbers
         }
@@ -299,7 +301,7 @@ class _RareStudy:
         density = fit_density(np.concatenate([result.violations for result in results]))
         if density is None:
             return []
-        case_count = self._settings.importance_cases
+        case_count = self._parameters.importance_cases
         coordinates, weights = density.draw(case_count, self._generator("importance sampling"))
         violation_weights: list[float] = []
         for first in range(0, case_count, _IMPORTANCE_BATCH):

@@ -2,7 +2,7 @@
 
 A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.points`).
 
-A study is a deterministic function of its settings and of the rows of its cases. To continue an interrupted study, it
+A study is a deterministic function of its parameters and of the rows of its cases. To continue an interrupted study, it
 is run again from its start. Cases with a stored row are not run again: their rows are read.
 """
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from marsyard.campaigns.definition.campaign import Campaign, value_at
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
@@ -41,7 +41,7 @@ from marsyard.sim.streams import Blend
 
 #: A study is stopped with an error if none of this number of first cases has finished.
 _MAX_FIRST_CRASHES = 20
-#: Key of a study's settings and results in the record of its folder.
+#: Key of a study's parameters and results in the record of its folder.
 STUDY_KEY = "study"
 
 
@@ -60,7 +60,7 @@ Result = TypeVar("Result", bound=StudyResult)
 
 @dataclass(frozen=True)
 class StudySession(Generic[Result]):
-    """Configuration of the workers, receiver of progress reports, and the function that runs the study."""
+    """Parameters of the workers, receiver of progress reports, and the function that runs the study."""
 
     executor: ExecutorConfig
     observer: ProgressObserver
@@ -124,7 +124,7 @@ class PointRunner:
         CampaignError if none of the first cases finished.
         """
         first = self.n_cases
-        limit = self._campaign.configuration.total_cases - reserved_cases
+        limit = self._campaign.definition.total_cases - reserved_cases
         if first + len(candidates) > limit:
             raise CaseLimitError(f"the study needs more than {limit} cases")
         points = {case: item.point(case) for case, item in enumerate(candidates, start=first)}
@@ -133,10 +133,10 @@ class PointRunner:
             if row.get(POINT_COLUMN) != points[case].text:
                 raise StoreError(f"{self._directory}: case {case} was run at another point; the study has changed")
         missing = [case for case in points if case not in rows]
-        configuration = self._campaign.configuration
+        definition = self._campaign.definition
         for batch in run_cases(
             self._executor,
-            configuration,
+            definition,
             missing,
             selection=ProductSelection(),
             total=len(missing),
@@ -147,7 +147,7 @@ class PointRunner:
                 if completed.note:
                     self._observer.note(completed.note)
                 if not self._is_checked and completed.row["outcome"] not in ENGINE_FAILURES:
-                    check_metrics(configuration, completed.row, self._directory)
+                    check_metrics(definition, completed.row, self._directory)
                     self._is_checked = True
                 rows[int(completed.row["case"])] = completed.row
                 self._observer.step()
@@ -165,26 +165,26 @@ def prepare_campaign(campaign: Campaign, max_cases: int) -> Campaign:
     A number `in-turn` that does not repeat within the study belongs to the random streams: it follows their number.
     Raises CampaignError if a dispersion is neither a standard normal variable nor such a number.
     """
-    configuration = campaign.configuration
-    for path, dispersion in configuration.dispersions.items():
+    definition = campaign.definition
+    for path, dispersion in definition.dispersions.items():
         remedy = f"fix it with --set {path}=VALUE, or give it a random distribution"
         if isinstance(dispersion, GridDispersion):
             raise CampaignError(f"dispersions.{path}: is a distribution 'grid', which has no probabilities; {remedy}")
         if isinstance(dispersion, CyclicInteger):
-            inputs = {name: value_at(configuration.parameters, name) for name in dispersion.names}
+            inputs = {name: value_at(definition.parameters, name) for name in dispersion.names}
             size = dispersion.insert_values(inputs).size
             if size < max_cases:
                 reason = f"the {size} values of the distribution 'in-turn' repeat within {max_cases} cases"
                 raise CampaignError(f"dispersions.{path}: {reason}; extend its range, {remedy}")
     if not campaign.drawn_paths:
-        raise CampaignError(f"campaign '{configuration.name}' has no random dispersion")
+        raise CampaignError(f"campaign '{definition.name}' has no random dispersion")
     changes = {"design": Design(kind=ADAPTIVE), "cases": max_cases, "appended": (), "max_cases": None}
-    return replace(campaign, configuration=configuration.model_copy(update=changes))
+    return replace(campaign, definition=definition.model_copy(update=changes))
 
 
 def find_requirement(campaign: Campaign, requirement_id: str) -> Requirement:
     """Find a requirement of the campaign by its id. Raises CampaignError for an unknown id."""
-    requirements = {item.id: item for item in campaign.configuration.requirements}
+    requirements = {item.id: item for item in campaign.definition.requirements}
     if requirement_id not in requirements:
         raise CampaignError(f"--requirement: {unknown_name_message('requirement', requirement_id, requirements)}")
     return requirements[requirement_id]
@@ -199,81 +199,81 @@ def check_margin(requirement: Requirement) -> None:
         )
 
 
-def create_study(campaign: Campaign, directory: Path, executor: str, settings: dict[str, Any]) -> None:
-    """Create the folder of a study; `settings` are stored in its record. Raises StoreError like a campaign's folder."""
-    identity = create_identity(campaign.configuration)
+def create_study(campaign: Campaign, directory: Path, executor: str, parameters: dict[str, Any]) -> None:
+    """Create the folder of a study with its parameters in the record. Raises StoreError as for a campaign's folder."""
+    identity = create_identity(campaign.definition)
     evidence = classify_run(campaign)
-    create_store(directory / ROWS_FILE, {"identity": identity.configuration})
+    create_store(directory / ROWS_FILE, {"identity": identity.definition})
     record.write_first_record(
         directory,
-        campaign.configuration,
+        campaign.definition,
         identity,
         executor,
         algorithms=describe_algorithms(campaign),
         evidence=evidence.to_table(),
-        origin=describe_origin(campaign.configuration),
+        origin=describe_origin(campaign.definition),
     )
-    record.update(directory, {STUDY_KEY: settings})
+    record.update(directory, {STUDY_KEY: parameters})
 
 
 def start_study(
-    campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Result], settings: Mapping[str, Any]
+    campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Result], parameters: Mapping[str, Any]
 ) -> Result:
     """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder.
 
-    `settings` are the settings of the study with its `kind`, as JSON types.
+    `parameters` are the parameters of the study with its `kind`, as JSON types.
     """
     study_campaign = prepare_campaign(campaign, max_cases)
     record.claim_folder(directory)
     with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock
         record.claim_folder(directory)
-        create_study(study_campaign, directory, session.executor.describe(), dict(settings))
-        return _run_study(study_campaign, directory, session, settings)
+        create_study(study_campaign, directory, session.executor.describe(), dict(parameters))
+        return _run_study(study_campaign, directory, session, parameters)
 
 
 def continue_study(
-    directory: Path, session: StudySession[Result], settings: Mapping[str, Any], additional_cases: int = 0
+    directory: Path, session: StudySession[Result], parameters: Mapping[str, Any], additional_cases: int = 0
 ) -> Result:
-    """Continue a stored study; `settings` replace the stored ones, and its limit of cases increases.
+    """Continue a stored study; `parameters` replace the stored ones, and its limit of cases increases.
 
     Raises CampaignError if the program has changed.
     """
     with folder_lock(directory):
-        configuration = record.stored_configuration(directory)
+        definition = record.stored_definition(directory)
         if additional_cases:
-            blocks = (*configuration.appended, additional_cases)
-            configuration = configuration.model_copy(update={"appended": blocks})
-        campaign = load_stored_campaign(directory, configuration)
+            blocks = (*definition.appended, additional_cases)
+            definition = definition.model_copy(update={"appended": blocks})
+        campaign = load_stored_campaign(directory, definition)
         check_identity(campaign, directory)
         check_rows(directory)
         stored = record.read(directory)
         description = record.describe_session("resume", session.executor.describe(), int(stored["cases_finished"]))
         changes: dict[str, Any] = {"state": "running", "finished_utc": None}
         changes["sessions"] = [*stored["sessions"], description]
-        changes.update(cases=configuration.total_cases, configuration=configuration.model_dump(mode="json"))
-        record.update(directory, {**changes, STUDY_KEY: dict(settings)})
-        return _run_study(campaign, directory, session, settings)
+        changes.update(cases=definition.total_cases, definition=definition.model_dump(mode="json"))
+        record.update(directory, {**changes, STUDY_KEY: dict(parameters)})
+        return _run_study(campaign, directory, session, parameters)
 
 
 def _run_study(
-    campaign: Campaign, directory: Path, session: StudySession[Result], settings: Mapping[str, Any]
+    campaign: Campaign, directory: Path, session: StudySession[Result], parameters: Mapping[str, Any]
 ) -> Result:
     """Run a study from its start; stored rows are not run again. Store its result and the table of its cases."""
     observer = session.observer
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
         try:
             with create_executor(session.executor) as executor:
-                compile_kernels(executor, campaign.configuration.scenario, observer.note)
+                compile_kernels(executor, campaign.definition.scenario, observer.note)
                 prepare_inputs(campaign, executor, observer, None)
                 runner = PointRunner(campaign, directory, store, executor, observer)
                 result = session.execute(campaign, runner)
         finally:
             counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
             record.update(directory, {"state": "interrupted", "finished_utc": record.utc_now(), **counts})
-        write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.configuration.requirements))
+        write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.definition.requirements))
     stored_result = convert_to_json(asdict(result))
-    changes = {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: {**settings, "result": stored_result}}
+    changes = {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: {**parameters, "result": stored_result}}
     record.update(directory, changes)
     return result
 
@@ -288,15 +288,15 @@ def convert_to_json(value: Any) -> Any:
 
 
 def check_identity(campaign: Campaign, directory: Path) -> None:
-    """Raise CampaignError if program, configuration or input files differ from those of the stored study."""
-    changes = Identity.read(record.read(directory)["identity"]).differences(create_identity(campaign.configuration))
+    """Raise CampaignError if program, definition or input files differ from those of the stored study."""
+    changes = Identity.read(record.read(directory)["identity"]).differences(create_identity(campaign.definition))
     if changes:
         text = "\n  ".join(changes)
-        reason = "was run with another program, configuration or input files; its rows would not be comparable"
+        reason = "was run with another program, definition or input files; its rows would not be comparable"
         raise CampaignError(f"{directory} {reason}. Changed:\n  {text}\nStart a new study in another folder")
 
 
 def read_study(directory: Path) -> dict[str, Any] | None:
-    """Read the settings and results of a study from the record of its folder; None for an ordinary campaign."""
+    """Read the parameters and results of a study from the record of its folder; None for an ordinary campaign."""
     study = record.read(directory).get(STUDY_KEY)
     return study if isinstance(study, dict) else None

@@ -25,7 +25,7 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -43,7 +43,7 @@ from marsyard.campaigns.studies.runner import (
 )
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the settings of this study.
+#: Value of the key `kind` in the parameters of this study.
 KIND = "search"
 #: Fraction of the cases that are used for exploration.
 _EXPLORATION_FRACTION = 0.5
@@ -60,8 +60,8 @@ _BISECTION_STEPS = 4
 
 
 @dataclass(frozen=True)
-class SearchSettings:
-    """Settings of the study.
+class SearchParameters:
+    """Parameters of the study.
 
     - requirement: id of the requirement
     - cases: number of cases of exploration and evolution strategies
@@ -147,7 +147,7 @@ class _EvaluatedPoint:
 
 def start_search(
     campaign: Campaign,
-    settings: SearchSettings,
+    parameters: SearchParameters,
     max_cases: int,
     directory: Path,
     executor: ExecutorConfig,
@@ -158,11 +158,11 @@ def start_search(
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
     stored, and `continue_search` continues.
     """
-    find_requirement(campaign, settings.requirement)
+    find_requirement(campaign, parameters.requirement)
     session = StudySession(
-        executor, observer, lambda campaign, runner: SearchStudy(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: SearchStudy(campaign, parameters, runner).run(observer)
     )
-    return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(settings)})
+    return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(parameters)})
 
 
 def continue_search(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> SearchResult:
@@ -170,24 +170,24 @@ def continue_search(directory: Path, executor: ExecutorConfig, observer: Progres
     study = read_study(directory) or {}
     if study.get("kind") != KIND:
         raise CampaignError(f"{directory} does not contain a search for violations (marsyard search)")
-    settings = SearchSettings(**{name: study[name] for name in SearchSettings.__dataclass_fields__})
+    parameters = SearchParameters(**{name: study[name] for name in SearchParameters.__dataclass_fields__})
     session = StudySession(
-        executor, observer, lambda campaign, runner: SearchStudy(campaign, settings, runner).run(observer)
+        executor, observer, lambda campaign, runner: SearchStudy(campaign, parameters, runner).run(observer)
     )
-    return continue_study(directory, session, {"kind": KIND, **asdict(settings)})
+    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)})
 
 
 class SearchStudy:
     """A running search."""
 
-    def __init__(self, campaign: Campaign, settings: SearchSettings, runner: PointRunner) -> None:
-        self.campaign, self.settings, self.runner = campaign, settings, runner
-        self._requirement: Requirement = find_requirement(campaign, settings.requirement)
+    def __init__(self, campaign: Campaign, parameters: SearchParameters, runner: PointRunner) -> None:
+        self.campaign, self.parameters, self.runner = campaign, parameters, runner
+        self._requirement: Requirement = find_requirement(campaign, parameters.requirement)
         self._evaluated: list[_EvaluatedPoint] = []
 
     def run(self, observer: ProgressObserver) -> SearchResult:
         """Search and reduce; a limit of cases ends the study with the failures so far."""
-        observer.begin("search", self.settings.cases)
+        observer.begin("search", self.parameters.cases)
         failures: list[FoundFailure] = []
         reason = ""
         n_searched = violations = 0
@@ -197,7 +197,7 @@ class SearchStudy:
             n_searched = len(self._evaluated)
             violating_cases = [item for item in self._evaluated if item.margin < 0.0]
             violations = len(violating_cases)
-            observer.begin("reduction", _REDUCTION_CASES * min(violations, self.settings.max_failures))
+            observer.begin("reduction", _REDUCTION_CASES * min(violations, self.parameters.max_failures))
             self._reduce_all(violating_cases, failures)
         except CaseLimitError as error:
             reason = f"The limit of cases was reached: {error}."
@@ -233,21 +233,21 @@ class SearchStudy:
 
     def _seed(self, name: str) -> int:
         """Derive the seed of one part of the study from the seed of the campaign."""
-        configuration = self.campaign.configuration
-        generator = Streams(configuration.seed, configuration.name, 0).generator(f"search: {name}")
+        definition = self.campaign.definition
+        generator = Streams(definition.seed, definition.name, 0).generator(f"search: {name}")
         return int(generator.integers(1, 2**31))
 
     def _explore(self) -> None:
         """Evaluate a Sobol sequence, the largest power of 2 within half of the cases."""
         dimension = len(self.campaign.drawn_paths)
-        exponent = int(math.log2(max(_EXPLORATION_FRACTION * self.settings.cases, 2.0)))
+        exponent = int(math.log2(max(_EXPLORATION_FRACTION * self.parameters.cases, 2.0)))
         sequence = qmc.Sobol(dimension, rng=np.random.default_rng(self._seed("exploration"))).random_base2(exponent)
         coordinates = np.clip(ndtri(sequence), -_MAX_COORDINATE, _MAX_COORDINATE)
         self._evaluate([Candidate(tuple(point.tolist())) for point in coordinates])
 
     def _evolve(self) -> None:
         """Run evolution strategies in parallel until the cases are used."""
-        settings, starts = self.settings, self._select_starts()
+        parameters, starts = self.parameters, self._select_starts()
         strategies = [
             cma.CMAEvolutionStrategy(
                 list(start),
@@ -266,7 +266,7 @@ class SearchStudy:
             for number, start in enumerate(starts)
         ]
         size = strategies[0].popsize
-        while self.runner.n_cases + size * len(strategies) <= settings.cases:
+        while self.runner.n_cases + size * len(strategies) <= parameters.cases:
             populations = [strategy.ask() for strategy in strategies]
             candidates = [Candidate(tuple(map(float, point))) for points in populations for point in points]
             margins = _replace_infinite(np.array([item.margin for item in self._evaluate(candidates)]))
@@ -282,7 +282,7 @@ class SearchStudy:
             min_distance = _MIN_START_DISTANCE * math.sqrt(point.size)
             if all(np.linalg.norm(point - np.array(other)) >= min_distance for other in starts):
                 starts.append(item.point.coordinates)
-            if len(starts) == self.settings.restarts:
+            if len(starts) == self.parameters.restarts:
                 break
         return starts
 
@@ -293,7 +293,7 @@ class SearchStudy:
         """
         remaining = sorted(violating_cases, key=lambda item: float(np.linalg.norm(item.point.coordinates)))
         reduced_points: list[tuple[list[str], np.ndarray]] = []
-        while remaining and len(failures) < self.settings.max_failures:
+        while remaining and len(failures) < self.parameters.max_failures:
             first = remaining[0]
             reduction = self._shrink(self._remove_dispersions(first))
             paths = [path for path in self.campaign.drawn_paths if path not in reduction.point.nominal]
@@ -318,7 +318,7 @@ class SearchStudy:
                 continue
             reduced_points.append((paths, reduced_coordinates))
             repetition = Candidate(reduction.point.coordinates, None, reduction.point.nominal)
-            repetitions = self._evaluate([repetition] * self.settings.repetitions)
+            repetitions = self._evaluate([repetition] * self.parameters.repetitions)
             failures.append(
                 FoundFailure(
                     reduction.case,
@@ -393,19 +393,19 @@ def write_regression_campaigns(campaign: Campaign, result: SearchResult, directo
     Each file has the parameters of the reduced case, no dispersions, and new random streams for each of its cases.
     """
     folder, paths = directory / "failures", list[Path]()
-    configuration = campaign.configuration
+    definition = campaign.definition
     requirement = find_requirement(campaign, str((read_study(directory) or {})["requirement"]))
     with report_write_errors(folder):
         folder.mkdir(exist_ok=True)
         for number, failure in enumerate(result.failures, start=1):
-            name = f"{configuration.name}-failure-{number}"
+            name = f"{definition.name}-failure-{number}"
             values_text = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
             tables = {
                 "name": name,
-                "scenario": configuration.scenario,
+                "scenario": definition.scenario,
                 "description": f"Violation of {requirement.id} with {values_text or 'the parameters of the campaign'}.",
                 "cases": max(failure.repetitions, 1),
-                "seed": configuration.seed,
+                "seed": definition.seed,
                 "parameters": campaign.with_values(failure.values).model_dump(mode="json"),
                 "requirements": [requirement.model_dump(mode="json")],
             }

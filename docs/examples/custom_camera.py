@@ -26,7 +26,7 @@ with tempfile.TemporaryDirectory() as folder:
     # the campaign key is camera.model; DIMES bins whole pixels, so the binned size must divide the image size
     changes = {"camera.model": str(path), "detector.rows_summed": 1, "dimes.binned_size": [376, 240]}
     campaign = marsyard.load_campaign("dimes-smoke", changes)
-    print("columns:", campaign.configuration.parameters["camera"]["model"]["columns"])
+    print("columns:", campaign.definition.parameters["camera"]["model"]["columns"])
 
 # project a point, m, in the frame of the calibration: x right, y down, z forward
 pixel, is_visible = calibration.camera.project(np.array([0.2, -0.1, 1.0]))

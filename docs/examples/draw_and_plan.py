@@ -3,7 +3,7 @@
 import marsyard
 
 campaign = marsyard.load_campaign("dimes-smoke", cases=200)
-print(campaign.configuration.description)
+print(campaign.definition.description)
 
 draws = marsyard.draws(campaign, 200)
 for path in ("descent.altitude_first_m", "descent.wind_east_m_s", "descent.cone_angle_deg"):

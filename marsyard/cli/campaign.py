@@ -84,7 +84,7 @@ def run(arguments: RunOptions) -> None:
         outcome.print_estimate(campaign, executor)
         outcome.print_limits(campaign)
         return
-    directory = arguments.out if arguments.out is not None else default_directory(campaign.configuration.name)
+    directory = arguments.out if arguments.out is not None else default_directory(campaign.definition.name)
     if arguments.shard is not None:
         run_shard(campaign, arguments.shard, directory, executor)
         return
@@ -186,7 +186,7 @@ def append(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.campaigns.store.record import stored_configuration
+    from marsyard.campaigns.store.record import stored_definition
     from marsyard.cli import outcome
     from marsyard.cli.studies import contains_study, continue_study
 
@@ -196,7 +196,7 @@ def append(
         continue_study(directory, jobs, cluster, cases, is_random=random)
     if random:
         raise CampaignError(f"--random is for studies of `marsyard rare`; {directory} contains a campaign")
-    if stored_configuration(directory).max_cases is not None:
+    if stored_definition(directory).max_cases is not None:
         raise CampaignError(f"{directory} was run with --until-decided: cases added afterwards would bias the verdict")
     outcome.print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
-    """Create the configuration of the workers from the options `--jobs` and `--cluster`."""
+    """Create the parameters of the workers from the options `--jobs` and `--cluster`."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.execution.workers import ExecutorConfig, available_cores
 

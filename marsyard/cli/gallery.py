@@ -30,7 +30,7 @@ SHEET_GREYS = (64, 48, 40, 32, 26, 21, 16, 12, 8)
 #: Display: percentiles of the signal for black and white, factor applied to the black percentile, gamma exponent.
 BLACK_PERCENTILE, WHITE_PERCENTILE, BLACK_FRACTION, GAMMA = 0.5, 99.7, 0.6, 0.65
 
-#: Images of the gallery: site, camera, and settings that replace the camera's defaults.
+#: Images of the gallery: site, camera, and values that replace the camera's defaults.
 VIEWS: Sequence[tuple[str, str, dict[str, Any]]] = (
     ("gusev", "mer-descent-flown", {"altitude_m": 1400.0, "sun_azimuth_deg": 270.0, "sun_elevation_deg": 30.0}),
     ("gusev", "mer-navcam", {"east_m": 30.0, "north_m": 40.0, "azimuth_deg": 340.0, "sun_azimuth_deg": 265.0}),
@@ -78,7 +78,7 @@ def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path] 
 
     Raises ValueError if a file is no DTM file, or if the gallery cannot be written or already exists.
     """
-    requests = [ImageRequest.from_defaults(site, camera, **settings) for site, camera, settings in VIEWS]
+    requests = [ImageRequest.from_defaults(site, camera, **values) for site, camera, values in VIEWS]
     for file in terrain_files:
         if not is_terrain_file(str(file)):
             raise ValueError(f"--terrain {file} is not a DTM file; allowed: {', '.join(SUFFIXES)}")

@@ -119,12 +119,12 @@ def compile_kernels() -> None:
                 typer.echo(line)
 
 
-def _compile_scenario(scenario: str, name: str, settings: Sequence[str]) -> str:
+def _compile_scenario(scenario: str, name: str, overrides: Sequence[str]) -> str:
     """Compile the kernels of a scenario; return a line of text."""
     from marsyard.campaigns.execution.worker_process import limit_threads
     from marsyard.campaigns.running.preparation import compile_campaign
 
     limit_threads()
     start_s = time.monotonic()
-    compile_campaign(name, settings)
+    compile_campaign(name, overrides)
     return f"{scenario}: compiled, {time.monotonic() - start_s:.0f} s"

@@ -70,8 +70,8 @@ class ImageRequest:
     bits_per_pixel: float | None = None  #: size of the compressed counts; None without compression
 
     @classmethod
-    def from_defaults(cls, site: str, camera: str, **settings: Any) -> ImageRequest:
-        """Create a request with the camera's default pose, changed by `settings`; raises ValueError if invalid."""
+    def from_defaults(cls, site: str, camera: str, **given: Any) -> ImageRequest:
+        """Create a request with the camera's default pose, changed by `given`; raises ValueError if invalid."""
         if not is_terrain_file(site):
             check_site_name(site)
             _check_name("site", site, sites())
@@ -81,7 +81,7 @@ class ImageRequest:
         defaults |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
         defaults |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
         defaults |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
-        changes = {name: value for name, value in settings.items() if value is not None}
+        changes = {name: value for name, value in given.items() if value is not None}
         if is_terrain_file(site):  # the DTM is centred in the periodic terrain
             terrain = load_site(site, float(changes.get("max_hole_fraction", MAX_HOLE_FRACTION))).terrain()
             defaults |= dict.fromkeys(("east_m", "north_m"), 0.5 * terrain.samples * terrain.spacing_m)

@@ -18,7 +18,7 @@ import typer
 from pydantic import Field, model_validator
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.configuration import MAX_CASES, read_table
+from marsyard.campaigns.definition.campaign_file import MAX_CASES, read_table
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.workers import ExecutorConfig
@@ -85,7 +85,7 @@ class Plan(Parameters):
 
 
 def read_plan(path: Path) -> Plan:
-    """Read the plan from a file. Raises ConfigurationError if the file is not readable or not valid."""
+    """Read the plan from a file. Raises DefinitionError if the file is not readable or not valid."""
     return read_table(path, Plan)
 
 
@@ -101,7 +101,7 @@ def hash_definition(campaign: Campaign) -> str:
     Seed, description, retained products, limits and number of cases are excluded.
     """
     excluded_keys = {"seed", "description", "retain", "limits", "cases"}
-    definition = campaign.configuration.model_dump(mode="json", exclude=excluded_keys)
+    definition = campaign.definition.model_dump(mode="json", exclude=excluded_keys)
     return hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()
 
 
@@ -120,7 +120,7 @@ def run_scheduled_campaign(run: NightlyRun, entry: PlannedCampaign, folder: Path
     """Run a campaign, evaluate it, and store its metrics; its errors do not affect the other campaigns."""
     try:
         campaign = entry.load(run.plan.seed, run.number, folder)
-        name = campaign.configuration.name
+        name = campaign.definition.name
         directory = run.out / RUNS / f"night-{run.number:05d}-{name}"
         run_campaign(campaign, directory, run.executor, observer)
         evaluation, _ = evaluate_and_store(directory)

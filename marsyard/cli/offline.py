@@ -52,7 +52,7 @@ def export(
     with show_progress(truth, f"the same command again ({out})") as observer:
         export_campaign(export_definition, out, truth, make_executor(jobs, cluster), observer)
     crashes = int(record.read(truth)["cases_crashed"])
-    total = export_definition.configuration.total_cases
+    total = export_definition.definition.total_cases
     typer.echo(f"exported {total - crashes} of {count(total, 'case')} to {out}")
     typer.echo(f"ground truth (do not distribute with the cases): {truth}")
     typer.echo(f"to score the results: marsyard score {out} ANSWERS.csv")
@@ -87,7 +87,7 @@ def score(
         adopt(truth)
     command = ("marsyard", "score", str(directory), str(answers), "--truth", str(truth))
     campaign = replace(create_scoring_campaign(directory, truth, answers), command=command)
-    target = out if out is not None else default_directory(campaign.configuration.name)
+    target = out if out is not None else default_directory(campaign.definition.name)
 
     def run(observer: ProgressObserver) -> None:
         run_campaign(campaign, target, make_executor(jobs, cluster), observer)

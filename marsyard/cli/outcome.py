@@ -32,7 +32,7 @@ from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked, replace_file
 from marsyard.campaigns.store.products import case_directory, save_packed
-from marsyard.campaigns.store.record import stored_configuration
+from marsyard.campaigns.store.record import stored_definition
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
 from marsyard.cli.options import Exit, size_text
 from marsyard.cli.showing import grid_table
@@ -166,11 +166,11 @@ def rerun_notable_cases(directory: Path) -> None:
     missing = [case for case in notable_cases(run) if case not in run.showcases]
     if not missing:
         return
-    configuration = stored_configuration(directory)
-    load_stored_campaign(directory, configuration)
+    definition = stored_definition(directory)
+    load_stored_campaign(directory, definition)
     with LocalExecutor(1) as workers:
         for case in missing:
-            rerun = replay_in_executor(workers, configuration, case, stored_row(directory, case))
+            rerun = replay_in_executor(workers, definition, case, stored_row(directory, case))
             if rerun.products is None or rerun.failed:
                 typer.echo(f"case {case}: rerun, but no images were produced")
                 continue
@@ -189,15 +189,15 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     Each reason contains a remedy. Only requirements that are decided at a confidence are considered. The population is
     assumed to be all cases; a smaller population requires more cases.
     """
-    configuration = campaign.configuration
-    requirements = [item for item in configuration.requirements if item.decide_by != ESTIMATE]
-    design = read_sampling_design(configuration.model_dump(mode="json"))
+    definition = campaign.definition
+    requirements = [item for item in definition.requirements if item.decide_by != ESTIMATE]
+    design = read_sampling_design(definition.model_dump(mode="json"))
     if not requirements:
         return []
     if not design.independent:
         return [design.no_probability]
     strictest = max(requirements, key=lambda item: minimum_sample_size(item.probability, item.confidence))
-    min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), configuration.total_cases
+    min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), definition.total_cases
     requirement_text = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
     limits = []
     if cases < min_cases:
@@ -208,9 +208,9 @@ def evidence_limits(campaign: Campaign) -> list[str]:
         return limits
     # number of distinct terrains: assigned in turn, or drawn at random
     terrains = min(cases, terrain_supply.terrains)
-    path = next((path for path in ("location.terrain", "world.terrain") if path in configuration.dispersions), None)
+    path = next((path for path in ("location.terrain", "world.terrain") if path in definition.dispersions), None)
     if not terrain_supply.in_turn and path is not None and cases <= _MAX_DRAWS:
-        terrains = len({campaign.draws(case)[path] for case in range(int(configuration.design.nominal), cases)})
+        terrains = len({campaign.draws(case)[path] for case in range(int(definition.design.nominal), cases)})
     # if several cases share a terrain, the evidence is limited by the number of terrains
     if terrains < min(cases, min_cases):
         limits.append(terrain_supply.advice(min_cases, strictest.probability, strictest.confidence))
@@ -221,7 +221,7 @@ def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
     """Print the estimated time and disk space of a campaign."""
     workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
     estimate = estimate_campaign(campaign, workers)
-    total = campaign.configuration.total_cases
+    total = campaign.definition.total_cases
     low, high = estimate.case_range_s
     time_s = estimate.time_s
     duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
@@ -254,32 +254,32 @@ def run_until_decided(
     See `marsyard.reports.statistics.proportions`. Raises CampaignError for dependent draws, or if no requirement has a
     confidence level.
     """
-    configuration = campaign.configuration
-    design = read_sampling_design(configuration.model_dump(mode="json"))
+    definition = campaign.definition
+    design = read_sampling_design(definition.model_dump(mode="json"))
     if not design.independent:
         raise CampaignError(f"--until-decided: {design.no_probability}")
-    if all(requirement.decide_by == ESTIMATE for requirement in configuration.requirements):
+    if all(requirement.decide_by == ESTIMATE for requirement in definition.requirements):
         raise CampaignError("--until-decided: the campaign has no requirement with a confidence level")
-    max_cases = configuration.total_cases
-    first_block = configuration.model_copy(
+    max_cases = definition.total_cases
+    first_block = definition.model_copy(
         update={"cases": planned_looks(max_cases)[0].cases, "appended": (), "max_cases": max_cases}
     )
     command = (*campaign.command, "--until-decided")
-    run_campaign(replace(campaign, configuration=first_block, command=command), directory, executor, observer)
+    run_campaign(replace(campaign, definition=first_block, command=command), directory, executor, observer)
     continue_until_decided(directory, executor, observer)
 
 
 def continue_until_decided(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
     """Append cases at the planned interim evaluations until the campaign is decided."""
     while True:
-        configuration = record.stored_configuration(directory)
-        if configuration.max_cases is None:
+        definition = record.stored_definition(directory)
+        if definition.max_cases is None:
             return
-        evaluation, cases = evaluate_run(directory), configuration.total_cases
+        evaluation, cases = evaluate_run(directory), definition.total_cases
         # a decided verdict that is withheld for its kind of evidence needs no further cases
         verdicts = [replace(item, status=item.withheld_status or item.status) for item in evaluation.verdicts]
         next_cases = next_look(verdicts, evaluation.sampling, cases)
         if next_cases is None:
-            observer.note(f"stopped after {cases} of at most {count(configuration.max_cases, 'case')}")
+            observer.note(f"stopped after {cases} of at most {count(definition.max_cases, 'case')}")
             return
         append_cases(directory, next_cases - cases, executor, observer)

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, description_at
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, description_at
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
 from marsyard.reports.wording import count, requirement_text
@@ -35,12 +35,12 @@ _FIGURE_FORMATS = (".svg", ".png")
 
 def show_campaign(campaign: Campaign, console: Console) -> None:
     """Print a campaign: description, parameters, dispersions and requirements."""
-    configuration = campaign.configuration
-    _print_header(configuration, console)
+    definition = campaign.definition
+    _print_header(definition, console)
     table = _create_table("Parameters", "parameter", "value")
-    for path, value in leaves(configuration.parameters):
-        nominal = f"; nominal {value}" if configuration.design.nominal else ""
-        table.add_row(Text(path), Text(f"dispersed{nominal}" if path in configuration.dispersions else str(value)))
+    for path, value in leaves(definition.parameters):
+        nominal = f"; nominal {value}" if definition.design.nominal else ""
+        table.add_row(Text(path), Text(f"dispersed{nominal}" if path in definition.dispersions else str(value)))
     console.print(table)
     table = _create_table("Dispersions", "parameter", "distribution", "bounds", "unit", "source")
     for path, dispersion in campaign.marginals.items():
@@ -57,14 +57,14 @@ def show_campaign(campaign: Campaign, console: Console) -> None:
             bounds_text = f"{low:g} to {high:g}" if lower and upper else lower or upper or "none"
         table.add_row(name, Text(dispersion.describe()), Text(bounds_text), Text(data["unit"]), source)
     console.print(table)
-    if configuration.correlations:
+    if definition.correlations:
         table = _create_table("Correlated", "parameters", "by", "matrix", "source")
-        for group in configuration.correlations:
+        for group in definition.correlations:
             rows = "\n".join(" ".join(f"{value:8.3g}" for value in row) for row in getattr(group, group.kind))
             table.add_row(Text("\n".join(group.parameters)), Text(group.kind), Text(rows), Text(group.source))
         console.print(table)
     table = _create_table("Requirements", "id", "statement", "criterion")
-    for item in configuration.requirements:
+    for item in definition.requirements:
         table.add_row(Text(item.id), Text(item.statement), Text(requirement_text(item)))
     console.print(table)
 
@@ -74,8 +74,8 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
 
     A row starts with minimum, mean and maximum over all cases, or the number of distinct values if not numeric.
     """
-    values_by_path, nominal_cases = list_drawn_values(campaign, cases), int(campaign.configuration.design.nominal)
-    _print_header(campaign.configuration, console)
+    values_by_path, nominal_cases = list_drawn_values(campaign, cases), int(campaign.definition.design.nominal)
+    _print_header(campaign.definition, console)
     cases = cases if values_by_path else 0
     units = {path: campaign.marginals[path].unit for path in values_by_path}
     names = {path: f"{path} ({unit})" if unit else path for path, unit in units.items()}
@@ -101,10 +101,10 @@ def show_draws(campaign: Campaign, cases: int, console: Console) -> None:
 
 def describe_campaign(campaign: Campaign, cases: int | None) -> dict[str, Any]:
     """Convert a campaign to plain data, optionally with the draws of its first cases; infinite bounds become None."""
-    configuration = campaign.configuration
-    data: dict[str, Any] = configuration.model_dump(mode="json")
-    data["design"]["text"] = _sampling_text(configuration)
-    data["dispersions"] = [_dispersion_data(campaign, path) for path in configuration.dispersions]
+    definition = campaign.definition
+    data: dict[str, Any] = definition.model_dump(mode="json")
+    data["design"]["text"] = _sampling_text(definition)
+    data["dispersions"] = [_dispersion_data(campaign, path) for path in definition.dispersions]
     if cases is not None:
         values_by_path = list_drawn_values(campaign, cases)
         data["draws"] = [
@@ -123,7 +123,7 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
 
     if path.suffix not in _FIGURE_FORMATS:
         raise CampaignError(f"--figure {path}: unknown file format; allowed: {', '.join(_FIGURE_FORMATS)}")
-    nominal_cases = int(campaign.configuration.design.nominal)
+    nominal_cases = int(campaign.definition.design.nominal)
     draws = {name: values[nominal_cases:] for name, values in list_drawn_values(campaign, cases).items()}
     if not any(draws.values()):
         raise CampaignError(f"--figure {path}: no parameter is drawn in {count(cases, 'case')}")
@@ -134,7 +134,7 @@ def write_draws_figure(campaign: Campaign, cases: int, path: Path) -> None:
             quantiles = [dispersion.quantile((index + 0.5) / _QUANTILES) for index in range(_QUANTILES)]
         marginals.append(ParameterSample(name, values, quantiles))
     with report_write_errors(f"--figure {path}:"):
-        save_figure(draws_figure(campaign.configuration.name, marginals), path)
+        save_figure(draws_figure(campaign.definition.name, marginals), path)
 
 
 def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
@@ -142,10 +142,10 @@ def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
 
     Raises CampaignError if the campaign has fewer cases or the values of a case cannot be drawn.
     """
-    total = campaign.configuration.total_cases
+    total = campaign.definition.total_cases
     if not 1 <= cases <= total:
         raise CampaignError(f"--draw {cases}: the campaign has {count(total, 'case')}; allowed: 1 to {total}")
-    values_by_path: dict[str, list[Any]] = {path: [] for path in campaign.configuration.dispersions}
+    values_by_path: dict[str, list[Any]] = {path: [] for path in campaign.definition.dispersions}
     for case in range(cases):
         try:
             values = campaign.draws(case)
@@ -156,26 +156,26 @@ def list_drawn_values(campaign: Campaign, cases: int) -> dict[str, list[Any]]:
     return values_by_path
 
 
-def _print_header(configuration: CampaignConfiguration, console: Console) -> None:
+def _print_header(definition: CampaignDefinition, console: Console) -> None:
     """Print name, description, scenario, size and sampling of a campaign."""
     for line in (
-        f"{configuration.name}: {configuration.description}",
-        f"scenario {configuration.scenario}, {count(configuration.total_cases, 'case')}, seed {configuration.seed}",
-        f"sampling: {_sampling_text(configuration)}",
+        f"{definition.name}: {definition.description}",
+        f"scenario {definition.scenario}, {count(definition.total_cases, 'case')}, seed {definition.seed}",
+        f"sampling: {_sampling_text(definition)}",
     ):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _sampling_text(configuration: CampaignConfiguration) -> str:
-    design = configuration.design
-    return describe_design(design.kind, list(configuration.grids), nominal=design.nominal)
+def _sampling_text(definition: CampaignDefinition) -> str:
+    design = definition.design
+    return describe_design(design.kind, list(definition.grids), nominal=design.nominal)
 
 
 def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
     """Convert a dispersion to plain data; unit and description default to those of the parameter."""
     dispersion = campaign.marginals[path]
     bounds = dispersion.bounds()
-    groups = (group.parameters for group in campaign.configuration.correlations if path in group.parameters)
+    groups = (group.parameters for group in campaign.definition.correlations if path in group.parameters)
     description = dispersion.description
     return {
         "parameter": path,
@@ -186,7 +186,7 @@ def _dispersion_data(campaign: Campaign, path: str) -> dict[str, Any]:
         "description": description_at(campaign.scenario.parameters_type, path) if description is None else description,
         "source": dispersion.source,
         "correlated_with": [name for group in groups for name in group if name != path],
-        "nominal": value_at(campaign.configuration.parameters, path),
+        "nominal": value_at(campaign.definition.parameters, path),
     }
 
 

@@ -52,7 +52,7 @@ def prepare_study(arguments: StudyOptions, kind: str) -> tuple[Campaign, Executo
     campaign = load_campaign(
         arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
     )
-    default = default_directory(f"{campaign.configuration.name}-{kind}")
+    default = default_directory(f"{campaign.definition.name}-{kind}")
     return campaign, make_executor(arguments.jobs, arguments.cluster), arguments.out or default
 
 
@@ -96,9 +96,9 @@ def rare(arguments: RareOptions) -> None:
 
     Exit status: 0 if the probability is below the limit by counting, 1 if it is above, 3 if undecided.
     """
-    from marsyard.campaigns.studies.rare import RareSettings, start_rare
+    from marsyard.campaigns.studies.rare import RareParameters, start_rare
 
-    settings = RareSettings(
+    parameters = RareParameters(
         arguments.requirement,
         arguments.max_probability,
         arguments.method,
@@ -110,7 +110,7 @@ def rare(arguments: RareOptions) -> None:
     )
     campaign, executor, directory = prepare_study(arguments, "rare")
     with show_progress(directory, f"marsyard resume {directory}") as progress:
-        result = start_rare(campaign, settings, arguments.max_cases, directory, executor, progress)
+        result = start_rare(campaign, parameters, arguments.max_cases, directory, executor, progress)
     finish_rare(directory, result)
 
 
@@ -143,12 +143,12 @@ def search(arguments: SearchOptions) -> None:
 
     Exit status: 1 if violations are found, otherwise 0.
     """
-    from marsyard.campaigns.studies.search import SearchSettings, start_search
+    from marsyard.campaigns.studies.search import SearchParameters, start_search
 
-    settings = SearchSettings(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
+    parameters = SearchParameters(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
     campaign, executor, directory = prepare_study(arguments, "search")
     with show_progress(directory, f"marsyard resume {directory}") as progress:
-        result = start_search(campaign, settings, arguments.max_cases, directory, executor, progress)
+        result = start_search(campaign, parameters, arguments.max_cases, directory, executor, progress)
     finish_search(directory, result)
 
 
@@ -177,12 +177,12 @@ def budget(arguments: BudgetOptions) -> None:
 
     Sources of error are those of the scenario, such as attitude, altitude or detector noise (docs/error-budget.md).
     """
-    from marsyard.campaigns.studies.budget import BudgetSettings, start_budget
+    from marsyard.campaigns.studies.budget import BudgetParameters, start_budget
 
-    settings = BudgetSettings(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
+    parameters = BudgetParameters(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
     campaign, executor, directory = prepare_study(arguments, "budget")
     with show_progress(directory, f"marsyard resume {directory}") as progress:
-        result = start_budget(campaign, settings, directory, executor, progress)
+        result = start_budget(campaign, parameters, directory, executor, progress)
     finish_budget(directory, result)
 
 
@@ -230,10 +230,10 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
     """Store files and images of the reduced violations, write the report, print the result, and exit."""
     from marsyard.campaigns.running.replay import load_stored_campaign, replay
     from marsyard.campaigns.store.products import case_directory, save_packed
-    from marsyard.campaigns.store.record import stored_configuration
+    from marsyard.campaigns.store.record import stored_definition
     from marsyard.campaigns.studies.search import write_regression_campaigns
 
-    campaign = load_stored_campaign(directory, stored_configuration(directory))
+    campaign = load_stored_campaign(directory, stored_definition(directory))
     files = write_regression_campaigns(campaign, result, directory)
     for failure in result.failures:
         rerun = replay(directory, failure.case)

@@ -261,7 +261,7 @@ class RenderOptions:
 def render(arguments: RenderOptions) -> None:
     """Render an image of a site or DTM.
 
-    Writes PREFIX.png (16 bits), PREFIX.npz (ground truth), PREFIX.cahvor (camera) and PREFIX.json (settings).
+    Writes PREFIX.png (16 bits), PREFIX.npz (ground truth), PREFIX.cahvor (camera) and PREFIX.json (values).
 
     A stereo camera adds -left and -right to PREFIX.
     """
@@ -269,12 +269,12 @@ def render(arguments: RenderOptions) -> None:
     from marsyard.sim.kernel_cache import mark_ready
 
     with report_image_errors(arguments.out):
-        settings = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
-        settings |= {f"{name}_m": getattr(arguments, name) for name in ("altitude", "east", "north")}
-        settings["bits_per_pixel"] = arguments.bits_per_pixel
+        values = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
+        values |= {f"{name}_m": getattr(arguments, name) for name in ("altitude", "east", "north")}
+        values["bits_per_pixel"] = arguments.bits_per_pixel
         angles = ("azimuth", "elevation", "sun_azimuth", "sun_elevation")
-        settings |= {f"{name}_deg": getattr(arguments, name) for name in angles}
-        request = ImageRequest.from_defaults(arguments.site, arguments.camera, **settings)
+        values |= {f"{name}_deg": getattr(arguments, name) for name in angles}
+        request = ImageRequest.from_defaults(arguments.site, arguments.camera, **values)
         check_files(arguments.out, arguments.camera, arguments.overwrite)
         _note_compilation()
         images = render_images(request, detector=arguments.detector, note=_print_progress)

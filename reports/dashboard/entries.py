@@ -110,7 +110,7 @@ def _read_entry(path: Path, pages: Path) -> Entry:
     """Read one campaign; its report is written into its folder of `pages` if there is no valid report."""
     reject_links(path)
     record = table(json.loads((path / RECORD_FILE).read_text(encoding="utf-8")))
-    name = str(record.get("name") or table(record.get("configuration")).get("name") or path.resolve().name)
+    name = str(record.get("name") or table(record.get("definition")).get("name") or path.resolve().name)
     slug = make_slug(path, name)
     report, folder = _read_valid(path, path), path
     if report is None:
@@ -122,8 +122,8 @@ def _read_entry(path: Path, pages: Path) -> Entry:
         report = read_report((folder / REPORT_JSON).read_bytes())
     if report is None:
         raise StoreError(f"{folder / REPORT_JSON} has another layout than this version of Marsyard writes")
-    parameters = table(table(record.get("configuration")).get("parameters"))
-    system = find_system(str(table(record.get("configuration")).get("scenario")))
+    parameters = table(table(record.get("definition")).get("parameters"))
+    system = find_system(str(table(record.get("definition")).get("scenario")))
     return Entry(
         slug=slug,
         directory=path,

@@ -122,8 +122,8 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
 
 def draw_detector(p: DescentScenarioParameters, optics: Optics, streams: Streams) -> Detector:
     """Draw the detector of a case: pixel response and faults."""
-    settings = add_detector_faults(p.faults, p.detector)
-    return Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
+    parameters = add_detector_faults(p.faults, p.detector)
+    return Detector.draw(optics.fall_off, parameters, streams.generator("detector response"))
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ class TripleParameters(Parameters):
 
 
 class FieldTestParameters(AlgorithmSelection, CustomScores):
-    """A field test: its runs and their common settings. Each case is a triple of one run."""
+    """A field test: its runs and their common parameters. Each case is a triple of one run."""
 
     task = VELOCITY
     scored = ScoredFlight

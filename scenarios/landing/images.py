@@ -90,8 +90,8 @@ def take_images(
     p: LandingScenarioParameters, world: LandingWorld, flight: LandingFlight, optics: Optics, streams: Streams
 ) -> Pair:
     """Take both images of a flight; the first image determines the exposure of both."""
-    settings = add_detector_faults(p.faults, p.detector)
-    detector = Detector.draw(optics.fall_off, settings, streams.generator("detector response"))
+    parameters = add_detector_faults(p.faults, p.detector)
+    detector = Detector.draw(optics.fall_off, parameters, streams.generator("detector response"))
     # a disc at the camera casts the vehicle's shadow; a fault can enlarge it
     shadow_disc_m = max(p.lander.caster_diameter_m, p.faults.vehicle_shadow_m)
     lowest = min(flight.states, key=lambda state: float(state.position_m[2]))

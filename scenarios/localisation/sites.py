@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.sim.parameters import merge_settings
+from marsyard.sim.parameters import merge_parameters
 from marsyard.sim.terrain import Site, TerrainParameters
 from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 from marsyard.sim.terrain.sites import SiteTexture
@@ -31,8 +31,8 @@ def localisation_sites() -> Mapping[str, Site]:
     tables = tomllib.loads(Path(__file__).with_name("sites.toml").read_text("utf-8"))
     sites = {}
     for name, entry in tables["sites"].items():
-        values = merge_settings(tables["common"], entry)
-        values["descent"] = merge_settings(tables["terrain"], values["descent"])
+        values = merge_parameters(tables["common"], entry)
+        values["descent"] = merge_parameters(tables["terrain"], values["descent"])
         for texture in ("ground_texture", "rock_texture"):
             values[texture] = _create_texture(values[texture])
         sites[name] = Site(name=name, **values)

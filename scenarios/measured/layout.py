@@ -19,7 +19,7 @@ from marsyard.sim.files import check_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded_field
 
-#: Names of the settings file and of the table of images in every folder.
+#: Names of the file of parameters and of the table of images in every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "images.csv"
 
 VELOCITY, LANDING, MATCHING = "velocity", "landing", "matching"
@@ -53,7 +53,7 @@ class CameraTable(Parameters):
 
 
 class DetectorTable(Parameters):
-    """Settings of the detector."""
+    """Parameters of the detector."""
 
     bits: Annotated[int, Field(ge=1, le=16, description="bits of a count; the largest count is 2^bits - 1")]
     offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="count of a dark pixel")] = 0.0
@@ -90,7 +90,7 @@ class SunTable(Parameters):
 
 
 class IngestFile(Parameters):
-    """`ingest.toml`: settings of the whole folder."""
+    """`ingest.toml`: parameters of the whole folder."""
 
     name: Annotated[
         str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="name of the campaign")

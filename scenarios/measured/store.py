@@ -99,7 +99,7 @@ class StoredCase(Parameters):
 
 
 class StoredDetector(Parameters):
-    """Settings of the detector of all images."""
+    """Parameters of the detector of all images."""
 
     offset_dn: float
     full_scale_dn: int

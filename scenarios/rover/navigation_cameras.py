@@ -56,8 +56,8 @@ class _StereoPair:
         """Draw the detectors of a pair with these true and calibrated cameras."""
         factor = 1.0 / p.navigation.binning
         binned_cameras = [(mast.left.scale(factor), mast.right.scale(factor)) for mast in (head.true, head.calibrated)]
-        settings, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
-        left, right = (Detector.draw(natural_fall_off(camera), settings, rng) for camera in binned_cameras[0])
+        detector, rng = preset(name).detector.bin(p.navigation.binning), streams.generator(f"{name} response")
+        left, right = (Detector.draw(natural_fall_off(camera), detector, rng) for camera in binned_cameras[0])
         # the exposure is metered in the binned image, which is the whole subframe
         exposure = p.exposure.model_copy(update={"metering": "subframe"})
         parameters = p.model_copy(update={"exposure": exposure})

@@ -296,7 +296,7 @@ class MastCameraParameters(Parameters):
         left, right = self.custom.cameras()
         return replace(design, left=left, right=right)
 
-    def settings(self) -> DetectorParameters:
+    def detector_parameters(self) -> DetectorParameters:
         """Return the parameters of both detectors."""
         detector = preset(self.preset).detector if self.detector is None else self.detector
         errors = {name: getattr(self, name) for name in ("defocus_px", "stray_light", "dust_discs", "dust_depth")}

@@ -76,8 +76,14 @@ class StereoCamera:
     @classmethod
     def draw(cls, p: RoverScenarioParameters, streams: Streams) -> StereoCamera:
         """Draw the detectors of both cameras; their fall-off is that of the nominal lens design."""
-        design, settings, rng = p.camera.mast(), p.camera.settings(), streams.generator("detector response")
-        left, right = (Detector.draw(_cached_fall_off(camera), settings, rng) for camera in (design.left, design.right))
+        design, parameters, rng = (
+            p.camera.mast(),
+            p.camera.detector_parameters(),
+            streams.generator("detector response"),
+        )
+        left, right = (
+            Detector.draw(_cached_fall_off(camera), parameters, rng) for camera in (design.left, design.right)
+        )
         return cls(p, (left, right), streams.generator("detector noise"))
 
     def take(

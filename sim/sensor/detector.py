@@ -187,8 +187,8 @@ class Detector:
         summed_response = _sum_rows(response, p.rows_summed) / p.rows_summed
         measured_response = summed_response * (1.0 + p.calibration_error * rng.standard_normal(summed_response.shape))
         names = ("exposure_s", "transfer_row_s", "clear_row_s", "rows_summed", "offset_dn", "full_scale_dn")
-        settings = {name: getattr(p, name) for name in names}
-        calibration = DetectorCalibration(flat_field=measured_response.astype(np.float64), **settings)
+        values = {name: getattr(p, name) for name in names}
+        calibration = DetectorCalibration(flat_field=measured_response.astype(np.float64), **values)
         is_bad, hot_e_s = np.zeros(fall_off.shape, dtype=np.bool_), None
         if p.defects.hot_fraction > 0.0:
             # the dark current of hot pixels is exponentially distributed

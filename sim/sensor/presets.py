@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel, mount_looking_down, read_cameras
 from marsyard.sim.files import open_regular
-from marsyard.sim.parameters import NonNegative, Parameters, Positive, merge_settings
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, merge_parameters
 from marsyard.sim.sensor import optics
 from marsyard.sim.sensor.detector import DetectorParameters
 from marsyard.sim.sensor.optics import LENS_TRANSMISSION, LightPath, OpticsParameters, bright_exposure_s
@@ -97,13 +97,13 @@ class Preset:
 
 def _create_mer_preset(design: CameraDesign, light: LightPath, sun_au: float, **changes: float | int) -> Preset:
     """Create a camera with the MER detector: the defaults of `DetectorParameters` with these changes."""
-    settings = {
+    values = {
         "responsivity_e_s": light.responsivity_e_s(sun_au),
         "sun_au": sun_au,
         "dark_e_s": optics.DARK_E_S,
         "optics": OpticsParameters(diffraction_px=light.diffraction_px()),
     }
-    return Preset(design, light, DetectorParameters.model_validate(settings | changes))
+    return Preset(design, light, DetectorParameters.model_validate(values | changes))
 
 
 #: MER descent camera: focal length 14.67 mm, pixel pitch 12 um.
@@ -298,21 +298,21 @@ def read_datasheet(path: str | Path) -> Datasheet:
         raise ValueError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from error
 
 
-def _resolve_detector(settings: object) -> object:
-    """Merge settings with those of the selected preset or datasheet, if there is one."""
-    if isinstance(settings, str):
-        settings = {"file": settings} if settings.endswith(".toml") else {"preset": settings}
-    if not isinstance(settings, Mapping) or all(settings.get(key) is None for key in ("preset", "file")):
-        return settings
-    if set(DetectorParameters.model_fields) <= set(settings):  # already resolved: settings stored with a campaign
-        return settings
-    if {"preset", "file"} <= set(settings):
+def _resolve_detector(values: object) -> object:
+    """Merge values with those of the selected preset or datasheet, if there is one."""
+    if isinstance(values, str):
+        values = {"file": values} if values.endswith(".toml") else {"preset": values}
+    if not isinstance(values, Mapping) or all(values.get(key) is None for key in ("preset", "file")):
+        return values
+    if set(DetectorParameters.model_fields) <= set(values):  # already resolved: values stored with a campaign
+        return values
+    if {"preset", "file"} <= set(values):
         raise ValueError("a detector is defined by a preset or by a datasheet file, not both")
-    changes = {key: value for key, value in settings.items() if key not in ("preset", "file")}
-    if "file" in settings:
-        file = str(settings["file"])
-        return merge_settings({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
-    return merge_settings(preset(str(settings["preset"])).detector.model_dump(), changes)
+    changes = {key: value for key, value in values.items() if key not in ("preset", "file")}
+    if "file" in values:
+        file = str(values["file"])
+        return merge_parameters({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
+    return merge_parameters(preset(str(values["preset"])).detector.model_dump(), changes)
 
 
 #: Detector parameters of a campaign, defined by values or by changes to a preset or datasheet:
@@ -389,23 +389,23 @@ class CustomCamera(Parameters):
         return cls.model_validate({"model": type(model).__name__.upper(), **values, **vectors, **origin})
 
 
-def _resolve_camera(settings: object) -> object:
-    """Read the camera file if the settings contain one; return other settings unchanged."""
-    if isinstance(settings, str | Path):
-        settings = {"file": str(settings)}
-    if not isinstance(settings, Mapping) or "model" in settings or not isinstance(settings.get("file"), str | Path):
-        return settings
-    unknown = [name for name in settings if name not in _FILE_KEYS]
+def _resolve_camera(values: object) -> object:
+    """Read the camera file if the values contain one; return other values unchanged."""
+    if isinstance(values, str | Path):
+        values = {"file": str(values)}
+    if not isinstance(values, Mapping) or "model" in values or not isinstance(values.get("file"), str | Path):
+        return values
+    unknown = [name for name in values if name not in _FILE_KEYS]
     if unknown:
         raise ValueError(f"unknown key {unknown[0]} for a camera file; allowed: {', '.join(_FILE_KEYS)}")
-    path, number, folded = str(settings["file"]), settings.get("number", 0), settings.get("subframe_folded_in", False)
-    size = settings.get("size")
+    path, number, folded = str(values["file"]), values.get("number", 0), values.get("subframe_folded_in", False)
+    size = values.get("size")
     if size is not None and not (isinstance(size, list | tuple) and [type(value) for value in size] == [int, int]):
         raise ValueError(f"{path}: size is {size!r}; allowed: [columns, rows]")
     cameras = read_cameras(path, subframe_folded_in=bool(folded), size=None if size is None else (size[0], size[1]))
     if not (isinstance(number, int) and 0 <= number < len(cameras)):
         raise ValueError(f"{path}: number is {number!r}; allowed: 0 to {len(cameras) - 1}")
-    if len(cameras) > 1 and "number" not in settings:
+    if len(cameras) > 1 and "number" not in values:
         raise ValueError(f"{path}: contains {len(cameras)} cameras; set number, 0 to {len(cameras) - 1}")
     return CustomCamera.from_camera(cameras[number], file=path, number=number, subframe_folded_in=bool(folded))
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
-from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field, merge_settings
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field, merge_parameters
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rasters import RealTerrain
@@ -79,7 +79,7 @@ class TerrainParameters(Parameters):
         """
         _check_names(TerrainParameters, changes, "")
         try:
-            return TerrainParameters.model_validate(merge_settings(self.model_dump(), changes))
+            return TerrainParameters.model_validate(merge_parameters(self.model_dump(), changes))
         except ValidationError as error:
             first = error.errors()[0]
             location = ".".join(str(part) for part in first["loc"])

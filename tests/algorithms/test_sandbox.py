@@ -103,12 +103,12 @@ def test_sandbox_without_bubblewrap_is_refused(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("values", "message"),
     [({"devices": ["cuda:0"]}, "allowed in the sandbox: cpu"), ({"isolated": False}, "allowed in the sandbox: true")],
 )
 def test_settings_that_the_sandbox_cannot_enforce_are_refused(
-    settings: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
+    values: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(process, "find_problem", lambda: "")
     with pytest.raises(ValidationError, match=message):
-        ExecutableLimits.model_validate({"sandbox": True, **settings})
+        ExecutableLimits.model_validate({"sandbox": True, **values})

@@ -38,7 +38,7 @@ def campaigns(tmp_path_factory: pytest.TempPathFactory) -> Path:
         directory = synthetic_run.write_run(folder / f"run-{day}", frame, products=products, **changes)
         record = (directory / "campaign.json").read_text()
         directory.joinpath("campaign.json").write_text(
-            record.replace('"configuration": {', f'"configuration": {{"parameters": {{"site": "{site}"}}, ', 1)
+            record.replace('"definition": {', f'"definition": {{"parameters": {{"site": "{site}"}}, ', 1)
         )
         write_report(directory)
     write_site(folder / "site", [folder])

@@ -85,7 +85,7 @@ def run(path: Path, directory: Path, watch: RecordingWatch, *overrides: str, job
 
 def sign_folder(directory: Path) -> None:
     """Make a folder, whose record a test has changed, one that was created here."""
-    record.update(directory, {"origin": describe_origin(record.stored_configuration(directory))})
+    record.update(directory, {"origin": describe_origin(record.stored_definition(directory))})
 
 
 def read_case_rows(directory: Path) -> list[dict[str, Any]]:

@@ -66,9 +66,9 @@ def test_explorations_do_not_use_the_seed_of_a_calibration() -> None:
     """The first cases of `loc-jezero` with the campaign's own seed are a calibration."""
     text = " ".join((ROOT / "docs" / "localisation.md").read_text().split())
     (kind,) = re.findall(r"first 24 descents of `loc-jezero` \(an? (\w+)", text)
-    configuration = load_campaign("loc-jezero").configuration
-    runs = configuration.calibration.runs
-    is_calibration = any(run.campaign == "loc-jezero" and run.seed == configuration.seed for run in runs)
+    definition = load_campaign("loc-jezero").definition
+    runs = definition.calibration.runs
+    is_calibration = any(run.campaign == "loc-jezero" and run.seed == definition.seed for run in runs)
     assert (kind == "calibration") == is_calibration
 
 
@@ -95,7 +95,7 @@ def test_number_of_cases_of_a_campaign_is_that_of_its_file() -> None:
                 continue
             number = re.match(r"[\d,]+", cells[2])
             assert number is not None, cells
-            cases = load_campaign(command.group(1)).configuration.cases
+            cases = load_campaign(command.group(1)).definition.cases
             assert int(number.group().replace(",", "")) == cases, cells
             n_rows += 1
     assert n_rows > 20

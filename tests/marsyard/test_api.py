@@ -47,11 +47,11 @@ def test_import_loads_no_heavy_packages() -> None:
 def test_changes_accept_python_values() -> None:
     changes = {"terrain.samples": 1024, "location.east_m": 3.5, "compared": ["homography"], "site": "meridiani"}
     campaign = marsyard.load_campaign("dimes-smoke", changes, cases=3)
-    parameters = campaign.configuration.parameters
+    parameters = campaign.definition.parameters
     assert parameters["terrain"]["samples"] == 1024
     assert parameters["compared"] == ["homography"]
     assert parameters["site"] == "meridiani"
-    assert "location.east_m" not in campaign.configuration.dispersions
+    assert "location.east_m" not in campaign.definition.dispersions
     assert len(marsyard.draws(campaign, 3)) == 3
 
 

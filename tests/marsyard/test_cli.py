@@ -163,7 +163,7 @@ def test_exit_status_follows_verdict_and_crashes(
     assert (report_result.status, f"verdict: {verdict}" in report_result.out) == (status, True)
 
 
-def test_configuration_error_precedes_failed_cases(tmp_path: Path) -> None:
+def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
     invalid_requirement = REQUIREMENT.replace("velocity_error_m_s", "velocity_error_m")
     path = write_campaign(tmp_path, _crashing_case_setting(0), dispersions="", requirement=invalid_requirement)
     result = marsyard("run", path, "-n", 3, "--jobs", 1, "--out", tmp_path / "run")

@@ -71,8 +71,8 @@ def test_first_confirmation_with_a_committed_record_passes(marsyard: Command, tm
     assert (entry.claim, entry.number, entry.cases, entry.results) == (claim, 1, 10, {"VELOCITY": "PASS"})
     stored = json.loads((tmp_path / "run-1" / "campaign.json").read_text())
     # seed and seed of the terrains follow from the content alone
-    assert stored["seed"] == entry.seed == confirmation_seed(claim, "") != campaign.configuration.seed
-    assert stored["configuration"]["parameters"]["bank_seed"] == entry.bank_seeds["bank_seed"] > 1
+    assert stored["seed"] == entry.seed == confirmation_seed(claim, "") != campaign.definition.seed
+    assert stored["definition"]["parameters"]["bank_seed"] == entry.bank_seeds["bank_seed"] > 1
     assert marsyard("confirmations").out.endswith("record: registered\n")
     # the recorded command repeats the run with the same terrains
     words = stored["command"]["words"]

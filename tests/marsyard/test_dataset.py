@@ -114,13 +114,13 @@ def test_samples_contain_pixel_truth_and_are_reproducible(tmp_path: Path) -> Non
     assert [path.read_bytes() for path in shards] == contents_before
     status, output = run_dataset(tmp_path, "--seed", "4")
     assert status == 2
-    assert "contains another data set (configuration_sha256 differs)" in output
+    assert "contains another data set (definition_sha256 differs)" in output
 
 
 @pytest.mark.slow
 def test_descent_sample_has_three_images(tmp_path: Path) -> None:
-    settings = ["terrain.samples=512", "location.bank=8"]
-    arguments = [argument for setting in settings for argument in ("--set", setting)]
+    overrides = ["terrain.samples=512", "location.bank=8"]
+    arguments = [argument for override in overrides for argument in ("--set", override)]
     out = tmp_path / "set"
     status, output = run_command("dataset", "dimes-smoke", "-n", 1, "--jobs", 1, "--out", out, *arguments)
     assert status == 0, output
@@ -129,7 +129,7 @@ def test_descent_sample_has_three_images(tmp_path: Path) -> None:
     assert kinds == {"image.png", "range.npy", "normal.npy", "rocks.png", "cahvor", "json"}
     assert {name.partition(".")[0] for name in files} == {f"0000000-{number}" for number in range(3)}
 
-    campaign = load_campaign("dimes-smoke", settings)
+    campaign = load_campaign("dimes-smoke", overrides)
     parameters = campaign.parameters(0)
     assert isinstance(parameters, DescentScenarioParameters)
     surface = DescentWorld.from_parameters(parameters).surface

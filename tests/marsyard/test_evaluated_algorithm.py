@@ -128,7 +128,7 @@ def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path
     first, second = (
         json.loads((run_folder / "campaign.json").read_text()) for run_folder in (folder / "run", second_run)
     )
-    assert first["configuration"] == second["configuration"]
+    assert first["definition"] == second["definition"]
     assert first["algorithms"] == second["algorithms"]
     columns = ("case", "outcome", "image_hash", "algorithm", "homography.velocity_error_m_s")
     rows = [
@@ -144,10 +144,8 @@ def test_appended_blocks_are_in_the_command(folder: Path) -> None:
     from marsyard.reports.stored import read_run
 
     run = read_run(folder / "run")
-    configuration = {**run.record["configuration"], "appended": [20]}
-    run_with_append = type(run)(
-        run.directory, run.frame, run.all_cases, {**run.record, "configuration": configuration}, ()
-    )
+    definition = {**run.record["definition"], "appended": [20]}
+    run_with_append = type(run)(run.directory, run.frame, run.all_cases, {**run.record, "definition": definition}, ())
     assert rerun_commands(run_with_append)[-1] == "marsyard append runs/custom-campaign-again 20"
 
 

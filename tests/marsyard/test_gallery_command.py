@@ -44,11 +44,11 @@ def images() -> list[GalleryImage]:
     rng = np.random.default_rng(1)
     return [
         GalleryImage(
-            ImageRequest.from_defaults(site, camera, **settings),
+            ImageRequest.from_defaults(site, camera, **values),
             rng.integers(0, 256, (480, 640), dtype=np.uint8),
             f"{number}-{site}.jpg",
         )
-        for number, (site, camera, settings) in enumerate(VIEWS)
+        for number, (site, camera, values) in enumerate(VIEWS)
     ]
 
 

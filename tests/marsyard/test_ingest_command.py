@@ -51,10 +51,10 @@ def test_campaign_with_truth_gets_an_error_requirement(tmp_path: Path) -> None:
     assert tables["parameters"]["dimes"]["binned_size"] == [256, 256]
     assert (requirement["decide_by"], requirement["population"]) == ("estimate", "valid and truth_known")
     campaign = load_campaign(str(path))
-    assert campaign.configuration.total_cases == 2
+    assert campaign.definition.total_cases == 2
     assert [campaign.parameters(case).case.name for case in range(2)] == ["one", "two"]  # type: ignore[attr-defined]
     # the identity of the campaign includes the hash of all images
-    assert len(campaign.configuration.parameters["cases"]["sha256"]) == 64
+    assert len(campaign.definition.parameters["cases"]["sha256"]) == 64
 
 
 def test_invalid_input_has_status_2_and_leaves_no_files(tmp_path: Path) -> None:

@@ -43,14 +43,14 @@ def working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_new_campaign_is_valid(working_folder: Path, system: str, scenario: str, bound: float) -> None:
     status, output = run_command("new", "mine", "--system", system, "--bound", str(bound), "-n", "30")
     assert status == 0, output
-    configuration = load_campaign("mine.toml").configuration
-    assert (configuration.name, configuration.scenario, configuration.cases) == ("mine", scenario, 30)
-    requirement, availability = configuration.requirements
+    definition = load_campaign("mine.toml").definition
+    assert (definition.name, definition.scenario, definition.cases) == ("mine", scenario, 30)
+    requirement, availability = definition.requirements
     assert bound in (requirement.bound, requirement.probability)
     # an algorithm that refuses every answer fails the second requirement
     assert availability.metric in ("answered", "site_reported")
     # every dispersion has a source and every table a comment
-    assert all(dispersion.source for dispersion in configuration.dispersions.values())
+    assert all(dispersion.source for dispersion in definition.dispersions.values())
     lines = (working_folder / "mine.toml").read_text().splitlines()
     assert sum(line.startswith("#") for line in lines) >= 8
     assert load_campaign("mine.toml").draws(3)
@@ -72,9 +72,9 @@ def test_new_campaign_without_failures_passes(working_folder: Path) -> None:
     campaign = load_campaign("mine.toml")
     terrains = [campaign.draws(case)["location.terrain"] for case in range(230)]
     frame = pd.DataFrame({"case": range(230), "terrain": terrains, "answered": True, "velocity_error_m_s": 1.0})
-    settings = campaign.configuration.model_dump(mode="json")
+    definition = campaign.definition.model_dump(mode="json")
     verdicts = evaluate_requirements(
-        frame.assign(outcome="VALID"), settings["requirements"], read_sampling_design(settings)
+        frame.assign(outcome="VALID"), definition["requirements"], read_sampling_design(definition)
     )
     assert [(item.status, item.n, item.terrains) for item in verdicts] == 2 * [(Status.PASS, 230, 230)]
 
@@ -89,7 +89,7 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
 
 
 @pytest.mark.parametrize(
-    ("name", "settings", "supply"),
+    ("name", "overrides", "supply"),
     [
         ("dimes-smoke", ["location.bank=8"], "has only 8 terrains (location.bank = 8)"),
         ("dimes-smoke", ["location.bank=8", f'{TERRAIN}.distribution="integer"'], "8 terrains (location.bank = 8)"),
@@ -97,14 +97,14 @@ def test_limits_of_the_evidence_are_reported_before_a_run(working_folder: Path) 
         ("vtt-terrains", ['dispersions."world.terrain"={low=2,high=5}'], '(dispersions."world.terrain" = 4)'),
     ],
 )
-def test_advice_about_terrains_can_be_followed_literally(name: str, settings: list[str], supply: str) -> None:
+def test_advice_about_terrains_can_be_followed_literally(name: str, overrides: list[str], supply: str) -> None:
     """More cases on the same terrains do not add evidence; the options of the advice do."""
-    (advice,) = evidence_limits(load_campaign(name, settings, 1000))
+    (advice,) = evidence_limits(load_campaign(name, overrides, 1000))
     assert supply in advice
     options = shlex.split(advice.rpartition(": ")[2].removesuffix("."))
     assert options[-2] == "-n"
-    additional_settings = [value for option, value in pairwise(options) if option == "--set"]
-    campaign = load_campaign(name, [*settings, *additional_settings], int(options[-1]))
+    further_overrides = [value for option, value in pairwise(options) if option == "--set"]
+    campaign = load_campaign(name, [*overrides, *further_overrides], int(options[-1]))
     assert evidence_limits(campaign) == []
     path = "world.terrain" if name == "vtt-terrains" else "location.terrain"
     assert len({campaign.draws(case)[path] for case in range(int(options[-1]))}) == int(options[-1])
@@ -121,7 +121,7 @@ def test_camera_file_is_used_in_the_new_campaign(working_folder: Path) -> None:
     assert status == 0, output
     tables = tomllib.loads((working_folder / "mine.toml").read_text())
     assert tables["parameters"]["camera"]["model"] == "cam.yaml"
-    parameters = load_campaign("mine.toml").configuration.parameters
+    parameters = load_campaign("mine.toml").definition.parameters
     assert parameters["camera"]["model"]["columns"] == 752
     assert parameters["detector"]["rows_summed"] == 1
 
@@ -159,7 +159,7 @@ def test_invalid_answers_are_rejected_in_the_dialogue(working_folder: Path, monk
         "'many' is not allowed",
     ):
         assert message in text
-    assert load_campaign("mine.toml").configuration.requirements[0].bound == 4.0
+    assert load_campaign("mine.toml").definition.requirements[0].bound == 4.0
 
 
 def test_existing_campaign_file_is_kept(working_folder: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import DefinitionError
 from marsyard.cli import nightly_plan
 from marsyard.cli.nightly_plan import PLAN_FILE, hash_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
@@ -148,6 +148,6 @@ def test_campaigns_of_the_shipped_plan_load() -> None:
 )
 def test_invalid_plans_are_rejected(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "plan.toml").write_text(text)
-    with pytest.raises(ConfigurationError) as error_info:
+    with pytest.raises(DefinitionError) as error_info:
         read_plan(tmp_path / "plan.toml")
     assert message in str(error_info.value)

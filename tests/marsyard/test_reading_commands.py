@@ -60,7 +60,7 @@ def folders(tmp_path: Path) -> dict[str, Path]:
     for number, (scenario, names) in enumerate(NAMES.items()):
         folders[scenario] = shutil.copytree(original, tmp_path / f"run-{number}")
         record = json.loads((original / "campaign.json").read_text())
-        record["configuration"] |= {"scenario": scenario, "parameters": names | PARTS}
+        record["definition"] |= {"scenario": scenario, "parameters": names | PARTS}
         for entry in record["algorithms"]:
             entry |= {"spec": "trap:Estimator", "path": "trap:Estimator"}
         (folders[scenario] / "campaign.json").write_text(json.dumps(record))

@@ -72,12 +72,12 @@ def test_missing_algorithm_is_reported_and_changes_nothing(tmp_path: Path, monke
 
     folder = tmp_path / "run"
     folder.mkdir()
-    configuration = load_campaign("dimes-smoke", [], 1).configuration
-    parameters = {**configuration.parameters, "algorithm": "my_absent_module:Estimator"}
+    definition = load_campaign("dimes-smoke", [], 1).definition
+    parameters = {**definition.parameters, "algorithm": "my_absent_module:Estimator"}
     create_store(folder / ROWS_FILE, {"identity": "x"})
-    identity = create_identity(configuration)
-    configuration = configuration.model_copy(update={"parameters": parameters})
-    record.write_first_record(folder, configuration, identity, "nobody", origin=describe_origin(configuration))
+    identity = create_identity(definition)
+    definition = definition.model_copy(update={"parameters": parameters})
+    record.write_first_record(folder, definition, identity, "nobody", origin=describe_origin(definition))
     files_before = _read_files(folder)
     status, output = run_command("replay", folder, 0)
     assert status == 2
@@ -93,7 +93,7 @@ def test_products_are_kept_if_the_replayed_case_fails(
     files_before = _read_files(copy / "cases")
     text = (copy / "campaign.json").read_text()
     changed_record = json.loads(text)
-    changed_record["configuration"]["parameters"]["raising_cases"] = [0]
+    changed_record["definition"]["parameters"]["raising_cases"] = [0]
     (copy / "campaign.json").write_text(json.dumps(changed_record))
     sign_folder(copy)
     status, output = run_command("replay", copy, 0)

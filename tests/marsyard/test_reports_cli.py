@@ -151,9 +151,9 @@ def test_adaptive_campaign_reports_its_end(tmp_path: Path) -> None:
     path = write_campaign(tmp_path, "error_scale = 1e3", requirement=requirement, dispersions=dispersions)
     campaign, watch = load_campaign(str(path), cases=128), RecordingWatch()
     run_until_decided(campaign, tmp_path / "run", ExecutorConfig(jobs=1), watch)
-    configuration = record.stored_configuration(tmp_path / "run")
+    definition = record.stored_definition(tmp_path / "run")
     # All cases fail on one terrain, which counts as one case. One failure does not refute a rate of 50 %.
-    assert (configuration.total_cases, configuration.max_cases) == (128, 128)
+    assert (definition.total_cases, definition.max_cases) == (128, 128)
     assert watch.notes[-1] == "stopped after 128 of at most 128 cases"
 
 

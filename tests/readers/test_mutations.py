@@ -158,13 +158,13 @@ def _write_parquet_rows(path: Path) -> None:
 def _write_record(path: Path) -> None:
     campaign = path.with_name("fake.toml")
     campaign.write_text(CAMPAIGN)
-    configuration = load_campaign(str(campaign)).configuration
+    definition = load_campaign(str(campaign)).definition
     environment = {"machine": "x86_64"}
     contents = {
         "schema": record.SCHEMA, "name": "fake", "state": "finished", "cases": 12, "cases_finished": 12,
         "cases_crashed": 0, "requirements": [], "sessions": [{"environment": environment}], "changes": [],
-        "configuration": configuration.model_dump(mode="json"), "environment": environment,
-        "identity": {"configuration": "1", "code": "2", "versions": {}, "inputs": {}},
+        "definition": definition.model_dump(mode="json"), "environment": environment,
+        "identity": {"definition": "1", "code": "2", "versions": {}, "inputs": {}},
     }  # fmt: skip
     path.write_text(json.dumps(contents, indent=1))
 
@@ -242,7 +242,7 @@ READERS: Mapping[str, Reader] = {
         "requirements.toml", _text(CAMPAIGN[CAMPAIGN.index("[[req"):]), read_requirements, CampaignError
     ),
     "record": Reader(
-        "campaign.json", _write_record, lambda path: record.stored_configuration(path.parent), StoreError
+        "campaign.json", _write_record, lambda path: record.stored_definition(path.parent), StoreError
     ),
     "rows": Reader("cases.sqlite", _write_store, _read_store, StoreError),
     "table": Reader("cases.parquet", _write_parquet_rows, read_rows, StoreError),

@@ -120,7 +120,7 @@ def synthetic_products(seed: int = 1) -> dict[str, Any]:
 
 def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the content of `campaign.json` in the form that the engine writes."""
-    configuration = {
+    definition = {
         "name": "dimes-synthetic",
         "scenario": "descent",
         "description": "Parachute descents over rough terrain: synthetic rows for tests of the report.",
@@ -144,7 +144,7 @@ def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, An
         "seed": 7,
         "jobs": 2,
         "requirements": list(requirements),
-        "configuration": configuration,
+        "definition": definition,
         "showcase": 3,
         "versions": {"marsyard": "0.1.0", "numpy": "2.4.0", "scipy": "1.17.0"},
         "git_commit": "0123456789abcdef0123456789abcdef01234567",
@@ -153,7 +153,7 @@ def synthetic_record(frame: pd.DataFrame, requirements: Sequence[Mapping[str, An
         "cases_crashed": 0,
         "sessions": [{"command": "run"}],
         "changes": [],
-        "identity": {"configuration": "a", "code": "b", "versions": {}, "inputs": {}},
+        "identity": {"definition": "a", "code": "b", "versions": {}, "inputs": {}},
     }
 
 

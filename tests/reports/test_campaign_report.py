@@ -222,8 +222,8 @@ def test_texts_from_files_are_escaped(make_run: MakeRun, dimes_products: dict[st
         "[]",
         "null",
         "{not json",
-        '{"requirements": "all", "configuration": 7, "dispersions": [1], "versions": null, "showcase": "x"}',
-        '{"requirements": [1, null, {}], "environment": "x", "configuration": {"dispersions": {"a": 1}}}',
+        '{"requirements": "all", "definition": 7, "dispersions": [1], "versions": null, "showcase": "x"}',
+        '{"requirements": [1, null, {}], "environment": "x", "definition": {"dispersions": {"a": 1}}}',
         '{"name": "\\ud800", "seed": [1], "description": {"a": "b"}}',
     ],
 )

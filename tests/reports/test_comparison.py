@@ -112,7 +112,7 @@ def test_campaigns_with_the_same_draws_are_compared_in_pairs(make_run: MakeRun) 
 
 def test_terrains_of_different_banks_are_not_paired(make_run: MakeRun) -> None:
     banks = [{"parameters": {"location": {"bank_seed": seed}}} for seed in (1, 2)]
-    runs = [make_run(make_rows(100), name=f"run-{seed}", configuration=bank) for seed, bank in enumerate(banks)]
+    runs = [make_run(make_rows(100), name=f"run-{seed}", definition=bank) for seed, bank in enumerate(banks)]
     assert not _compare(*runs)[0]
     assert _compare(runs[0], runs[0])[0]
 
@@ -138,8 +138,8 @@ def test_terrains_of_different_sites_are_not_paired(make_run: MakeRun) -> None:
         terrain_error = np.random.default_rng(seed).uniform(1.0, 3.0, 20)
         frame = make_rows(400, terrains=20, answer_rate=1.0, seed=seed)
         frame["velocity_error_m_s"] = terrain_error[frame["terrain"]] + 0.1 * np.arange(400) / 400
-        configuration = {"parameters": {"site": name}}
-        return make_run(frame, name=name, seed=seed, configuration=configuration)
+        definition = {"parameters": {"site": name}}
+        return make_run(frame, name=name, seed=seed, definition=definition)
 
     gusev, meridiani = read_run(write_site_run("gusev", 1)), read_run(write_site_run("meridiani", 6))
     assert min(entry.p_value for entry in compare_campaigns(gusev, meridiani)[1]) > 0.05

@@ -16,7 +16,7 @@ from marsyard.reports.stored import read_study
 
 
 def create_study(limit: float, violations: int, cases: int, terrains: int = 0, probability: float = 1e-4) -> Any:
-    """Create the stored settings and the result of a study with four replicates around a probability."""
+    """Create the stored parameters and the result of a study with four replicates around a probability."""
     replicates = [
         SubsetResult(factor * probability, SubsetEnd.VIOLATION, (2.0, 1.0), (Level(1.0, 50, 0),), np.zeros((1, 2)))
         for factor in (0.8, 1.0, 1.3, 0.9)

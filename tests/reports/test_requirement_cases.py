@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
@@ -144,7 +144,7 @@ def test_conditions_of_a_landing_contain_no_results(make_run: MakeRun) -> None:
     results = ["footprints_roughness_below_1_unflagged", "gross_hazards_unflagged", "tracks", "points", "inliers"]
     conditions = ["sun_elevation_deg", "pose_tilt_error_deg", "image_contrast"]
     frame = frame.assign(**{name: rng.random(len(frame)) for name in (*results, *conditions)})
-    evaluation = evaluate_run(make_run(frame, [AVAILABLE], configuration={"scenario": "landing"}, scenario="landing"))
+    evaluation = evaluate_run(make_run(frame, [AVAILABLE], definition={"scenario": "landing"}, scenario="landing"))
     summary = CaseFinder(evaluation.run, evaluation.verdicts).summary(0)
     assert summary is not None
     assert {driver.name for driver in summary.drivers} >= {label(name) for name in conditions}

@@ -28,16 +28,16 @@ DESIGNS = [
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"design": None}, {"design": 3}, {"design": {"kind": None, "nominal": "x"}}, {"dispersions": [1]}]
+    "values", [{}, {"design": None}, {"design": 3}, {"design": {"kind": None, "nominal": "x"}}, {"dispersions": [1]}]
 )
-def test_default_design_is_independent_draws(settings: dict[str, Any]) -> None:
-    assert read_sampling_design(settings) == INDEPENDENT
+def test_default_design_is_independent_draws(values: dict[str, Any]) -> None:
+    assert read_sampling_design(values) == INDEPENDENT
     assert INDEPENDENT.no_probability == ""
 
 
-@pytest.mark.parametrize(("configuration", "message"), DESIGNS)
-def test_designs_without_independent_draws_have_no_confidence(configuration: dict[str, Any], message: str) -> None:
-    frame, design = make_rows(2000), read_sampling_design(configuration)
+@pytest.mark.parametrize(("definition", "message"), DESIGNS)
+def test_designs_without_independent_draws_have_no_confidence(definition: dict[str, Any], message: str) -> None:
+    frame, design = make_rows(2000), read_sampling_design(definition)
     requirements = [{**VELOCITY, "probability": probability} for probability in (0.5, VELOCITY["probability"])]
     for verdict, reference in zip(
         evaluate_requirements(frame, requirements, design), evaluate_requirements(frame, requirements), strict=True
@@ -59,10 +59,10 @@ def test_designs_without_independent_draws_have_no_confidence(configuration: dic
     assert "Clopper" not in output.getvalue()
 
 
-@pytest.mark.parametrize(("configuration", "message"), DESIGNS)
-def test_rate_decides_for_designs_without_independent_draws(configuration: dict[str, Any], message: str) -> None:
+@pytest.mark.parametrize(("definition", "message"), DESIGNS)
+def test_rate_decides_for_designs_without_independent_draws(definition: dict[str, Any], message: str) -> None:
     """A rate of 0.98 in 1000 cases meets 0.98 but not 0.99; the verdict has no bounds."""
-    frame, design = make_rows(1000), read_sampling_design(configuration)
+    frame, design = make_rows(1000), read_sampling_design(definition)
     frame["answered"], frame["velocity_error_m_s"] = True, np.where(np.arange(1000) % 50, 0.1, 99.0)
     requirements = [{**VELOCITY, "probability": min_rate, "decide_by": "estimate"} for min_rate in (0.98, 0.99)]
     met_verdict, failed_verdict = evaluate_requirements(frame, requirements, design)
@@ -107,7 +107,7 @@ def test_page_and_json_describe_the_design(make_run: MakeRun) -> None:
     frame.loc[0, "velocity_error_m_s"] = 77.0
     directory = make_run(frame)
     record = json.loads((directory / "campaign.json").read_text())
-    record["configuration"]["design"] = {"kind": "latin-hypercube", "nominal": True}
+    record["definition"]["design"] = {"kind": "latin-hypercube", "nominal": True}
     (directory / "campaign.json").write_text(json.dumps(record))
     page = write_report(directory).read_text()
     report = json.loads((directory / "report.json").read_text())

@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.blocks import correlation_text, estimate_effects
 from marsyard.reports.decision import evaluate_requirements
@@ -206,7 +206,7 @@ def test_populations_are_described_in_words(population: str, text: str) -> None:
 @pytest.mark.parametrize("campaign", sorted(catalogue()))
 def test_criteria_of_the_catalogue_are_written_by_hand(campaign: str) -> None:
     """No text of a requirement contains the name of a column, or a series of phrases that start with "with"."""
-    for requirement in load_campaign(campaign).configuration.requirements:
+    for requirement in load_campaign(campaign).definition.requirements:
         text = requirement_text(requirement)
         # without an entry in `templates/notes.toml`, the name of the column is quoted; 'no safe site' is an answer
         assert "'" not in text.replace("'no safe site'", "").replace("rover's", "").replace("lander's", ""), text

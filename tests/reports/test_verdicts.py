@@ -365,7 +365,7 @@ def test_configured_conditions_also_restrict_the_result_of_all_cases() -> None:
     assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
     assert verdict.all_cases.text.startswith("For comparison: if all 10 cases with the navcam counted, ")
-    # the population is the configuration itself
+    # the population is the definition itself
     (configured_population,) = evaluate_requirements(
         frame, [{**VELOCITY, "population": "navcam"}], configured=("nav*",)
     )

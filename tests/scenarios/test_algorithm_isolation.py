@@ -38,7 +38,7 @@ def _clear_spies() -> Iterator[None]:
 
 def run_small_case(name: str, algorithm: str, compared: tuple[str, ...] = (), case: int = 0) -> CaseResult:
     """Run a small case of a scenario; `compared` are the names of further algorithms of the spies module."""
-    from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
+    from tests.scenarios.descent.descents import DESCENT, SMALL_WORLD
     from tests.scenarios.rover.short_run import SHORT_RUN
     from tests.scenarios.test_fieldtest import make_parameters
 

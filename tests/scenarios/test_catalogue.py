@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.running.engine import check_metrics
@@ -22,9 +22,9 @@ def _run_small_case(scenario: str) -> Row:
         result = SharedDriveScenario().run(_make_short_drive(), Streams(1, "catalogue", 0))
     else:
         small_campaigns = {
-            load_campaign(name, settings).configuration.scenario: (name, settings)
+            load_campaign(name, overrides).definition.scenario: (name, overrides)
             for system in systems()
-            for name, settings in system.compilation_campaigns.items()
+            for name, overrides in system.compilation_campaigns.items()
         }
         # The field test has no small campaign: its first case is run.
         campaign = load_campaign(*small_campaigns.get(scenario, ("dimes-fieldtest", ())))
@@ -54,11 +54,11 @@ def _make_short_drive() -> SharedDriveParameters:
 
 
 def _read_parameters(campaign: str) -> dict[str, list[dict[str, str]]]:
-    return dict(load_campaign(campaign).configuration.parameters)
+    return dict(load_campaign(campaign).definition.parameters)
 
 
 def _list_campaigns(scenario: str) -> list[str]:
-    return [name for name in catalogue() if load_campaign(name).configuration.scenario == scenario]
+    return [name for name in catalogue() if load_campaign(name).definition.scenario == scenario]
 
 
 @pytest.mark.slow
@@ -68,7 +68,7 @@ def _list_campaigns(scenario: str) -> list[str]:
 def test_requirements_use_columns_of_their_scenario(scenario: str) -> None:
     row = _run_small_case(scenario)
     for name in _list_campaigns(scenario):
-        check_metrics(load_campaign(name).configuration, row, Path(name))
+        check_metrics(load_campaign(name).definition, row, Path(name))
 
 
 #: Columns that are true only for an answer, or that contain a number only for one.
@@ -81,7 +81,7 @@ ANSWER_FLAGS = {"valid", "site_reported", "landed", "fixed_in_time", "position_r
 
 
 def read_campaign_requirements(name: str) -> tuple[Requirement, ...]:
-    return tuple(load_campaign(name).configuration.requirements)
+    return tuple(load_campaign(name).definition.requirements)
 
 
 def has_all_answers(requirement: Requirement) -> bool:

@@ -84,7 +84,7 @@ def test_labels_are_unique_column_names() -> None:
         (LANDING, "hda", "check_footprints", True),
     ],
 )
-def test_only_the_custom_configuration_accepts_an_improvement(
+def test_only_the_custom_variant_accepts_an_improvement(
     task: Task[Any, Any], name: str, key: str, improved_value: Any
 ) -> None:
     defaults = task.options()

@@ -27,7 +27,7 @@ from marsyard.scenarios.systems import find_system, scenario
 name = sys.argv[1]
 scenario(name)
 campaigns = (load_campaign(campaign) for campaign in find_system(name).campaigns)
-campaign = next((campaign for campaign in campaigns if campaign.configuration.scenario == name), None)
+campaign = next((campaign for campaign in campaigns if campaign.definition.scenario == name), None)
 is_checked = campaign is not None and campaign.parameters(0) is not None
 modules = [module.removeprefix("marsyard.") for module in sys.modules if module.startswith("marsyard.")]
 print(json.dumps([is_checked, modules]))

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from marsyard.campaigns.definition import requirements
 from marsyard.campaigns.definition.identity import custom_sources
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import DefinitionError
 from marsyard.cli.app import app
 from marsyard.doctor import CheckResult, check_systems
 from marsyard.scenarios import columns as column_declarations
@@ -214,7 +214,7 @@ def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path)
     assert "DIMES-VEL" in requirements.shipped_requirements()
     campaign = tmp_path / "campaign.toml"
     campaign.write_text('name = "c"\nscenario = "descent"\ncases = 1\n[[requirements]]\nid = "MINE"\n')
-    with pytest.raises(ConfigurationError, match=r"unknown requirement 'MINE'.*requirements\.toml: .*metric.*required"):
+    with pytest.raises(DefinitionError, match=r"unknown requirement 'MINE'.*requirements\.toml: .*metric.*required"):
         load_campaign(str(campaign))
 
 

@@ -89,7 +89,7 @@ def assert_all_fields_are_compared(measurement_class: type[Any], names: set[str]
 
 @pytest.mark.parametrize("case", CASES)
 def test_descent_inputs_differ_from_truth(case: int) -> None:
-    from tests.scenarios.descent.settings import DESCENT, SMALL_WORLD
+    from tests.scenarios.descent.descents import DESCENT, SMALL_WORLD
 
     parameters = DescentScenarioParameters.model_validate(
         {

@@ -37,8 +37,8 @@ def test_timeline_of_a_case(name: str, tmp_path: Path) -> None:
     # the extra `view` is installed only for slow tests
     from marsyard.reports.timeline.rerun_file import write_rerun
 
-    settings, contents = CAMPAIGNS[name]
-    campaign = load_campaign(name, settings)
+    overrides, contents = CAMPAIGNS[name]
+    campaign = load_campaign(name, overrides)
     parameters = campaign.parameters(0)
     for shared_input in campaign.scenario.shared_inputs(parameters):
         campaign.scenario.prepare(parameters, shared_input)

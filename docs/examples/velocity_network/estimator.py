@@ -65,7 +65,7 @@ def _select(velocities_m_s: np.ndarray, probabilities: np.ndarray) -> VelocityEs
 def create_session(network: Path, device: str) -> onnxruntime.InferenceSession:
     """Load a network on a device. Raises RuntimeError if the device is not available.
 
-    ONNX Runtime itself would continue on the CPU, and the campaign would measure another configuration.
+    ONNX Runtime itself would continue on the CPU, and the campaign would measure another algorithm.
     """
     options = onnxruntime.SessionOptions()
     # one core per worker: the cores belong to the other workers
@@ -78,13 +78,13 @@ def create_session(network: Path, device: str) -> onnxruntime.InferenceSession:
     provider = "CUDAExecutionProvider"
     if provider not in onnxruntime.get_available_providers():
         raise RuntimeError(f"no {device}: install onnxruntime-gpu instead of onnxruntime")
-    settings = {
+    provider_options = {
         "device_id": number,
         "gpu_mem_limit": str(GPU_MEMORY_BYTES),
         "arena_extend_strategy": "kSameAsRequested",  # by default the memory grows to powers of two
         "use_tf32": "0",  # by default products are rounded to 10 bits
     }
-    session = onnxruntime.InferenceSession(network, options, providers=[(provider, settings)])
+    session = onnxruntime.InferenceSession(network, options, providers=[(provider, provider_options)])
     if provider not in session.get_providers():
         raise RuntimeError(f"no {device}: ONNX Runtime cannot use it; its messages are in standard error")
     return session

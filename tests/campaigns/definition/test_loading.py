@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import DefinitionError
 from marsyard.scenarios.systems import catalogue
 from tests.campaigns.fake_campaign import CampaignFile, to_toml
 
@@ -20,15 +20,15 @@ FAKE = "tests.campaigns.fake_scenario"
 
 def load_and_expect_error(path: Path | str, *overrides: str, cases: int | None = None, seed: int | None = None) -> str:
     """Return the message of the error that loading the campaign raises."""
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         load_campaign(str(path), overrides, cases, seed)
     return str(error.value)
 
 
 def test_omitted_parameters_get_their_defaults(campaign_file: CampaignFile) -> None:
     campaign = load_campaign(str(campaign_file("altitude_m = 1500")))
-    assert campaign.configuration.parameters["altitude_m"] == 1500.0
-    assert campaign.configuration.parameters["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
+    assert campaign.definition.parameters["altitude_m"] == 1500.0
+    assert campaign.definition.parameters["wind"] == {"east_m_s": 0.0, "north_m_s": 0.0}
 
 
 NAMED = f"name='a'\nscenario='{FAKE}:FakeScenario'\n"
@@ -147,7 +147,7 @@ def test_all_problems_are_listed_together(campaign_file: CampaignFile) -> None:
     path = campaign_file(
         "altitude_m = -1\nwnd = 3", extra_tables="[retain]\nshowcase = 'best'", dispersions="[dispersions]\nkind = 3"
     )
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         load_campaign(str(path), [], cases=0)
     keys = {problem.key for problem in error.value.problems}
     assert keys == {"cases", "parameters.altitude_m", "parameters.wnd", "retain.showcase", "dispersions.kind"}
@@ -182,17 +182,17 @@ def test_documented_sampling_example_can_be_loaded(tmp_path: Path) -> None:
 def test_overrides_replace_values_and_dispersions(campaign_file: CampaignFile) -> None:
     path = str(campaign_file())
     overrides = ["altitude_m=1500", "wind.east_m_s = 3", "kind=smooth", "retain.showcase=none", "heights_m=[3, 4.5]"]
-    configuration = load_campaign(path, overrides, cases=7, seed=9).configuration
-    assert (configuration.cases, configuration.seed, configuration.retain.showcase) == (7, 9, "none")
-    assert configuration.parameters["altitude_m"] == 1500.0
-    assert configuration.parameters["kind"] == "smooth"
-    assert configuration.parameters["heights_m"] == [3.0, 4.5]
+    definition = load_campaign(path, overrides, cases=7, seed=9).definition
+    assert (definition.cases, definition.seed, definition.retain.showcase) == (7, 9, "none")
+    assert definition.parameters["altitude_m"] == 1500.0
+    assert definition.parameters["kind"] == "smooth"
+    assert definition.parameters["heights_m"] == [3.0, 4.5]
     # setting a parameter removes its dispersion
-    assert set(configuration.dispersions) == {"terrain"}
+    assert set(definition.dispersions) == {"terrain"}
     overrides = ['dispersions."wind.east_m_s".low=-5', "cases=3", "parameters.kind=x"]
-    changed_configuration = load_campaign(path, overrides).configuration
-    assert changed_configuration.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
-    assert changed_configuration.cases == 3
+    changed_definition = load_campaign(path, overrides).definition
+    assert changed_definition.dispersions["wind.east_m_s"].quantile(1e-9) == pytest.approx(-5.0)
+    assert changed_definition.cases == 3
 
 
 #: Words of valid and invalid keys and values for random campaign files.
@@ -225,7 +225,7 @@ def find_error_keys(load: Callable[[], object]) -> list[str]:
     """Return one key per reported problem; empty if the campaign loads."""
     try:
         load()
-    except ConfigurationError as error:
+    except DefinitionError as error:
         return [problem.key for problem in error.problems]
     return []
 
@@ -268,8 +268,8 @@ def test_invalid_value_is_reported_by_its_key(
 
 @given(override=st.text(max_size=20) | st.builds("{}={}".format, _random_words, st.text(max_size=8)))
 @settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_random_overrides_raise_only_configuration_errors(campaign_file: CampaignFile, override: str) -> None:
-    with contextlib.suppress(ConfigurationError):
+def test_random_overrides_raise_only_definition_errors(campaign_file: CampaignFile, override: str) -> None:
+    with contextlib.suppress(DefinitionError):
         load_campaign(str(campaign_file()), [override])
 
 
@@ -282,7 +282,7 @@ def test_drawn_table_uses_defaults_for_omitted_keys(campaign_file: CampaignFile)
     assert winds == {(0.0, 0.0), (3.0, 0.0), (5.0, -4.0)}
     # setting a value of the table removes the dispersion of the table
     campaign_with_fixed_wind = load_campaign(path, ["wind.east_m_s=7"])
-    assert campaign_with_fixed_wind.configuration.dispersions == {}
+    assert campaign_with_fixed_wind.definition.dispersions == {}
 
 
 @pytest.mark.parametrize(

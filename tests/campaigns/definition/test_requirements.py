@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.loading import find_campaign, load_campaign
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.definition.requirements import read_requirements, select_applicable, shipped_requirements
-from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import DefinitionError
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.systems import catalogue
 from tests.campaigns.fake_campaign import write_campaign
@@ -41,10 +41,10 @@ def test_campaigns_of_requirements_exist() -> None:
 def test_shipped_campaign_has_sources_and_the_applicable_requirements(name: str, path: Path) -> None:
     """The requirements' lists of campaigns agree with the campaigns' lists of requirements."""
     assert find_campaign(name) == path
-    configuration, shipped = load_campaign(name).configuration, shipped_requirements()
-    assert configuration.name == name
-    assert [key for key, dispersion in configuration.dispersions.items() if not dispersion.source] == []
-    requirements = [entry for entry in configuration.requirements if entry.id in shipped]
+    definition, shipped = load_campaign(name).definition, shipped_requirements()
+    assert definition.name == name
+    assert [key for key, dispersion in definition.dispersions.items() if not dispersion.source] == []
+    requirements = [entry for entry in definition.requirements if entry.id in shipped]
     applicable = {entry["id"] for entry in select_applicable(list(shipped.values()), name)}
     assert {requirement.id for requirement in requirements} == applicable
     for requirement in requirements:
@@ -56,7 +56,7 @@ def test_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:
     path = write_campaign(
         tmp_path, requirement='[[requirements]]\nid = "DIMES-VEL"\npopulation = "valid and clear"\nprobability = 0.9\n'
     )
-    (requirement,) = load_campaign(str(path)).configuration.requirements
+    (requirement,) = load_campaign(str(path)).definition.requirements
     assert (requirement.metric, requirement.bound, requirement.confidence) == ("velocity_error_m_s", 5.0, 0.9)
     assert (requirement.population, requirement.probability) == ("valid and clear", 0.9)
 
@@ -67,7 +67,7 @@ def test_campaign_may_change_population_and_confidence(tmp_path: Path) -> None:
 )
 def test_unknown_id_and_changed_bound_are_reported(tmp_path: Path, entry: str, message: str) -> None:
     path = write_campaign(tmp_path, requirement=f"[[requirements]]\n{entry}\n")
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         load_campaign(str(path))
     assert message in str(error.value)
 
@@ -98,13 +98,13 @@ def test_campaign_patterns_select_requirements(tmp_path: Path) -> None:
 def test_invalid_requirement_file_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "requirements.toml"
     path.write_text(text)
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         read_requirements(path)
     assert message in str(error.value)
 
 
 def test_missing_file_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="cannot be read"):
+    with pytest.raises(DefinitionError, match="cannot be read"):
         read_requirements(tmp_path / "none.toml")
 
 
@@ -161,7 +161,7 @@ def test_misspelt_columns_are_reported_before_terrain_is_built(
     # preparing a case builds its terrain
     monkeypatch.setattr(DescentScenario, "prepare", lambda _, __, number: prepared_inputs.append(number))
     path = _write_campaign(tmp_path, metric, population, bound)
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         load_campaign(str(path))
     assert f"requirements[0].{key}" in str(error.value)
     assert hint in str(error.value)
@@ -176,7 +176,7 @@ def test_score_columns_and_algorithm_columns_are_accepted(tmp_path: Path, monkey
     monkeypatch.chdir(tmp_path)
     path = _write_campaign(tmp_path, "braking_lateral_j", "valid and braking_soft")
     load_campaign(str(path), ['scores=["my_scores:braking"]'])
-    with pytest.raises(ConfigurationError, match="braking_lateral_j"):
+    with pytest.raises(DefinitionError, match="braking_lateral_j"):
         load_campaign(str(path))
     comparison = _write_campaign(tmp_path, "homography.velocity_error_m_s", "answered")
     load_campaign(str(comparison), algorithms=["dimes", "homography"])

@@ -171,7 +171,7 @@ STATE_CHANGES = {
     "the warning filters": lambda: warnings.simplefilter("ignore"),
     "NumPy's error handling (numpy.seterr)": lambda: np.seterr(all="ignore"),
     "the recursion limit": lambda: sys.setrecursionlimit(2345),
-    "OpenCV's settings (optimised code, threads)": lambda: __import__("cv2").setUseOptimized(False),
+    "OpenCV's state (optimised code, threads)": lambda: __import__("cv2").setUseOptimized(False),
     # 0x800 and 0x400 are upwards and downwards on x86; 0x400000 is on ARM
     "the floating-point rounding mode": lambda: [
         ctypes.CDLL("libm.so.6").fesetround(mode) for mode in (0x800, 0x400000)

@@ -28,8 +28,8 @@ def test_missing_kernels_are_compiled_once(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     compiled, notes = [], list[str]()
 
-    def compile_campaign(name: str, settings: tuple[str, ...]) -> None:
-        compiled.append((name, settings))
+    def compile_campaign(name: str, overrides: tuple[str, ...]) -> None:
+        compiled.append((name, overrides))
         mark_ready("descent")
 
     monkeypatch.setattr(preparation, "compile_campaign", compile_campaign)
@@ -47,7 +47,7 @@ def test_missing_kernels_are_compiled_once(tmp_path: Path, monkeypatch: pytest.M
 def test_failed_compilation_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
 
-    def fail(name: str, settings: tuple[str, ...]) -> None:
+    def fail(name: str, overrides: tuple[str, ...]) -> None:
         raise RuntimeError("no renderer")
 
     monkeypatch.setattr(preparation, "compile_campaign", fail)

@@ -12,7 +12,7 @@ import pytest
 import typer
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import CampaignError, ConfigurationError, StoreError
+from marsyard.campaigns.errors import CampaignError, DefinitionError, StoreError
 from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
 from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import replay
@@ -54,10 +54,10 @@ def test_run_killed_at_its_start_can_be_restarted(
         ("sessions", {"a": 1}, "sessions is not a list"),
         ("sessions", [], "sessions is empty"),
         ("identity", "abc", "identity is not a table"),
-        ("identity", {"configuration": "a"}, "identity has no"),
-        ("identity", {"configuration": "a", "code": "b", "versions": {}}, "identity has no .* or inputs"),
+        ("identity", {"definition": "a"}, "identity has no"),
+        ("identity", {"definition": "a", "code": "b", "versions": {}}, "identity has no .* or inputs"),
         ("environment", 3, "environment is not a table"),
-        ("configuration", [], "configuration is not a table"),
+        ("definition", [], "definition is not a table"),
         ("changes", None, "changes is not a list"),
         ("sessions", REMOVED, "damaged: it has no sessions"),
     ],
@@ -80,11 +80,11 @@ def test_stored_parameters_with_wrong_types_are_rejected(
     failing_campaign: Path, tmp_path: Path, command: Callable[[Path], Any]
 ) -> None:
     stored_record = json.loads((failing_campaign / "campaign.json").read_text())
-    stored_record["configuration"]["parameters"] = {"altitude_m": [1], "wind": 3}
+    stored_record["definition"]["parameters"] = {"altitude_m": [1], "wind": 3}
     (tmp_path / "campaign.json").write_text(json.dumps(stored_record))
     sign_folder(tmp_path)
     shutil.copy(failing_campaign / ROWS_FILE, tmp_path)
-    with pytest.raises(ConfigurationError, match=r"parameters\.altitude_m"):
+    with pytest.raises(DefinitionError, match=r"parameters\.altitude_m"):
         command(tmp_path)
 
 
@@ -142,13 +142,13 @@ def test_full_disk_is_reported_without_traceback(capsys: pytest.CaptureFixture[s
 def test_invalid_site_and_distribution_are_reported_by_key(tmp_path: Path) -> None:
     path = tmp_path / "campaign.toml"
     path.write_text('name = "x"\nscenario = "landing"\ncases = 3\nseed = 1\n[parameters]\nsite = {a = 1}\n')
-    with pytest.raises(ConfigurationError, match=r"parameters\.site: input should be a valid string"):
+    with pytest.raises(DefinitionError, match=r"parameters\.site: input should be a valid string"):
         load_campaign(str(path))
     path.write_text(
         'name = "x"\nscenario = "descent"\ncases = 3\nseed = 1\n[dispersions]\n'
         '"location.east_m" = {distribution = "poisson", mu = 1e300}\n'
     )
     with pytest.raises(
-        ConfigurationError, match=r'dispersions\."location.east_m": poisson is not defined for mu = 1e\+300'
+        DefinitionError, match=r'dispersions\."location.east_m": poisson is not defined for mu = 1e\+300'
     ):
         load_campaign(str(path))

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError, StoreError
+from marsyard.campaigns.errors import DefinitionError, StoreError
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record
@@ -62,8 +62,8 @@ def test_record_describes_the_run(failing_campaign: Path) -> None:
     stored_record = record.read(failing_campaign)
     assert (stored_record["schema"], stored_record["state"], stored_record["exit_code"]) == (1, "finished", None)
     assert (stored_record["cases_finished"], stored_record["cases_crashed"], stored_record["seed"]) == (12, 3, 5)
-    assert stored_record["configuration"]["parameters"]["lowest_altitude_m"] == 0.0
-    assert stored_record["configuration"]["dispersions"]["wind.east_m_s"]["source"] == "test"
+    assert stored_record["definition"]["parameters"]["lowest_altitude_m"] == 0.0
+    assert stored_record["definition"]["dispersions"]["wind.east_m_s"]["source"] == "test"
     assert stored_record["requirements"][0]["population"] == "all"
     assert stored_record["versions"]["numpy"] == np.__version__
     assert {"python", "platform", "processor", "processor_features"} <= set(stored_record["environment"])
@@ -113,7 +113,7 @@ def test_unknown_metric_stops_the_campaign_after_one_case(
     campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     requirement = "[[requirements]]\nid='a'\nmetric='velocity_eror_m_s'\nbound=1\nprobability=0.9\nconfidence=0.9"
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         run(campaign_file(requirement=requirement), tmp_path / "run", watch, jobs=1)
     assert "unknown column of numbers 'velocity_eror_m_s' (did you mean 'velocity_error_m_s'?)" in str(error.value)
     assert record.read(tmp_path / "run")["state"] == "interrupted"
@@ -133,10 +133,10 @@ def test_unknown_metric_stops_the_campaign_after_one_case(
 )
 def test_metrics_are_numbers_or_sums_or_true_or_false(campaign_file: CampaignFile, change: str, message: str) -> None:
     requirement = f"[[requirements]]\nid='a'\nprobability=0.9\nconfidence=0.9\n{change}"
-    configuration = load_campaign(str(campaign_file(requirement=requirement))).configuration
+    definition = load_campaign(str(campaign_file(requirement=requirement))).definition
     row = {"case": 0, "answered": True, "velocity_error_m_s": 1.0, "a_time_s": 0.1}
-    with pytest.raises(ConfigurationError, match=re.escape(message)) if message else nullcontext():
-        check_metrics(configuration, row, Path("runs"))
+    with pytest.raises(DefinitionError, match=re.escape(message)) if message else nullcontext():
+        check_metrics(definition, row, Path("runs"))
 
 
 def test_metric_exists_if_all_cases_crash(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:

@@ -130,11 +130,11 @@ def test_each_gusev_descent_has_a_terrain_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "settings"),
+    ("name", "overrides"),
     [("hda-hazardous", []), ("vtt-montecarlo", []), ("dimes-fieldtest", []), ("dimes-smoke", ["location.bank=2"])],
 )
-def test_shared_inputs_are_those_of_several_cases(name: str, settings: list[str]) -> None:
-    campaign = load_campaign(name, settings)
+def test_shared_inputs_are_those_of_several_cases(name: str, overrides: list[str]) -> None:
+    campaign = load_campaign(name, overrides)
     all_inputs = campaign.scenario.shared_inputs(campaign.base_parameters())
     assert isinstance(campaign.scenario, SelectsInputs)
     used_inputs = find_shared_inputs(campaign, range(4))
@@ -203,7 +203,7 @@ def test_dispersed_input_files_belong_to_the_identity(campaign_file: CampaignFil
     second_table.write_text("4,5,6\n")
     dispersions = f'[dispersions]\ntable = {{distribution = "choice", values = ["{table}", "{second_table}"]}}\n'
     campaign = load_campaign(str(campaign_file(f'table = "{table}"', dispersions=dispersions)))
-    assert set(create_identity(campaign.configuration).inputs or {}) == {str(table), str(second_table)}
+    assert set(create_identity(campaign.definition).inputs or {}) == {str(table), str(second_table)}
 
 
 def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> None:
@@ -217,22 +217,22 @@ def test_terrain_camera_and_datasheet_belong_to_the_identity(tmp_path: Path) -> 
         f"camera.model={files['cam.cahv']}",
         f"detector.file={files['sensor.toml']}",
     ]
-    configuration = load_campaign("dimes-gusev", overrides).configuration
-    initial_identity = create_identity(configuration)
+    definition = load_campaign("dimes-gusev", overrides).definition
+    initial_identity = create_identity(definition)
     assert set(initial_identity.inputs or {}) == {str(path) for path in files.values()}
     np.savez(files["site.npz"], dem=rng.normal(size=(64, 64)), dem_gsd=4.0)
     files["cam.cahv"].write_text(CAMERA.replace("1200", "1201"))
     files["sensor.toml"].write_text(DATASHEET.replace("25.0", "26.0"))
-    differences = initial_identity.differences(create_identity(configuration))
+    differences = initial_identity.differences(create_identity(definition))
     # each difference starts with the path of the file
     assert [line.split(" ")[0] for line in differences] == sorted(str(path) for path in files.values())
     # the campaign stores the content of the camera file and datasheet, so these files may be deleted
     files["cam.cahv"].unlink()
     files["sensor.toml"].unlink()
-    assert list(create_identity(configuration).inputs or {}) == [str(files["site.npz"])]
+    assert list(create_identity(definition).inputs or {}) == [str(files["site.npz"])]
     files["site.npz"].unlink()
     with pytest.raises(CampaignError, match=r"are no longer valid: .*site.npz: no such file"):
-        create_identity(configuration)
+        create_identity(definition)
 
 
 def test_estimate_follows_from_trial_cases(campaign_file: CampaignFile) -> None:

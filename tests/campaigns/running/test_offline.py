@@ -55,10 +55,10 @@ def export(tmp_path_factory: pytest.TempPathFactory) -> ExportFolders:
     return folders
 
 
-def load_campaign_to_export(export: ExportFolders, *settings: str) -> Campaign:
+def load_campaign_to_export(export: ExportFolders, *overrides: str) -> Campaign:
     """Load the campaign with the algorithm `export:FOLDER`, which writes the measurements of the cases to a folder."""
     path = str(export.directory.parent / "fake.toml")
-    return load_campaign(path, ["retain.showcase=none", *settings], None, None, [f"export:{export.directory}"])
+    return load_campaign(path, ["retain.showcase=none", *overrides], None, None, [f"export:{export.directory}"])
 
 
 def estimate_exported_cases(export: ExportFolders) -> dict[int, VelocityEstimate]:

@@ -1,4 +1,4 @@
-"""Tests of `resume`, `append` and `replay`: added and repeated cases, changed programs and configurations."""
+"""Tests of `resume`, `append` and `replay`: added and repeated cases, changed programs and definitions."""
 
 import shutil
 from pathlib import Path
@@ -49,7 +49,7 @@ def test_appended_cases_follow_existing_cases(
     assert [str(row) for row in rows[:4]] == rows_before
     stored_record = record.read(finished_campaign)
     assert (stored_record["cases"], stored_record["state"]) == (8, "finished")
-    assert stored_record["configuration"]["appended"] == [3, 1]
+    assert stored_record["definition"]["appended"] == [3, 1]
     # independent draws: appended cases equal the cases of a larger campaign
     larger_run = run(campaign_file("raising_cases = [2]"), tmp_path / "larger", watch, "cases=8", jobs=1)
     larger_rows = read_case_rows(larger_run)
@@ -103,11 +103,11 @@ def test_changed_versions_are_rejected_without_allow_changed(
     assert record.read(finished_campaign)["identity"]["versions"]["numpy"] == "0.9"
 
 
-def test_changed_configuration_is_rejected(finished_campaign: Path, watch: RecordingWatch) -> None:
+def test_changed_definition_is_rejected(finished_campaign: Path, watch: RecordingWatch) -> None:
     text = (finished_campaign / "campaign.json").read_text()
     (finished_campaign / "campaign.json").write_text(text.replace('"altitude_m": 2000.0', '"altitude_m": 2001.0'))
     sign_folder(finished_campaign)
-    with pytest.raises(CampaignError, match="configuration \\("):
+    with pytest.raises(CampaignError, match="definition \\("):
         resume_campaign(finished_campaign, ExecutorConfig(1), watch)
 
 

@@ -55,7 +55,7 @@ def test_shards_equal_one_run(
     assert [row["case"] for row in rows] == list(range(12))
     assert [differing_columns(*pair) for pair in zip(rows, expected, strict=True)] == [()] * 12
     merged, single = record.read(target), record.read(failing_campaign)
-    for key in ("state", "cases", "cases_finished", "cases_crashed", "seed", "configuration", "showcase", "evidence"):
+    for key in ("state", "cases", "cases_finished", "cases_crashed", "seed", "definition", "showcase", "evidence"):
         assert merged[key] == single[key], key
     assert "shard" not in merged
     assert len(merged["sessions"]) == 4
@@ -89,7 +89,7 @@ def test_incomplete_or_different_shards_are_rejected(
         (shards[:3], "3 of 12 cases are missing, the first is case 9"),
         ([*shards, shards[0]], "both contain case 0"),
         ([shards[0], failing_campaign], "was run without --shard"),
-        ([*shards[:3], other], "differ in the configuration"),
+        ([*shards[:3], other], "differ in the definition"),
     ):
         with pytest.raises(CampaignError, match=message):
             merge_shards(directories, tmp_path / "merged")

@@ -7,7 +7,7 @@ from scipy import stats
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import DefinitionError
 from marsyard.campaigns.sampling.design import Correlation
 from tests.campaigns.fake_campaign import CampaignFile
 
@@ -68,7 +68,7 @@ def test_rank_correlation_holds_for_any_distribution(campaign_file: CampaignFile
     campaign = load_correlated(campaign_file, SKEWED, design, cases)
     draws = draw_table(campaign, cases)
     estimated = np.atleast_2d(stats.spearmanr(draws).statistic)
-    ranks = campaign.configuration.correlations[0].rank
+    ranks = campaign.definition.correlations[0].rank
     assert ranks is not None
     for row in range(3):
         for column in range(row):
@@ -139,10 +139,10 @@ def test_added_parameter_does_not_change_draws_of_the_group(campaign_file: Campa
 
 def test_overridden_parameter_is_removed_from_its_group(campaign_file: CampaignFile) -> None:
     path = str(campaign_file(dispersions=SKEWED))
-    (group,) = load_campaign(path, ["wind.north_m_s=3"]).configuration.correlations
+    (group,) = load_campaign(path, ["wind.north_m_s=3"]).definition.correlations
     assert (group.parameters, group.rank) == (("wind.east_m_s", "altitude_m"), ((1.0, -0.3), (-0.3, 1.0)))
     without_group = load_campaign(path, ["wind={}", "altitude_m=1800"])
-    assert without_group.configuration.correlations == ()
+    assert without_group.definition.correlations == ()
 
 
 @pytest.mark.parametrize(
@@ -182,6 +182,6 @@ def test_invalid_correlations_are_rejected(matrices: dict[str, object], message:
     ],
 )
 def test_invalid_groups_are_rejected(campaign_file: CampaignFile, dispersions: str, message: str) -> None:
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         load_campaign(str(campaign_file(dispersions=dispersions)))
     assert message in str(error.value)

@@ -11,7 +11,7 @@ from scipy.stats import qmc
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import ConfigurationError
+from marsyard.campaigns.errors import DefinitionError
 from marsyard.campaigns.sampling.design import build_stratified_design
 from tests.campaigns.fake_campaign import CampaignFile
 
@@ -139,7 +139,7 @@ def test_added_dispersion_changes_no_other_draw(campaign_file: CampaignFile, kin
 def test_appended_cases_do_not_change_earlier_cases(campaign_file: CampaignFile, kind: str) -> None:
     initial_campaign = load_design(campaign_file, kind, 33, nominal=True)
     extended_campaign = load_design(campaign_file, kind, 33, nominal=True, extra_keys="appended = [16, 8]")
-    assert extended_campaign.configuration.total_cases == 57
+    assert extended_campaign.definition.total_cases == 57
     assert [extended_campaign.draws(case) for case in range(33)] == [initial_campaign.draws(case) for case in range(33)]
     points = read_probabilities(extended_campaign, range(1, 57))
     assert len(np.unique(points[:, 0])) == 56
@@ -198,6 +198,6 @@ def test_nominal_case_uses_no_draws(campaign_file: CampaignFile) -> None:
 def test_invalid_designs_are_rejected(
     campaign_file: CampaignFile, kind: str, cases: int, options: dict[str, object], message: str
 ) -> None:
-    with pytest.raises(ConfigurationError) as error:
+    with pytest.raises(DefinitionError) as error:
         load_design(campaign_file, kind, cases, **options)  # type: ignore[arg-type]
     assert message in str(error.value)

@@ -160,7 +160,7 @@ def test_formulas_use_draws_and_parameters(campaign_file: CampaignFile) -> None:
     # formulas use the values of overrides
     # with terrain 2, the mean altitude is 1500 + 100 * 2
     campaign_with_fixed_terrain = load_campaign(str(campaign_file("shared = 4", dispersions=text)), ["terrain=2"])
-    altitude = campaign_with_fixed_terrain.configuration.dispersions["altitude_m"].insert_values({"terrain": 2})
+    altitude = campaign_with_fixed_terrain.definition.dispersions["altitude_m"].insert_values({"terrain": 2})
     assert altitude.describe().startswith("normal(mean=1700")
 
 

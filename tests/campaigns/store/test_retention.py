@@ -30,7 +30,7 @@ def test_showcase_is_the_worst_answered_case(failing_campaign: Path) -> None:
     assert products["title"] == "a"
 
 
-def test_showcase_follows_the_configuration(campaign_file: CampaignFile, tmp_path: Path) -> None:
+def test_showcase_follows_the_definition(campaign_file: CampaignFile, tmp_path: Path) -> None:
     """Without an answered case, or without a requirement, the showcase is the first case that has finished."""
     rows: list[dict[str, Any]] = [
         {"case": 0, "outcome": "CRASHED", "answered": False},
@@ -43,25 +43,29 @@ def test_showcase_follows_the_configuration(campaign_file: CampaignFile, tmp_pat
         table = tmp_path / "cases.parquet"
         store.add(rows[:1])
         write_table(table, store, ["velocity_error_m_s"])
-        worst = load_campaign(str(campaign_file()), ["retain.worst=9"]).configuration
-        first = load_campaign(str(campaign_file()), ["retain.showcase=first"]).configuration
-        none = load_campaign(str(campaign_file()), ["retain.showcase=none"]).configuration
-        no_requirement = load_campaign(str(campaign_file(requirement=""))).configuration
+        worst = load_campaign(str(campaign_file()), ["retain.worst=9"]).definition
+        first = load_campaign(str(campaign_file()), ["retain.showcase=first"]).definition
+        none = load_campaign(str(campaign_file()), ["retain.showcase=none"]).definition
+        no_requirement = load_campaign(str(campaign_file(requirement=""))).definition
         assert find_showcase(worst, table, store) is None
         store.add(rows[1:2])
         write_table(table, store)
         assert find_showcase(worst, table, store) == 1
         store.add(rows[2:])
         write_table(table, store)
-        assert [
-            find_showcase(configuration, table, store) for configuration in (worst, first, none, no_requirement)
-        ] == [3, 1, None, 1]  # case 3 has the largest absolute error
-    assert [
-        find_worst_cases(configuration, table, configuration.retain.worst) for configuration in (worst, no_requirement)
-    ] == [[3, 2], []]
+        assert [find_showcase(definition, table, store) for definition in (worst, first, none, no_requirement)] == [
+            3,
+            1,
+            None,
+            1,
+        ]  # case 3 has the largest absolute error
+    assert [find_worst_cases(definition, table, definition.retain.worst) for definition in (worst, no_requirement)] == [
+        [3, 2],
+        [],
+    ]
     # a requirement on a sum of times selects no worst case
     requirement = 'id = "T"\nmetric = "a_time_s + b_time_s"\nbound = 2.0\nprobability = 0.9\nconfidence = 0.9\n'
-    time_sum = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{requirement}"))).configuration
+    time_sum = load_campaign(str(campaign_file(requirement=f"[[requirements]]\n{requirement}"))).definition
     assert find_worst_cases(time_sum, table, 2) == []
 
 

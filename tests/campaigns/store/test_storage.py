@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from marsyard.campaigns.definition.configuration import Requirement
+from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import lock, record
 from marsyard.campaigns.store.lock import folder_lock, is_locked
@@ -189,9 +189,9 @@ def test_invalid_records_are_rejected(tmp_path: Path) -> None:
         (tmp_path / "campaign.json").write_text(text)
         with pytest.raises(StoreError, match=message):
             record.read(tmp_path)
-    (tmp_path / "campaign.json").write_text('{"schema": 1, "configuration": {"name": 3}}')
+    (tmp_path / "campaign.json").write_text('{"schema": 1, "definition": {"name": 3}}')
     with pytest.raises(StoreError, match="damaged"):
-        record.stored_configuration(tmp_path)
+        record.stored_definition(tmp_path)
 
 
 _leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=5)

@@ -20,7 +20,7 @@ from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies import budget, runner
-from marsyard.campaigns.studies.budget import STREAMS, BudgetResult, BudgetSettings, active_sources, start_budget
+from marsyard.campaigns.studies.budget import STREAMS, BudgetParameters, BudgetResult, active_sources, start_budget
 from marsyard.campaigns.studies.contributions import compute_budget
 from marsyard.reports.budget import budget_sentences
 from marsyard.reports.campaign import write_report
@@ -33,19 +33,19 @@ from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, read
 from tests.campaigns.studies.error_model import CAMPAIGN
 from tests.campaigns.studies.killing import kill_and_resume
 
-SETTINGS = BudgetSettings("ERROR", cases=200)
+PARAMETERS = BudgetParameters("ERROR", cases=200)
 
 
 campaign_path = campaign_fixture(CAMPAIGN)
 
 
-def run_budget(path: Path, directory: Path, settings: BudgetSettings, *overrides: str) -> BudgetResult:
+def run_budget(path: Path, directory: Path, parameters: BudgetParameters, *overrides: str) -> BudgetResult:
     campaign = load_campaign(str(path), overrides)
-    return start_budget(campaign, settings, directory, ExecutorConfig(1), RecordingWatch())
+    return start_budget(campaign, parameters, directory, ExecutorConfig(1), RecordingWatch())
 
 
 def test_contributions_of_independent_errors_are_their_variances(campaign_path: Path, tmp_path: Path) -> None:
-    result = run_budget(campaign_path, tmp_path / "run", SETTINGS)
+    result = run_budget(campaign_path, tmp_path / "run", PARAMETERS)
     error_budget = result.budget
     assert result.inactive == ("fan",)
     contributions = {item.source: item for item in error_budget.contributions}
@@ -58,7 +58,7 @@ def test_contributions_of_independent_errors_are_their_variances(campaign_path: 
     for item in contributions.values():
         assert item.lower < item.mean < item.upper
     assert error_budget.closure == pytest.approx(1.0, abs=1e-9)
-    # six configurations: all sources, none, without gyro, without radar, only gyro, only radar
+    # six variants: all sources, none, without gyro, without radar, only gyro, only radar
     assert (error_budget.common, result.violations, result.evaluated) == (200, 0, 200 * 6)
 
 
@@ -119,7 +119,7 @@ def test_groups_are_the_sampling_unit() -> None:
 
 @pytest.mark.slow
 def test_interaction_of_two_sources_is_divided_between_them(campaign_path: Path, tmp_path: Path) -> None:
-    result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "interaction=0.5")
+    result = run_budget(campaign_path, tmp_path / "run", PARAMETERS, "interaction=0.5")
     contributions = {item.source: item for item in result.budget.contributions}
     # mean square of the interaction: 0.5^2 * 9 * 16/3 = 12; it occurs only with both sources
     # (removed: decrease without this source; alone: increase by this source only)
@@ -130,12 +130,12 @@ def test_interaction_of_two_sources_is_divided_between_them(campaign_path: Path,
 
 
 @pytest.mark.slow
-def test_cases_without_an_error_in_a_configuration_are_excluded(campaign_path: Path, tmp_path: Path) -> None:
-    result = run_budget(campaign_path, tmp_path / "run", SETTINGS, "refused_fraction=0.25")
-    # the stream of the refusal is the same in all configurations
+def test_cases_without_an_error_in_a_variant_are_excluded(campaign_path: Path, tmp_path: Path) -> None:
+    result = run_budget(campaign_path, tmp_path / "run", PARAMETERS, "refused_fraction=0.25")
+    # the stream of the refusal is the same in all variants
     assert result.budget.common == result.budget.contributions[0].answered[0]
     assert 120 <= result.budget.common <= 180
-    no_error = run_budget(campaign_path, tmp_path / "none", SETTINGS, "refused_fraction=1.0")
+    no_error = run_budget(campaign_path, tmp_path / "none", PARAMETERS, "refused_fraction=1.0")
     assert no_error.budget is None
     assert "fewer than 10 base cases" in no_error.reason
     assert no_error.exit_code == 3
@@ -144,17 +144,17 @@ def test_cases_without_an_error_in_a_configuration_are_excluded(campaign_path: P
 @pytest.mark.slow
 def test_margin_is_centred(campaign_path: Path, tmp_path: Path) -> None:
     """The mean of a margin is subtracted: a mean load of 100 does not change the budget."""
-    settings = replace(SETTINGS, requirement="MARGIN")
-    result = run_budget(campaign_path, tmp_path / "run", settings, "dispersions.load.mean=100.0")
+    parameters = replace(PARAMETERS, requirement="MARGIN")
+    result = run_budget(campaign_path, tmp_path / "run", parameters, "dispersions.load.mean=100.0")
     assert (result.quantity, result.centred) == ("error_margin", True)
     assert result.budget.remaining == pytest.approx(2.0, rel=0.3)
 
 
 @pytest.mark.slow
 def test_sobol_indices_of_a_linear_model_are_variance_fractions(campaign_path: Path, tmp_path: Path) -> None:
-    settings = BudgetSettings("MARGIN", cases=20, sobol=256)
+    parameters = BudgetParameters("MARGIN", cases=20, sobol=256)
     overrides = ("gyro_sd=0.0", "radar_sd=0.0", "dispersions.load.sd=2.0")
-    result = run_budget(campaign_path, tmp_path / "run", settings, *overrides)
+    result = run_budget(campaign_path, tmp_path / "run", parameters, *overrides)
     indices = {item.name: item for item in result.indices}
     # the error is 2 load + floor, with variances 4 and 1; floor is drawn from the random streams
     assert indices["load"].first == pytest.approx(0.8, abs=0.15)
@@ -171,14 +171,14 @@ def test_killed_budget_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     arguments = ["budget", str(campaign_path), "--requirement", "ERROR", "-n", "40", "--set", "sleep_s=0.02"]
     resume_result = kill_and_resume(arguments, killed_run, log_bytes=12_000)
     assert resume_result.returncode == 0, resume_result.stderr
-    run_budget(campaign_path, reference_run, BudgetSettings("ERROR", 40), "sleep_s=0.02")
+    run_budget(campaign_path, reference_run, BudgetParameters("ERROR", 40), "sleep_s=0.02")
     assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]
     assert "Largest contributions to the mean square: gyroscope" in resume_result.stdout
 
 
 @pytest.mark.slow
 def test_case_without_a_source_replays(campaign_path: Path, tmp_path: Path) -> None:
-    run_budget(campaign_path, tmp_path / "run", BudgetSettings("ERROR", 20))
+    run_budget(campaign_path, tmp_path / "run", BudgetParameters("ERROR", 20))
     rows = read_case_rows(tmp_path / "run")
     # the first base case: all, none, without gyro, without radar, only gyro, only radar
     errors = [row["miss"] for row in rows[:6]]
@@ -189,7 +189,7 @@ def test_case_without_a_source_replays(campaign_path: Path, tmp_path: Path) -> N
 
 
 def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
-    run_budget(campaign_path, tmp_path / "run", replace(SETTINGS, sobol=16))
+    run_budget(campaign_path, tmp_path / "run", replace(PARAMETERS, sobol=16))
     page = write_report(tmp_path / "run").read_text()
     data = json.loads((tmp_path / "run" / "report.json").read_text())
     assert data["verdict"] == "NO VERDICT"
@@ -205,7 +205,7 @@ def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("parameters", "message"),
     [
         ({"requirement": "FLAG"}, "the metric 'is_small' is only true or false"),
         ({"requirement": "ERRORS"}, "did you mean 'ERROR'"),
@@ -215,10 +215,10 @@ def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
     ],
 )
 def test_invalid_settings_are_rejected(
-    campaign_path: Path, tmp_path: Path, settings: dict[str, Any], message: str
+    campaign_path: Path, tmp_path: Path, parameters: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CampaignError, match=message):
-        run_budget(campaign_path, tmp_path / "run", BudgetSettings(**{"requirement": "ERROR", **settings}))
+        run_budget(campaign_path, tmp_path / "run", BudgetParameters(**{"requirement": "ERROR", **parameters}))
     assert not (tmp_path / "run").exists()
 
 
@@ -228,8 +228,8 @@ def test_sources_of_all_scenarios_have_valid_values() -> None:
     campaigns |= {"rover": "vtt-montecarlo", "rover-drive": "vtt-straight", "localisation": "loc-faults"}
     for scenario, name in campaigns.items():
         campaign = load_campaign(name)
-        assert campaign.configuration.scenario == scenario
-        parameters = campaign.configuration.parameters
+        assert campaign.definition.scenario == scenario
+        parameters = campaign.definition.parameters
         for source in error_sources(scenario):
             exact = source.exact_values(parameters)
             assert set(exact) <= set(source.parameters), source.name
@@ -243,5 +243,5 @@ def test_study_ends_if_first_cases_crash(campaign_path: Path, tmp_path: Path, mo
     monkeypatch.setattr(budget, "_BATCH", 1)
     monkeypatch.setattr(runner, "_MAX_FIRST_CRASHES", 5)
     with pytest.raises(CampaignError, match=r"none of the first \d+ cases finished: ValueError: math domain error"):
-        run_budget(campaign_path, tmp_path / "run", BudgetSettings("ERROR", 20), "refused_fraction=-1.0")
+        run_budget(campaign_path, tmp_path / "run", BudgetParameters("ERROR", 20), "refused_fraction=-1.0")
     assert record.read(tmp_path / "run")["state"] == "interrupted"

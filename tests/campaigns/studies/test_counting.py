@@ -16,7 +16,7 @@ from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
 from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
-from marsyard.campaigns.studies.search import SearchSettings, start_search, write_regression_campaigns
+from marsyard.campaigns.studies.search import SearchParameters, start_search, write_regression_campaigns
 from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.scenarios.systems import systems
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, read_case_rows, write_campaign
@@ -99,8 +99,8 @@ def test_terrain_follows_the_number_of_the_streams(tmp_path: Path) -> None:
 
 def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:
     campaign = load_fake_campaign(tmp_path, 99_999, bound=0.5)
-    settings = SearchSettings("velocity", cases=20, restarts=1, max_failures=1)
-    result = start_search(campaign, settings, 500, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
+    parameters = SearchParameters("velocity", cases=20, restarts=1, max_failures=1)
+    result = start_search(campaign, parameters, 500, tmp_path / "run", ExecutorConfig(1), RecordingWatch())
     rows = {int(row["case"]): row for row in read_case_rows(tmp_path / "run")}
     assert all(row["terrain"] == StudyPoint.read(str(row[POINT_COLUMN])).stream for row in rows.values())
     (failure,) = result.failures
@@ -137,7 +137,7 @@ def test_each_system_has_requirements_with_margins_and_error_sources(system: str
     n_with_margin = 0
     for name in names:
         campaign = load_campaign(name)
-        requirements = campaign.configuration.requirements
+        requirements = campaign.definition.requirements
         n_with_margin += any(item.bound is not None or item.margin is not None for item in requirements)
         assert len(active_sources(campaign)[0]) >= 3, name  # error sources that have an effect in this campaign
     assert n_with_margin >= 1
@@ -152,7 +152,7 @@ def test_case_of_each_system_runs_without_its_error_sources(name: str) -> None:
     """
     campaign = load_campaign(name, CAMPAIGNS[name])
     removed = tuple(source.name for source in active_sources(campaign)[0])
-    requirement = next(item for item in campaign.configuration.requirements if item.bound or item.margin)
+    requirement = next(item for item in campaign.definition.requirements if item.bound or item.margin)
     rows = []
     step = ((3, 0.995), (4, math.sqrt(1.0 - 0.995**2)))
     for sources, blend in (((), ()), (removed, ()), ((), ()), ((), step)):

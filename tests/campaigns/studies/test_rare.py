@@ -9,11 +9,11 @@ import pytest
 from scipy.stats import norm
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.errors import CampaignError, ConfigurationError
+from marsyard.campaigns.errors import CampaignError, DefinitionError
 from marsyard.campaigns.execution.workers import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.studies.rare import RareResult, RareSettings, continue_rare, start_rare
+from marsyard.campaigns.studies.rare import RareParameters, RareResult, continue_rare, start_rare
 from marsyard.campaigns.studies.rare_decision import Basis, RareVerdict
 from marsyard.reports.evaluation import evaluate_run
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
@@ -22,7 +22,7 @@ from tests.campaigns.studies.limit_state import CAMPAIGN
 from tests.command import run_command
 
 #: With a confidence of 0.99, the intervals of the fixed seeds contain the true probability norm.sf(3) = 0.00135.
-SETTINGS = RareSettings("LOAD", 5e-2, samples=100, replicates=(4,), random_cases=(50,), confidence=0.99)
+PARAMETERS = RareParameters("LOAD", 5e-2, samples=100, replicates=(4,), random_cases=(50,), confidence=0.99)
 #: Columns that differ between repeated runs.
 TIMES = ("wall_time_s", "cpu_time_s")
 
@@ -31,10 +31,10 @@ campaign_path = campaign_fixture(CAMPAIGN)
 
 
 def run_study(
-    path: Path, directory: Path, settings: RareSettings = SETTINGS, *overrides: str, max_cases: int = 5000
+    path: Path, directory: Path, parameters: RareParameters = PARAMETERS, *overrides: str, max_cases: int = 5000
 ) -> RareResult:
     campaign = load_campaign(str(path), overrides)
-    return start_rare(campaign, settings, max_cases, directory, ExecutorConfig(1), RecordingWatch())
+    return start_rare(campaign, parameters, max_cases, directory, ExecutorConfig(1), RecordingWatch())
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def rows_without_times(directory: Path) -> list[dict[str, object]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.6])
 def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, noise: float) -> None:
-    result = run_study(campaign_path, tmp_path / "run", SETTINGS, f"noise={noise}")
+    result = run_study(campaign_path, tmp_path / "run", PARAMETERS, f"noise={noise}")
     interval, counting = result.decision.interval, result.decision.counting
     assert interval.lower < norm.sf(3.0) < interval.upper
     # 50 random cases, and 100 of the first level of each of 4 replicates
@@ -64,8 +64,8 @@ def test_interval_contains_the_probability(campaign_path: Path, tmp_path: Path, 
 
 @pytest.mark.slow
 def test_importance_sampling_interval_contains_the_probability(campaign_path: Path, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, max_probability=1e-2, method="importance", replicates=(3,), importance_cases=300)
-    result = run_study(campaign_path, tmp_path / "run", settings)
+    parameters = replace(PARAMETERS, max_probability=1e-2, method="importance", replicates=(3,), importance_cases=300)
+    result = run_study(campaign_path, tmp_path / "run", parameters)
     assert result.decision.effective_violations is not None
     assert result.decision.effective_violations > 30.0
     with pytest.raises(CampaignError, match="no replicates can be added to a study with importance sampling"):
@@ -79,7 +79,7 @@ def test_importance_sampling_interval_contains_the_probability(campaign_path: Pa
 @pytest.mark.slow
 def test_margin_column_replaces_a_boolean_metric(campaign_path: Path, tmp_path: Path) -> None:
     by_bound = run_study(campaign_path, tmp_path / "bound")
-    by_margin = run_study(campaign_path, tmp_path / "margin", replace(SETTINGS, requirement="MARGIN"))
+    by_margin = run_study(campaign_path, tmp_path / "margin", replace(PARAMETERS, requirement="MARGIN"))
     assert by_margin.decision == by_bound.decision
 
 
@@ -90,8 +90,8 @@ def test_killed_study_resumes_with_the_same_result(campaign_path: Path, tmp_path
     sizes += ["--random-cases", "20"]
     arguments = ["rare", str(campaign_path), "--requirement", "LOAD", "--max-probability", "0.1", *sizes]
     resume_result = kill_and_resume(arguments, killed_run, log_bytes=12_000)
-    settings = RareSettings("LOAD", 0.1, samples=50, replicates=(2,), random_cases=(20,))
-    reference = run_study(campaign_path, reference_run, settings, "sleep_s=0.03", max_cases=20_000)
+    parameters = RareParameters("LOAD", 0.1, samples=50, replicates=(2,), random_cases=(20,))
+    reference = run_study(campaign_path, reference_run, parameters, "sleep_s=0.03", max_cases=20_000)
     assert resume_result.returncode == reference.exit_code, resume_result.stderr
     assert "Probability of a violation per case" in resume_result.stdout
     assert rows_without_times(killed_run) == rows_without_times(reference_run)
@@ -115,7 +115,7 @@ def test_additional_replicates_narrow_the_interval(campaign_path: Path, tmp_path
 
 @pytest.mark.slow
 def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
-    run_study(campaign_path, tmp_path / "run", SETTINGS, "noise=0.5")
+    run_study(campaign_path, tmp_path / "run", PARAMETERS, "noise=0.5")
     # a late case of a Markov chain, in general with the random streams of an earlier case
     cases = [row["case"] for row in read_case_rows(tmp_path / "run")]
     for case in cases[-3:]:
@@ -126,8 +126,8 @@ def test_case_of_a_study_replays(campaign_path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, max_probability=1e-3)
-    result = run_study(campaign_path, tmp_path / "run", settings, max_cases=350)
+    parameters = replace(PARAMETERS, max_probability=1e-3)
+    result = run_study(campaign_path, tmp_path / "run", parameters, max_cases=350)
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert "limit of cases" in result.decision.reason
     # the random cases are run nevertheless, and those that are added later
@@ -137,8 +137,8 @@ def test_verdict_is_insufficient_at_the_limit_of_cases(campaign_path: Path, tmp_
 
 
 def test_small_study_is_insufficient_if_the_probability_equals_its_limit(campaign_path: Path, tmp_path: Path) -> None:
-    settings = RareSettings("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,), random_cases=(0,))
-    result = run_study(campaign_path, tmp_path / "run", settings)
+    parameters = RareParameters("LOAD", float(norm.sf(3.0)), samples=50, replicates=(2,), random_cases=(0,))
+    result = run_study(campaign_path, tmp_path / "run", parameters)
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert result.exit_code == 3
 
@@ -178,7 +178,7 @@ def test_invalid_settings_are_reported(
 ) -> None:
     values = {"requirement": requirement, "max_probability": 1e-2, **changes}
     with pytest.raises(CampaignError, match=message):
-        run_study(campaign_path, tmp_path / "run", RareSettings(**values))  # type: ignore[arg-type]
+        run_study(campaign_path, tmp_path / "run", RareParameters(**values))  # type: ignore[arg-type]
     assert not (tmp_path / "run").exists()
 
 
@@ -190,7 +190,7 @@ def test_grid_dispersions_are_rejected(campaign_path: Path, tmp_path: Path) -> N
 
 
 def test_campaign_file_cannot_be_adaptive(campaign_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="adaptive is for studies"):
+    with pytest.raises(DefinitionError, match="adaptive is for studies"):
         load_campaign(str(campaign_path), ["design.kind=adaptive"])
 
 
@@ -219,8 +219,8 @@ def test_verdict_on_a_calibration_seed_cannot_be_pass(campaign_path: Path, tmp_p
 
 def test_estimate_below_the_limit_is_no_pass(campaign_path: Path, tmp_path: Path) -> None:
     """250 independent cases cannot exclude a violation at random in one of 1,000 cases, although the estimate does."""
-    settings = RareSettings("LOAD", 1e-3, samples=100, replicates=(2,), random_cases=(50,))
-    result = run_study(campaign_path, tmp_path / "run", settings, "beta=3.7")
+    parameters = RareParameters("LOAD", 1e-3, samples=100, replicates=(2,), random_cases=(50,))
+    result = run_study(campaign_path, tmp_path / "run", parameters, "beta=3.7")
     assert result.verdict is RareVerdict.INSUFFICIENT
     # 1 - 0.05^(1/250)
     assert result.decision.counting.violations == 0
@@ -228,8 +228,8 @@ def test_estimate_below_the_limit_is_no_pass(campaign_path: Path, tmp_path: Path
 
 
 def test_plateau_is_insufficient(campaign_path: Path, tmp_path: Path) -> None:
-    settings = RareSettings("LOAD", 1e-3, samples=50, replicates=(2,), random_cases=(0,))
-    result = run_study(campaign_path, tmp_path / "run", settings, "step=true")
+    parameters = RareParameters("LOAD", 1e-3, samples=50, replicates=(2,), random_cases=(0,))
+    result = run_study(campaign_path, tmp_path / "run", parameters, "step=true")
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert "2 of 2 replicates reached a plateau" in result.decision.reason
     assert all(not item.reached for item in result.replicates)
@@ -238,12 +238,12 @@ def test_plateau_is_insufficient(campaign_path: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_cases_on_one_terrain_are_not_counted_as_independent(campaign_path: Path, tmp_path: Path) -> None:
-    settings = RareSettings("LOAD", 5e-2, samples=100, replicates=(2,), random_cases=(50,))
+    parameters = RareParameters("LOAD", 5e-2, samples=100, replicates=(2,), random_cases=(50,))
     # without terrains, 250 cases without a violation are enough for a limit of 5 %
-    assert run_study(campaign_path, tmp_path / "cases", settings, "beta=5").verdict is RareVerdict.PASS
+    assert run_study(campaign_path, tmp_path / "cases", parameters, "beta=5").verdict is RareVerdict.PASS
     terrain = 'terrain = { distribution = "integer", low = 0, high = 9 }'
     campaign_path.write_text(CAMPAIGN.replace("[dispersions]", f"[dispersions]\n{terrain}"))
-    result = run_study(campaign_path, tmp_path / "terrains", settings, "beta=5")
+    result = run_study(campaign_path, tmp_path / "terrains", parameters, "beta=5")
     assert result.verdict is RareVerdict.INSUFFICIENT
     assert (result.decision.counting.cases, result.decision.counting.units) == (250, 10)
     assert result.decision.additional_random_cases is not None

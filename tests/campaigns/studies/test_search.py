@@ -16,7 +16,7 @@ from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.rare import continue_rare
 from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
-from marsyard.campaigns.studies.search import SearchResult, SearchSettings, SearchStudy, start_search
+from marsyard.campaigns.studies.search import SearchParameters, SearchResult, SearchStudy, start_search
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture
 from tests.campaigns.studies import limit_state
 from tests.campaigns.studies.killing import kill_and_resume
@@ -27,10 +27,10 @@ campaign_path = campaign_fixture(CAMPAIGN)
 
 
 def run_search(
-    path: Path, directory: Path, settings: SearchSettings, *, seed: int = 1, max_cases: int = 5000
+    path: Path, directory: Path, parameters: SearchParameters, *, seed: int = 1, max_cases: int = 5000
 ) -> SearchResult:
     campaign = load_campaign(str(path), (), None, seed)
-    return start_search(campaign, settings, max_cases, directory, ExecutorConfig(1), RecordingWatch())
+    return start_search(campaign, parameters, max_cases, directory, ExecutorConfig(1), RecordingWatch())
 
 
 def assert_reduced_to_causes(result: SearchResult) -> None:
@@ -46,7 +46,7 @@ def assert_reduced_to_causes(result: SearchResult) -> None:
 
 
 def test_planted_defect_is_found_and_reduced_to_its_two_causes(campaign_path: Path, tmp_path: Path) -> None:
-    result = run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"))
+    result = run_search(campaign_path, tmp_path / "run", SearchParameters("VELOCITY"))
     assert_reduced_to_causes(result)
     assert replay(tmp_path / "run", result.failures[0].case).differing == ()
 
@@ -74,7 +74,7 @@ def test_planted_defect_is_found_with_other_seeds(campaign_path: Path) -> None:
     for seed in range(2, 12):
         campaign = prepare_campaign(load_campaign(str(campaign_path), (), None, seed), 5000)
         runner = DirectRunner(campaign)
-        study = SearchStudy(campaign, SearchSettings("VELOCITY"), runner)  # type: ignore[arg-type]  # no store
+        study = SearchStudy(campaign, SearchParameters("VELOCITY"), runner)  # type: ignore[arg-type]  # no store
         assert_reduced_to_causes(study.run(RecordingWatch()))
 
 
@@ -83,7 +83,7 @@ def test_campaign_without_violation_reports_the_smallest_margin(tmp_path: Path) 
     path.write_text(limit_state.CAMPAIGN)
     campaign = load_campaign(str(path), ["beta=20.0"])
     result = start_search(
-        campaign, SearchSettings("LOAD", 60), 999, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
+        campaign, SearchParameters("LOAD", 60), 999, tmp_path / "run", ExecutorConfig(1), RecordingWatch()
     )
     assert (result.violations, result.failures, result.exit_code) == (0, (), 0)
     # the evolution strategies approach the corner (4, 4) of the allowed coordinates, at a margin of 20 - 8 / sqrt(2)
@@ -91,7 +91,7 @@ def test_campaign_without_violation_reports_the_smallest_margin(tmp_path: Path) 
 
 
 def test_limit_of_cases_ends_the_search(campaign_path: Path, tmp_path: Path) -> None:
-    result = run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY"), max_cases=200)
+    result = run_search(campaign_path, tmp_path / "run", SearchParameters("VELOCITY"), max_cases=200)
     assert "limit of cases" in result.reason
     assert result.cases <= 200
 
@@ -101,7 +101,7 @@ def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     killed_run, reference_run = tmp_path / "killed", tmp_path / "whole"
     arguments = ["search", str(campaign_path), "--requirement", "VELOCITY", "-n", "150"]
     resume_result = kill_and_resume(arguments, killed_run, log_bytes=20_000)
-    reference = run_search(campaign_path, reference_run, SearchSettings("VELOCITY", 150))
+    reference = run_search(campaign_path, reference_run, SearchParameters("VELOCITY", 150))
     assert resume_result.returncode == reference.exit_code == 1, resume_result.stderr
     assert record.read(killed_run)["study"]["result"] == record.read(reference_run)["study"]["result"]
     # the campaign file of the reduced violation violates the requirement in each of its cases
@@ -115,16 +115,16 @@ def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("parameters", "message"),
     [({"cases": 5}, "--cases 5"), ({"restarts": 0}, "--restarts 0"), ({"max_failures": 0}, "--failures 0")],
 )
-def test_invalid_settings_are_reported(settings: dict[str, int], message: str) -> None:
+def test_invalid_settings_are_reported(parameters: dict[str, int], message: str) -> None:
     with pytest.raises(CampaignError, match=message):
-        SearchSettings("VELOCITY", **settings)
+        SearchParameters("VELOCITY", **parameters)
 
 
 def test_search_has_no_replicates_and_no_rates(campaign_path: Path, tmp_path: Path) -> None:
-    run_search(campaign_path, tmp_path / "run", SearchSettings("VELOCITY", 20))
+    run_search(campaign_path, tmp_path / "run", SearchParameters("VELOCITY", 20))
     with pytest.raises(CampaignError, match="does not contain a study of rare violations"):
         continue_rare(tmp_path / "run", ExecutorConfig(1), RecordingWatch())
     status, output = run_command("compare", tmp_path / "run", tmp_path / "run")

@@ -156,7 +156,7 @@ def test_texts_are_escaped_and_files_stay_in_the_site(make_run: MakeRun, tmp_pat
     directory = make_run(frame, [{**VELOCITY, "id": HOSTILE, "statement": HOSTILE}], name="hostile", git_commit=HOSTILE)
     record = (directory / "campaign.json").read_text()
     hostile_record = {**json.loads(record), "name": HOSTILE, "state": HOSTILE, "started_utc": HOSTILE}
-    hostile_record["configuration"]["parameters"] = parameters
+    hostile_record["definition"]["parameters"] = parameters
     (directory / "campaign.json").write_text(json.dumps(hostile_record))
     text = _write_index(tmp_path)
     assert "alert('x')</script>" not in text

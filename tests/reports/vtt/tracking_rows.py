@@ -46,7 +46,7 @@ def make_subject(
 ) -> Subject:
     """Return the subject of a report on these rows, for a campaign with this name and these legs of the drive."""
     parameters = {"drive": {"legs": legs}} if legs else {}
-    record = {"name": name, "configuration": {"parameters": parameters}}
+    record = {"name": name, "definition": {"parameters": parameters}}
     return Subject(StoredRun(Path("run"), frame, frame, record, ()), "position_error_m", 0.03)
 
 

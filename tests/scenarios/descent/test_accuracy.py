@@ -15,7 +15,7 @@ from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
-from tests.scenarios.descent.settings import FLAT_TERRAIN, IDEAL_INSTRUMENTS, NOISELESS_DETECTOR, make_parameters
+from tests.scenarios.descent.descents import FLAT_TERRAIN, IDEAL_INSTRUMENTS, NOISELESS_DETECTOR, make_parameters
 
 #: Rough ground on a long wave of the terrain ("swell") with 200 m between trough and crest.
 RELIEF = {"samples": 1024, "spacing_m": 4.0, "rms_slope_deg": 1.0, "swell": {"relief_m": 200.0}}

@@ -28,7 +28,7 @@ from marsyard.sim.render import Frame, PixelRays, Sun
 from marsyard.sim.sensor import Detector, DetectorParameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Environment, TerrainParameters
-from tests.scenarios.descent.settings import NOISELESS_DETECTOR, make_parameters, run_descent
+from tests.scenarios.descent.descents import NOISELESS_DETECTOR, make_parameters, run_descent
 
 SMALL_CAMERA = DescentCameraParameters(columns=256, rows=256, pixel_pitch_um=48.0)
 #: Sun at an azimuth of 4 rad and an elevation of 0.7 rad.

@@ -19,7 +19,7 @@ from marsyard.sim.sensor import InertialSolution
 from marsyard.sim.sensor.imu import DEG_H, IMUS, MILLI_G, ImuClass
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface
-from tests.scenarios.descent.settings import make_parameters, run_descent
+from tests.scenarios.descent.descents import make_parameters, run_descent
 from tests.scenarios.descent.test_many_images import InertialEstimator
 
 RECORDER = "tests.scenarios.descent.test_increments:EventRecorder"
@@ -92,8 +92,8 @@ def test_errors_of_increments_are_those_of_the_class(imu_class: ImuClass) -> Non
     p, cases, rate_hz = IMUS[imu_class], 10, 100.0
     errors: dict[str, list[Any]] = {"gyro": [], "accelerometer": []}
     for case in range(cases):
-        settings = {"inertial": {"rate_hz": rate_hz, "imu_class": imu_class}}
-        measured, exact = (measure(case, **settings, exact_instruments=is_exact)[0].increments for is_exact in (0, 1))
+        values = {"inertial": {"rate_hz": rate_hz, "imu_class": imu_class}}
+        measured, exact = (measure(case, **values, exact_instruments=is_exact)[0].increments for is_exact in (0, 1))
         assert measured is not None
         assert exact is not None
         # offset and jitter of the unit's clock: 0.2 ms and 0.02 ms
@@ -129,12 +129,12 @@ def test_other_rates_are_rejected(rate_hz: float) -> None:
 def test_increments_arrive_in_order_and_change_no_other_measurement() -> None:
     """Two descents with the same images: one without increments, one with increments at 100 Hz."""
     # in this process, so that the estimator records its measurements here
-    settings: dict[str, Any] = {"algorithm": RECORDER, "images": 2, "executable": {"isolated": False}}
-    without = run_descent(**settings)
+    values: dict[str, Any] = {"algorithm": RECORDER, "images": 2, "executable": {"isolated": False}}
+    without = run_descent(**values)
     frames = [event for event in EVENTS if isinstance(event, DescentFrame)]
     assert len(EVENTS) == len(frames) == 2
     EVENTS.clear()
-    with_increments = run_descent(**settings, inertial={"rate_hz": 100.0})
+    with_increments = run_descent(**values, inertial={"rate_hz": 100.0})
     assert with_increments.outcome == "VALID"
     assert with_increments.row["image_hash"] == without.row["image_hash"]
     assert differing_columns(dict(without.row), dict(with_increments.row)) == ()

@@ -10,7 +10,7 @@ from marsyard.algorithms.exchange import read_case
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.measurements import DescentFrame, DescentMeasurements
-from tests.scenarios.descent.settings import DESCENT, IDEAL_INSTRUMENTS, make_parameters, run_descent
+from tests.scenarios.descent.descents import DESCENT, IDEAL_INSTRUMENTS, make_parameters, run_descent
 
 STREAM_ESTIMATOR = "tests.scenarios.descent.test_many_images:InertialEstimator"
 #: Nine images of a descent that contain the three images of a standard descent.
@@ -123,7 +123,7 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("values", "message"),
     [
         ({"images": 2}, "images is 2, but 'dimes' needs 3; allowed: 3 to 100"),
         ({"images": 1}, "greater than or equal to 2"),
@@ -135,9 +135,9 @@ def test_answer_table_for_exported_images_is_scored(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_invalid_image_counts_are_rejected(settings: dict[str, Any], message: str) -> None:
+def test_invalid_image_counts_are_rejected(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        make_parameters(**settings)
+        make_parameters(**values)
 
 
 @pytest.mark.parametrize(("images", "positions"), [(3, (0, 1, 2)), (4, (1, 2, 3)), (5, (0, 2, 4)), (10, (1, 5, 9))])

@@ -38,8 +38,8 @@ def test_invalid_parameters_are_reported(invalid: dict[str, Any], message: str) 
 
 
 def test_site_terrain_can_be_overridden() -> None:
-    settings = {"site": "gusev", "terrain": {"samples": 512, "spacing_m": 8.0, "rocks": {"smallest_m": 2.0}}}
-    parameters = DescentScenarioParameters.model_validate(settings)
+    values = {"site": "gusev", "terrain": {"samples": 512, "spacing_m": 8.0, "rocks": {"smallest_m": 2.0}}}
+    parameters = DescentScenarioParameters.model_validate(values)
     site_terrain = site("gusev").terrain("descent")
     rocks = site_terrain.rocks
     assert rocks is not None
@@ -54,10 +54,10 @@ def test_site_cannot_be_dispersed() -> None:
         DescentScenarioParameters.model_validate(complete | {"site": "kelso"})
 
 
-@pytest.mark.parametrize("settings", [{}, {"site": "kelso"}, {"dimes": {"subpixel": False}, "faults": {"haze": 2.0}}])
-def test_complete_parameters_round_trip(settings: dict[str, Any]) -> None:
+@pytest.mark.parametrize("values", [{}, {"site": "kelso"}, {"dimes": {"subpixel": False}, "faults": {"haze": 2.0}}])
+def test_complete_parameters_round_trip(values: dict[str, Any]) -> None:
     """Workers of a campaign receive the parameters as JSON."""
-    parameters = DescentScenarioParameters.model_validate(settings)
+    parameters = DescentScenarioParameters.model_validate(values)
     assert DescentScenarioParameters.model_validate(parameters.model_dump(mode="json", round_trip=True)) == parameters
 
 
@@ -92,8 +92,8 @@ def test_custom_cameras_are_stored_in_the_campaign(tmp_path: Path) -> None:
         "dark_current_e_s = 20\ndark_temperature_c = 20\nrows = 480\nreadout_s = 0.02\n"
         "[lens]\nf_number = 4\nband_nm = [450, 700]\n"
     )
-    settings = {"camera": {"model": str(calibration)}, "detector": str(sheet), "dimes": {"binned_size": [320, 240]}}
-    parameters = DescentScenarioParameters.model_validate(settings)
+    values = {"camera": {"model": str(calibration)}, "detector": str(sheet), "dimes": {"binned_size": [320, 240]}}
+    parameters = DescentScenarioParameters.model_validate(values)
     assert parameters.camera.model is not None
     assert parameters.camera.model.size == (640, 480)
     round_trip = DescentScenarioParameters.model_validate(parameters.model_dump(mode="json", round_trip=True))

@@ -15,7 +15,7 @@ from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.sim.dynamics.recorded import COLUMNS
 from marsyard.sim.streams import Streams
-from tests.scenarios.descent.settings import make_parameters, run_descent
+from tests.scenarios.descent.descents import make_parameters, run_descent
 
 #: OpenCV's camera axes in the axes of a body whose camera looks along -z; equal to its inverse.
 CAMERA_IN_BODY = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
@@ -94,8 +94,8 @@ def test_lever_arm_and_mounting_are_applied(tmp_path: Path) -> None:
     positions = np.column_stack([0.0 * times, 0.0 * times, 2000.0 - 50.0 * times])
     file = _write_poses(tmp_path, times, positions, Rotation.identity(times.size))
     quaternion = tuple(Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])).as_quat().tolist())
-    settings = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
-    parameters = DescentScenarioParameters.model_validate({"flight": settings})
+    values = {"file": file, "axes": "enu", "mounting": quaternion, "lever_m": (0.0, 0.0, -2.0)}
+    parameters = DescentScenarioParameters.model_validate({"flight": values})
     assert isinstance(parameters.flight, FlightFile)
     state = parameters.flight.motion(np.zeros(3), 3.7).state(0.0)
     assert np.allclose(state.attitude.as_matrix(), np.eye(3))
@@ -123,9 +123,9 @@ def test_times_since_1970_are_subtracted_before_rounding(tmp_path: Path, first_i
 
 
 def test_invalid_flights_are_rejected_on_load(tmp_path: Path) -> None:
-    def expect_error(match: str, file: str, **settings: Any) -> None:
+    def expect_error(match: str, file: str, **values: Any) -> None:
         with pytest.raises(ValidationError, match=match):
-            DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"} | settings})
+            DescentScenarioParameters.model_validate({"flight": {"file": file, "axes": "enu"} | values})
 
     expect_error("at image 1 the camera looks up, 60.0 deg above", _write_vertical_fall(tmp_path, tilt_deg=150.0))
     expect_error("at image 1 the camera looks up", _write_vertical_fall(tmp_path), attitude_of="body")

@@ -11,7 +11,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.streams import Streams
-from tests.scenarios.descent.settings import DESCENT, FLAT_TERRAIN, IDEAL_INSTRUMENTS, SMALL_WORLD, run_descent
+from tests.scenarios.descent.descents import DESCENT, FLAT_TERRAIN, IDEAL_INSTRUMENTS, SMALL_WORLD, run_descent
 
 
 @pytest.fixture(scope="module")
@@ -37,25 +37,25 @@ def test_each_catalogue_dispersion_is_reported() -> None:
     """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
     draws = load_campaign("dimes-gusev").draws(3)
     samples = {path: value for path, value in draws.items() if path != "location.terrain"}
-    settings: dict[str, Any] = {
+    values: dict[str, Any] = {
         "location": dict(SMALL_WORLD["location"]),
         "faults": {"exposure_delay_s": 0.25},
         "site": "gusev",
     }
-    settings["terrain"] = dict(SMALL_WORLD["terrain"])
+    values["terrain"] = dict(SMALL_WORLD["terrain"])
     for path, value in samples.items():
         *names, last = path.split(".")
-        table = settings
+        table = values
         for name in names:
             table = table.setdefault(name, {})
         table[last] = value
-    row = run_descent(**settings).row
+    row = run_descent(**values).row
     for path, value in samples.items():
         parts = path.split(".")
         column = next(name for name in ("_".join(parts[start:]) for start in range(len(parts))) if name in row)
         assert row[column] == pytest.approx(value, rel=1e-9), path
     assert (row["fault"], row["fault_size"], row["terrain"]) == ("exposure_delay_s", 0.25, 0)
-    campaigns = [load_campaign(name).configuration for name in catalogue()]
+    campaigns = [load_campaign(name).definition for name in catalogue()]
     dispersed_paths = {path for entry in campaigns if entry.scenario == "descent" for path in entry.dispersions}
     assert dispersed_paths == {*draws, "faults"}
 

@@ -142,7 +142,7 @@ def test_limit_of_an_algorithm_does_not_end_the_case(tmp_path: Path) -> None:
         """
     )
     rows = read_case_rows(run(path, tmp_path / "run", RecordingWatch()))
-    assert own_limits(load_campaign(str(path)).configuration) == (64.0, 2e9)
+    assert own_limits(load_campaign(str(path)).definition) == (64.0, 2e9)
     assert [(row["outcome"], row["Hanging.outcome"]) for row in rows] == [("VALID", "TIMED_OUT")] * 2
 
 

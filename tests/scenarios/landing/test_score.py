@@ -93,7 +93,7 @@ def test_flight_without_landing_has_no_touchdown_score() -> None:
     assert row["landed"] is False
     assert "touchdown_safe" not in row
     # A campaign with touchdown requirements accepts a first case without a landing.
-    check_metrics(load_campaign("hda-benign").configuration, {**row, "answered": True}, Path())
+    check_metrics(load_campaign("hda-benign").definition, {**row, "answered": True}, Path())
 
 
 @pytest.mark.parametrize(

@@ -124,9 +124,9 @@ def test_terrain_and_files_of_a_wrong_size_are_rejected(tmp_path: Path) -> None:
         (_settings({**source, "ortho": str(tmp_path / "no.tif")}), r"no.tif: no such file"),
         (_settings(source, faults={"wrong_map": 1}), r"faults.wrong_map needs another terrain; all terrains with"),
     ]
-    for settings, message in cases:
+    for values, message in cases:
         with pytest.raises(ValidationError, match=message) as caught:
-            LocalisationScenarioParameters.model_validate(settings)
+            LocalisationScenarioParameters.model_validate(values)
         assert caught.value.error_count() == 1
 
 
@@ -137,8 +137,8 @@ def test_example_with_an_invalid_file_ends_with_a_message(
     example = Path(__file__).parents[3] / "docs" / "examples" / "loc-imported.toml"
     missing = {name: str(tmp_path / f"{name}.tif") for name in ("dtm", "ortho")}
     source = missing if posting_m is None else _write_site(tmp_path, posting_m=posting_m)
-    settings = [word for name, path in source.items() for word in ("--set", f"terrain.source.{name}={path}")]
-    result = CliRunner().invoke(app, ["run", str(example), *settings, "--out", str(tmp_path / "run")])
+    overrides = [word for name, path in source.items() for word in ("--set", f"terrain.source.{name}={path}")]
+    result = CliRunner().invoke(app, ["run", str(example), *overrides, "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert message in " ".join(result.output.split())
     assert "Traceback" not in result.output

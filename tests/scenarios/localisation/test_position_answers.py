@@ -41,8 +41,8 @@ seed = 3
 [parameters]
 algorithm = "inertial"
 """
-#: Settings of a short descent with small images and a small map.
-SETTINGS = [
+#: Overrides for a short descent with small images and a small map.
+OVERRIDES = [
     f"{table}.{key}={value}"
     for table, values in {**SMALL, **COARSE}.items()
     if isinstance(values, dict)
@@ -194,9 +194,9 @@ def test_export_and_score_equal_a_normal_run(tmp_path: Path) -> None:
     file = tmp_path / "loc.toml"
     file.write_text(CAMPAIGN)
     folder, truth = tmp_path / "out", tmp_path / "truth"
-    settings = [*SETTINGS, "retain.showcase=none", "retain.products=none"]
+    overrides = [*OVERRIDES, "retain.showcase=none", "retain.products=none"]
     watch = RecordingWatch()
-    export = load_campaign(str(file), settings, None, None, [f"export:{folder}"])
+    export = load_campaign(str(file), overrides, None, None, [f"export:{folder}"])
     export_campaign(export, folder, truth, ExecutorConfig(1), watch)
     estimates = estimate_descent(read_descent(folder / "cases" / "000000"))
     readme = (folder / "README.md").read_text()
@@ -206,7 +206,7 @@ def test_export_and_score_equal_a_normal_run(tmp_path: Path) -> None:
     answers = write_table(tmp_path / "answers.csv", [write_line(0, estimate) for estimate in estimates])
     run_campaign(create_scoring_campaign(folder, truth, answers), tmp_path / "scored", ExecutorConfig(1), watch)
     path = "tests.scenarios.localisation.test_position_answers:RefusingOnceEstimator"
-    run_campaign(load_campaign(str(file), settings, None, None, [path]), tmp_path / "run", ExecutorConfig(1), watch)
+    run_campaign(load_campaign(str(file), overrides, None, None, [path]), tmp_path / "run", ExecutorConfig(1), watch)
     assert find_cases_with_changed_images(truth, tmp_path / "scored") == []
     (scored,), (normal,) = read_case_rows(tmp_path / "scored"), read_case_rows(tmp_path / "run")
     assert (scored["outcome"], scored["valid_images"]) == ("VALID", 3)

@@ -306,13 +306,13 @@ def test_fault_name_and_size_are_reported(name: str) -> None:
 @pytest.mark.parametrize("name", LOC_CAMPAIGNS)
 def test_campaign_loads_and_its_requirements_use_the_columns(name: str) -> None:
     campaign = load_campaign(name)
-    assert campaign.configuration.scenario == "localisation"
-    assert campaign.configuration.requirements
+    assert campaign.definition.scenario == "localisation"
+    assert campaign.definition.requirements
     for case in range(3):
         assert isinstance(campaign.parameters(case), LocalisationScenarioParameters)
     result = _nominal()
     row = {"case": 0, "outcome": result.outcome, "answered": result.answered, **result.row}
-    check_metrics(campaign.configuration, row, Path(name))
+    check_metrics(campaign.definition, row, Path(name))
 
 
 @pytest.mark.parametrize(

@@ -30,9 +30,9 @@ def small_camera() -> Cahvor:
     return Cahvor(np.array([0.5, -0.2, -1.3]), a, h, v, a, np.zeros(3), (32, 32))
 
 
-def write_folder(folder: Path, lines: list[str], settings: str = "") -> Path:
+def write_folder(folder: Path, lines: list[str], parameters: str = "") -> Path:
     folder.mkdir(exist_ok=True)
-    (folder / "ingest.toml").write_text(f'name = "frames"\ntask = "matching"\n{settings}[detector]\nbits = 8\n')
+    (folder / "ingest.toml").write_text(f'name = "frames"\ntask = "matching"\n{parameters}[detector]\nbits = 8\n')
     (folder / "images.csv").write_text("\n".join(lines) + "\n")
     return folder
 

@@ -13,7 +13,7 @@ from marsyard.scenarios.descent.measurement import DescentInstruments
 from marsyard.scenarios.parts import InstrumentReadings, InstrumentTruth, MotionInputs, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams
-from tests.scenarios.descent.settings import FLAT_TERRAIN, IDEAL_INSTRUMENTS, make_parameters, run_descent
+from tests.scenarios.descent.descents import FLAT_TERRAIN, IDEAL_INSTRUMENTS, make_parameters, run_descent
 
 MODULE = f"{__name__}:"
 

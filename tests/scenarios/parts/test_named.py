@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.configuration import CampaignConfiguration, validation_problems
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, validation_problems
 from marsyard.campaigns.definition.identity import custom_sources, list_parts
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
@@ -155,7 +155,7 @@ def test_invalid_columns_are_rejected(columns: object, message: str) -> None:
 
 def test_campaign_identity_includes_the_modules_of_parts() -> None:
     """Custom parts occur in parameters, as a dispersed value, and in a dispersed table."""
-    configuration = CampaignConfiguration.model_validate(
+    definition = CampaignDefinition.model_validate(
         {
             "name": "parts",
             "scenario": "descent",
@@ -179,7 +179,7 @@ def test_campaign_identity_includes_the_modules_of_parts() -> None:
             },
         }
     )
-    assert list_parts(configuration) == (
+    assert list_parts(definition) == (
         "custom_parts:Glider",
         "mine.scores:energy",
         "other:Falling",

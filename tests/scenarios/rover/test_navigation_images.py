@@ -160,7 +160,7 @@ def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("values", "message"),
     [
         ({"custom": {"left": "none.cahvor", "baseline_m": 0.2}}, "none.cahvor"),
         ({"custom": {"left": "small.yaml", "right": "large.yaml", "baseline_m": 0.2}}, "640 x 480 pixels, the right"),
@@ -168,10 +168,10 @@ def test_target_is_tracked_with_a_custom_pair(tmp_path: Path) -> None:
     ],
 )
 def test_invalid_camera_pairs_are_rejected(
-    settings: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    values: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "small.yaml").write_text(OPENCV_CALIBRATION)
     (tmp_path / "large.yaml").write_text(OPENCV_CALIBRATION.replace("640\nimage_height", "800\nimage_height"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ValidationError, match=message):
-        MastCameraParameters.model_validate(settings)
+        MastCameraParameters.model_validate(values)

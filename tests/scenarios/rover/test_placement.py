@@ -179,7 +179,7 @@ def test_variant_replaces_leg_ground_and_rock() -> None:
 def test_regression_campaign_has_the_14_runs_of_the_paper() -> None:
     """Six ways of driving on level ground and visual odometry on the ramp, to a small and to a large rock."""
     campaign = load_campaign("vtt-regression")
-    assert campaign.configuration.cases == 14
+    assert campaign.definition.cases == 14
     scenario = RoverScenario()
     runs = [scenario.check_parameters(campaign.parameters(case)) for case in range(14)]
     legs = [run.legs[0] for run in runs]
@@ -193,7 +193,7 @@ def test_regression_campaign_has_the_14_runs_of_the_paper() -> None:
 
 def test_shadow_of_a_shared_drive_does_not_depend_on_the_tracker() -> None:
     """The sun is 30 deg high behind the rover: at the last stop the mast shades the middle of the rock."""
-    settings: dict[str, Any] = {
+    values: dict[str, Any] = {
         "drive": {
             **SHORT_RUN,
             "start": {"distance_m": 2.6},
@@ -207,10 +207,10 @@ def test_shadow_of_a_shared_drive_does_not_depend_on_the_tracker() -> None:
         "targets": [{"across": 0.0, "up": 0.5}],
     }
     scenario = SharedDriveScenario()
-    row = scenario.run(SharedDriveParameters.model_validate(settings), Streams(1, "shared shadow", 0)).row
+    row = scenario.run(SharedDriveParameters.model_validate(values), Streams(1, "shared shadow", 0)).row
     # the tracker loses the target at the second stop, before the shadow arrives
     assert not row["tracked"]
     assert (row["rover_shadow_on_target"], row["no_rover_shadow_on_target"]) == (True, False)
-    settings["drive"] = {**settings["drive"], "rover_shadow": False}
-    row = scenario.run(SharedDriveParameters.model_validate(settings), Streams(1, "shared shadow", 0)).row
+    values["drive"] = {**values["drive"], "rover_shadow": False}
+    row = scenario.run(SharedDriveParameters.model_validate(values), Streams(1, "shared shadow", 0)).row
     assert not row["rover_shadow_on_target"]

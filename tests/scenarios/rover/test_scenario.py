@@ -176,16 +176,16 @@ def test_unknown_trackers_and_cameras_are_rejected() -> None:
 @pytest.mark.slow
 def test_trackers_share_the_images_of_a_drive() -> None:
     scenario = SharedDriveScenario()
-    settings: dict[str, Any] = {
+    values: dict[str, Any] = {
         "drive": {**SHORT_RUN, "legs": [{"motion": "circle", "step_deg": 5.0, "steps": 2}]},
         "variants": [{"diameter_m": 0.8, "height_m": 0.5, "shape": 8, "yaw_deg": 30.0, "sun_azimuth_deg": 260.0}],
         "targets": [{"across": 0.0, "up": 0.5}, {"across": 0.4, "up": 0.5}],
         "step_ranges": [{"name": "at_10_deg", "min": 10.0, "max": 10.0}],
     }
     silent_tracker = "tests.scenarios.rover.trackers:SilentTracker"
-    settings["drive"] = {**settings["drive"], "compared": ["pure-ncc", silent_tracker]}
+    values["drive"] = {**values["drive"], "compared": ["pure-ncc", silent_tracker]}
     small_steps, large_steps = (
-        SharedDriveParameters.model_validate({**settings, "skipped_stops": skipped_stops}) for skipped_stops in (0, 1)
+        SharedDriveParameters.model_validate({**values, "skipped_stops": skipped_stops}) for skipped_stops in (0, 1)
     )
     assert (small_steps.step, large_steps.step) == (5.0, 10.0)
     results = [scenario.run(p, make_streams(case)) for case, p in enumerate((small_steps, large_steps))]
@@ -203,9 +203,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
     assert isinstance(row["obliquity_max_deg"], float)
     row_within_limit, row_above_limit = (
-        scenario.run(
-            SharedDriveParameters.model_validate({**settings, "max_obliquity_deg": limit}), make_streams(0)
-        ).row
+        scenario.run(SharedDriveParameters.model_validate({**values, "max_obliquity_deg": limit}), make_streams(0)).row
         for limit in (row["obliquity_max_deg"] + 0.1, row["obliquity_max_deg"] - 0.1)
     )
     assert [(columns["in_view"], columns["on_face"]) for columns in (row, row_within_limit, row_above_limit)] == [
@@ -214,7 +212,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
         (True, False),
     ]
     drive = render_drive(DriveKey.from_parameters(small_steps, make_streams(0)))
-    second_target = track_views(SharedDriveParameters.model_validate({**settings, "target": 1}), drive)
+    second_target = track_views(SharedDriveParameters.model_validate({**values, "target": 1}), drive)
     assert second_target.stops[0].point_px[0] > drive.views[0].images.left.corner[0]
     assert second_target.stops[0].images is drive.views[0].images
     # The camera circles the centre of the targets at a constant distance.

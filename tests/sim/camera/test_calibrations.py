@@ -86,7 +86,7 @@ distortion_coefficients:
   data: [-0.1710342568253523, 0.01562344385534763, -0.006842079559350427, 0.005880933792022186, 0]
 """
 
-#: The EuRoC cameras from the MSCKF configuration in Kalibr's format, reduced to the fields that the test reads.
+#: The EuRoC cameras from the MSCKF definition in Kalibr's format, reduced to the fields that the test reads.
 KALIBR = """cam0:
   T_cam_imu:
   - [0.014865542981794, 0.999557249008346, -0.025774436697440, 0.065222909535531]

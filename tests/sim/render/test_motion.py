@@ -64,8 +64,8 @@ def test_rock_image_motion_matches_the_mast_camera(renderer: Renderer, distance_
     eye = np.array([9.2 - distance_m, 10.0, float(surface.height(10.0, 10.0)) + 1.4])
     rocks = rocks_near(field, eye[0], eye[1], distance_m + 3.0, 1.4, albedo=0.15)
     textures = {"ground_texture": Texture(0.2, (0.05,) * 6), "object_texture": Texture(0.2, (0.06,) * 8)}
-    settings: dict[str, Any] = {"mesh_finest_m": 0.04, "mesh_half_width_m": 200.0, "among_objects": True, **textures}
-    scene = Scene(surface, (eye[0], eye[1]), SUN, Photometry(), rocks, **settings)
+    values: dict[str, Any] = {"mesh_finest_m": 0.04, "mesh_half_width_m": 200.0, "among_objects": True, **textures}
+    scene = Scene(surface, (eye[0], eye[1]), SUN, Photometry(), rocks, **values)
     camera = Cahv.from_focal_length(16e-3, 4.65e-6, (512, 384), **FORWARD)
     depression_rad = np.arctan2(0.9, distance_m)
     view = View(scene, camera, rigid(Rotation.from_euler("y", depression_rad), eye))

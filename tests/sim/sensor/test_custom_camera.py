@@ -85,7 +85,7 @@ def test_mirrored_images_are_rejected(euroc: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "fault"),
+    ("values", "fault"),
     [
         ("absent.yaml", "absent.yaml: file: cannot be read"),
         ({"file": "FILE", "focal": 3}, "unknown key focal for a camera file; allowed: file, number"),
@@ -93,8 +93,8 @@ def test_mirrored_images_are_rejected(euroc: Path) -> None:
         ({"model": "CAHVOR", "columns": 64, "rows": 64, "h": (1, 0, 0), "v": (0, 1, 0)}, "CAHVOR requires o and r"),
     ],
 )
-def test_camera_errors_are_reported(euroc: Path, settings: object, fault: str) -> None:
-    if isinstance(settings, dict) and settings.get("file") == "FILE":
-        settings = {**settings, "file": str(euroc)}
+def test_camera_errors_are_reported(euroc: Path, values: object, fault: str) -> None:
+    if isinstance(values, dict) and values.get("file") == "FILE":
+        values = {**values, "file": str(euroc)}
     with pytest.raises(ValidationError, match=fault):
-        CHOICE.validate_python(settings)
+        CHOICE.validate_python(values)

@@ -198,9 +198,9 @@ def test_lowest_scaled_integer_is_missing(tmp_path: Path, dtype: str, lowest: in
     """Without nodata value, it is missing even if its scaled value is positive; with a nodata value it is valid."""
     stored = (BRIGHTNESS * 100).astype(dtype)[None]
     stored[:, :, :6] = lowest
-    settings: dict[str, Any] = {"scales": (0.01,), "offsets": (400.0,)}
-    assert embed(make_source(tmp_path, stored, **settings), 128, 1.0).extent.ortho_holes == 6 * 2 * ROWS
-    assert embed(make_source(tmp_path, stored, nodata=32767, **settings), 128, 1.0).extent.ortho_holes == 0
+    values: dict[str, Any] = {"scales": (0.01,), "offsets": (400.0,)}
+    assert embed(make_source(tmp_path, stored, **values), 128, 1.0).extent.ortho_holes == 6 * 2 * ROWS
+    assert embed(make_source(tmp_path, stored, nodata=32767, **values), 128, 1.0).extent.ortho_holes == 0
 
 
 @pytest.mark.parametrize("transparent", [False, True])

@@ -48,8 +48,8 @@ def _apply_units(units: SurfaceUnits, seed: int = 1, side: int = 1024) -> tuple[
 
 
 def _make_parameters(**changes: Any) -> TerrainParameters:
-    settings = {"samples": 512, "spacing_m": 2.0, "albedo_contrast": 0.1, "albedo_hurst": 0.3, "craters_per_km2": 0.0}
-    return TerrainParameters.model_validate({**settings, **changes})
+    values = {"samples": 512, "spacing_m": 2.0, "albedo_contrast": 0.1, "albedo_hurst": 0.3, "craters_per_km2": 0.0}
+    return TerrainParameters.model_validate({**values, **changes})
 
 
 def test_units_have_the_specified_areas_factors_and_albedos() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_a
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from marsyard.campaigns.errors import ConfigurationError, Problem, suggest_similar
+from marsyard.campaigns.errors import DefinitionError, Problem, suggest_similar
 from marsyard.campaigns.sampling.design import Correlation, Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, GridDispersion, Normal
 from marsyard.sim.files import check_regular
@@ -139,7 +139,7 @@ class CalibrationRuns(Parameters):
     runs: Annotated[tuple[CalibrationRun, ...], Field(strict=False)] = ()
 
 
-class CampaignConfiguration(Parameters):
+class CampaignDefinition(Parameters):
     """All inputs that determine a campaign's rows, apart from the program and the machine."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)]
@@ -170,7 +170,7 @@ class CampaignConfiguration(Parameters):
         return self.cases + sum(self.appended)
 
     @model_validator(mode="after")
-    def _check_unique_ids(self) -> CampaignConfiguration:
+    def _check_unique_ids(self) -> CampaignDefinition:
         ids = [requirement.id for requirement in self.requirements]
         repeated_ids = sorted({name for name in ids if ids.count(name) > 1})
         if repeated_ids:
@@ -235,23 +235,23 @@ class CampaignConfiguration(Parameters):
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Read the tables of a TOML file. Raises ConfigurationError if it is unreadable or invalid."""
+    """Read the tables of a TOML file. Raises DefinitionError if it is unreadable or invalid."""
     try:
         check_regular(path)
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ConfigurationError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
+        raise DefinitionError([Problem(str(path), "", f"cannot be read: {error.strerror or error}")]) from error
     except (ValueError, RecursionError) as error:  # ValueError: also numbers of thousands of digits
-        raise ConfigurationError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
+        raise DefinitionError([Problem(str(path), "", f"not valid TOML: {error}")]) from error
 
 
 def read_table(path: Path, model: type[Model]) -> Model:
-    """Read a complete TOML file into a model. Raises ConfigurationError; each problem has its key."""
+    """Read a complete TOML file into a model. Raises DefinitionError; each problem has its key."""
     try:
         return model.model_validate(read_tables(path))
     except ValidationError as error:
         problems = [Problem(str(path), key_text(key), message) for key, message in validation_problems(error, model)]
-        raise ConfigurationError(problems) from error
+        raise DefinitionError(problems) from error
 
 
 def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[tuple[Key, str]]:
@@ -277,7 +277,7 @@ def validation_problems(error: ValidationError, model: type[BaseModel]) -> list[
             if not any(option.__name__ == part for option in list_models(node)):
                 key = (*key, part)
             node = _find_inner_type(node, part)
-        if model is CampaignConfiguration and len(location) > 2 and location[0] == "dispersions":
+        if model is CampaignDefinition and len(location) > 2 and location[0] == "dispersions":
             key = (*location[:2], *location[3:])
         problems.append((key, message))
     return problems

@@ -1,4 +1,4 @@
-"""Settings of the descent tests: a small terrain, one descent, ideal instruments and a noiseless detector."""
+"""Parameters of the descent tests: a small terrain, one descent, ideal instruments and a noiseless detector."""
 
 from collections.abc import Mapping
 from typing import Any
