@@ -24,7 +24,6 @@ from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.scenarios.user_files import check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular
-from marsyard.sim.sensor.compression import compress
 
 EXPORT, ANSWERS = "export:", "answers:"
 #: Separator between the folder of an export and the bits per pixel of its compressed images.
@@ -143,6 +142,9 @@ class CaseExporter:
     def estimate(self, measurements: Any) -> Any:
         """Write a case. Raises OSError."""
         if self.bits_per_pixel is not None:
+            # imported at the first use: a worker starts in three quarters of the time without the instruments
+            from marsyard.sim.sensor.compression import compress
+
             bits, images = self.bits_per_pixel, measurements.images
             counts = [compress(image.counts, bits, image.calibration.full_scale_dn) for image in images]
             compressed_images = tuple(

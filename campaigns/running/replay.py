@@ -1,10 +1,8 @@
-"""Load stored campaigns, run single cases again (replay), and check custom algorithms in worker processes."""
+"""Load stored campaigns, and run single cases again (replay)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -12,9 +10,9 @@ from pydantic import ValidationError
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, key_text, validation_problems
 from marsyard.campaigns.definition.identity import Identity, create_identity
-from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, DefinitionError, Problem, WorkerExitError
+from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, DefinitionError, Problem
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.worker_process import Executor, Work, WorkLimits, accept_process_state
+from marsyard.campaigns.execution.worker_process import Executor
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
@@ -23,7 +21,6 @@ from marsyard.campaigns.store.origin import check_origin, check_rows
 from marsyard.campaigns.store.products import ALL_PRODUCTS, REPLAYED_PRODUCTS, PackedProducts
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
-from marsyard.scenarios import conformance as suite
 from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 
@@ -127,58 +124,3 @@ def load_stored_campaign(directory: Path, definition: CampaignDefinition) -> Cam
         problems.append(("", f"nothing was run or changed; {hint}"))
         raise DefinitionError([Problem(str(directory), *problem) for problem in problems]) from error
     return campaign
-
-
-#: Limits of output and memory of a conformance check, bytes.
-_OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
-
-
-def create_subject(spec: str, task: str | None, limit_s: float) -> suite.CandidateAlgorithm:
-    """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
-
-    limit_s: time limit of one answer
-    task: task of the algorithm; None for the task that its interface determines.
-    Raises CampaignError if the name or the task is unknown.
-    """
-    if task is not None and task not in suite.subject_kinds():
-        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.subject_kinds())}")
-    try:
-        task_name = suite.determine_task(spec) if task is None else task
-        suite.check_subject(spec, task_name)
-    except ValueError as error:
-        raise CampaignError(str(error)) from error
-    return suite.CandidateAlgorithm(spec, task_name, limit_s)
-
-
-def run_conformance_checks(subject: suite.CandidateAlgorithm) -> Iterator[suite.Finding]:
-    """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
-    # the time limit of an answer, the same time for the other work of the check, and 5 s
-    limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
-    with LocalExecutor(1) as workers:
-        for number, (name, requirement) in enumerate(suite.check_names(subject)):
-            ((result,),) = workers.run(
-                Work(partial(suite.run_check, subject), [number], limits, load=partial(_load_subject, subject))
-            )
-            finding, error = result.result, result.error
-            if finding is None and isinstance(error, WorkerExitError):
-                frames = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
-                problem = f"{error.outcome}: {error}{f' ({frames[0]})' if frames else ''}"
-                advice = "it must return within the limits of time and memory for every image"
-                finding = suite.Finding(name, requirement, problem, advice)
-            elif finding is None:
-                problem = f"{type(error).__name__}: {error}"
-                advice = "this is a defect of the checks or of the types in the answer"
-                finding = suite.Finding(name, requirement, problem, advice)
-            elif finding.passed and result.changed:
-                problem = f"it changed the state of its process: {'; '.join(result.changed)}"
-                advice = "restore the state before returning, and end every thread and child process"
-                finding = replace(finding, problem=problem, next_step=f"{advice}: a case must not affect later cases")
-            yield finding
-            if number == 0 and isinstance(error, WorkerExitError):
-                return
-
-
-def _load_subject(subject: suite.CandidateAlgorithm) -> None:
-    """Load and compile the subject of conformance checks in a worker."""
-    subject.prepare()
-    accept_process_state()

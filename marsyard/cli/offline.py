@@ -146,7 +146,7 @@ def conformance(
     as_json: JsonOption = False,
 ) -> None:
     """Check that a custom algorithm, dynamics model, instrument or score follows its interface and time limit."""
-    from marsyard.campaigns.running.replay import create_subject, run_conformance_checks
+    from marsyard.campaigns.running.conformance import create_subject, run_conformance_checks
     from marsyard.scenarios.parts.named import KINDS
 
     candidate = create_subject(algorithm, task, time_limit)

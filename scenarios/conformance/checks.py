@@ -85,7 +85,7 @@ class Check:
 class Suite(ABC):
     """Conformance suite of one algorithm or part; a new object is constructed for each check.
 
-    `marsyard.campaigns.running.replay` runs each check in a worker process, and also reports whether the algorithm
+    `marsyard.campaigns.running.conformance` runs each check in a worker process, and also reports whether the algorithm
     changed the state of that process.
 
     - make: constructs the algorithm or part

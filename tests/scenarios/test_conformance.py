@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.running.replay import run_conformance_checks
+from marsyard.campaigns.running.conformance import run_conformance_checks
 from marsyard.scenarios.conformance import CandidateAlgorithm, determine_task, inputs, trackers
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.landing_site import LANDING
