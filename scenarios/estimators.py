@@ -38,7 +38,7 @@ Algorithm = TypeVar("Algorithm")
 Options = TypeVar("Options")
 
 
-def definitions(
+def variants(
     name: str, create: Callable[[Any], Any], improvements: Mapping[str, Any]
 ) -> dict[str, Callable[[Any], Any]]:
     """Return the variants of an algorithm of a paper, by name.

@@ -13,7 +13,7 @@ from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchS
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
-from marsyard.scenarios.estimators import Task, definitions
+from marsyard.scenarios.estimators import Task, variants
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline import SITE_FORMAT
 
@@ -23,7 +23,7 @@ LANDING: Task[SiteEstimator, HdaOptions] = Task(
     methods=("estimate",),
     answers=(SiteEstimate, SiteOutcome),
     shipped={
-        **definitions("hda", HdaEstimator, IMPROVEMENTS),
+        **variants("hda", HdaEstimator, IMPROVEMENTS),
         # the baselines replace stages of the improved algorithm
         "essential-matrix": lambda options: EssentialMatrixEstimator(replace(options, **IMPROVEMENTS)),
         "semi-global": lambda options: SemiGlobalEstimator(replace(options, **IMPROVEMENTS)),

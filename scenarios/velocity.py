@@ -20,7 +20,7 @@ from marsyard.algorithms.dimes.options import IMPROVEMENTS
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.estimators import Task, definitions
+from marsyard.scenarios.estimators import Task, variants
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline import VELOCITY_FORMAT, CaseExporter, RecordedAnswer
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
@@ -40,7 +40,7 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     methods=("estimate",),
     answers=(VelocityEstimate, VelocityOutcome),
     shipped={
-        **definitions("dimes", DimesEstimator, IMPROVEMENTS),
+        **variants("dimes", DimesEstimator, IMPROVEMENTS),
         "phase-correlation": lambda _: PhaseCorrelationEstimator(),
         "homography": lambda _: HomographyEstimator(),
     },

@@ -8,7 +8,7 @@ from marsyard.algorithms.exchange import ExecutableTargetTracker
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import IMPROVEMENTS
-from marsyard.scenarios.estimators import Task, definitions
+from marsyard.scenarios.estimators import Task, variants
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(
     name="tracking",
@@ -16,7 +16,7 @@ TRACKING: Task[TargetTracker, VttOptions] = Task(
     methods=("designate", "aim", "update", "clear", "state"),
     answers=(MastAim, PixelBox, TargetUpdate, TargetLoss, TrackingState),
     shipped={
-        **definitions("vtt", VisualTargetTracker, IMPROVEMENTS),
+        **variants("vtt", VisualTargetTracker, IMPROVEMENTS),
         # the paper's baseline: without scale and roll
         "pure-ncc": lambda options: VisualTargetTracker(
             replace(options, scale=PURE_NCC.scale, roll=PURE_NCC.roll, warp=PURE_NCC.warp)
