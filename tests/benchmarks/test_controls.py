@@ -39,7 +39,7 @@ def test_control_that_meets_all_requirements_is_reported(tmp_path: Path) -> None
     text, _, _ = find_campaign("hda-benign").read_text().partition("[[requirements]]")
     path = tmp_path / "benign.toml"
     path.write_text(f'{text}[[requirements]]\nid = "HDA-FIND"\n')
-    measure = measure_campaign(str(path), ControlRun((0,), ("terrain.samples=512",)))
+    measure = measure_campaign(str(path), ControlRun((0, 1), ("terrain.samples=512",)))
     cells = dict(zip(TITLES.values(), measure.how.split(" | "), strict=True))
     assert not measure.passed
     assert (cells["no image"], cells["constant"], cells["refusal"]) == ("**none**", "**none**", "HDA-FIND")
