@@ -4,13 +4,15 @@ import ctypes
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from marsyard.sim.render.backend import DepthRenderer, RenderingError, default_backend
+from marsyard.sim.render.backend import RenderingError, create_depth_renderer, default_backend
+from marsyard.sim.render.pinhole import DepthRenderer
 
 SCRIPT = """
 import sys
@@ -88,15 +90,19 @@ def _make_depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
     return pose, 40.0, 1.0, 100.0
 
 
+def _make_level_ground() -> trimesh.Trimesh:
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
 def test_load_replaces_the_previous_geometry() -> None:
     """Depths of level ground and of a triangle above its centre are exact, for any load order.
 
     The rendered number of a triangle is its object number plus 1; the number of ground is 0.
     """
-    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
-    ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    ground = _make_level_ground()
     triangle = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
-    renderer = DepthRenderer(64, default_backend())
+    renderer = create_depth_renderer(64, default_backend())
     with pytest.raises(RenderingError, match="no mesh"):
         renderer.draw(*_make_depth_view(20.0))
     no_triangles = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
@@ -115,11 +121,112 @@ def test_load_replaces_the_previous_geometry() -> None:
     renderer.close()
 
 
+@pytest.fixture
+def small_renderer() -> Iterator[DepthRenderer]:
+    renderer = create_depth_renderer(64, default_backend())
+    yield renderer
+    renderer.close()
+
+
+def test_views_contain_the_first_triangle_of_each_ray(small_renderer: DepthRenderer) -> None:
+    """Depth and number at each pixel's centre equal those of its ray, intersected with all triangles in float64.
+
+    Most triangles are behind the camera, so that the vertex numbers of the others need three bytes.
+    """
+    rng, height_m = np.random.default_rng(4), 20.0
+    centres = rng.uniform([-8.0, -8.0, 1.0], [8.0, 8.0, 12.0], (40, 3))
+    triangles = centres[:, None] + rng.uniform(-4.0, 4.0, (40, 3, 3)) * [1.0, 1.0, 0.2]
+    # back faces are not drawn: the normals point upwards
+    is_down = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] < 0.0
+    triangles[is_down] = triangles[is_down, ::-1]
+    hidden = np.full((30_000, 3, 3), height_m + 5.0) * [0.0, 0.0, 1.0] + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    numbers = rng.permutation(100_000)[:30_040]
+    small_renderer.load(_make_level_ground(), np.concatenate([hidden, triangles]), numbers)
+    depth, ids = small_renderer.draw(*_make_depth_view(height_m))
+    x = (np.arange(64) + 0.5 - 32.0) / 40.0
+    rays = np.stack([*np.broadcast_arrays(x, -x[:, None], -1.0)], axis=-1)
+    # corner 0 + u edge 1 + v edge 2 = eye + distance ray
+    edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=-1)
+    matrices = np.concatenate(
+        [
+            np.broadcast_to(edges[:, None, None], (40, 64, 64, 3, 2)),
+            np.broadcast_to(-rays[..., None], (40, 64, 64, 3, 1)),
+        ],
+        axis=-1,
+    )
+    right_side = np.array([0.0, 0.0, height_m]) - triangles[:, 0]
+    u, v, distance = np.moveaxis(np.linalg.solve(matrices, right_side[:, None, None, :, None])[..., 0], -1, 0)
+    inside = np.minimum(np.minimum(u, v), 1.0 - u - v)
+    distances = np.sort(np.where(inside > 0.0, distance, height_m), axis=0)
+    first = np.where(inside > 0.0, distance, np.inf).argmin(axis=0)
+    # undefined are pixels with an edge or an intersection at their centre: OpenGL rounds corners to 1/256 pixel
+    is_defined = (np.abs(inside).min(axis=0) > 0.01) & (distances[1] - distances[0] > 0.01)
+    is_ground = distances[0] == height_m
+    is_defined |= is_ground & (np.abs(inside).min(axis=0) > 0.01)
+    assert is_defined.mean() > 0.5
+    expected_ids = np.where(is_ground, 0, numbers[30_000 + first] + 1)
+    np.testing.assert_array_equal(ids[is_defined], expected_ids[is_defined])
+    # the resolution of a 24-bit depth between 1 and 100 m, and the rounding of corners on slopes
+    np.testing.assert_allclose(depth[is_defined], distances[0][is_defined], atol=3e-3)
+    assert len(np.unique(ids[is_defined])) > 10
+
+
+def test_a_mesh_is_uploaded_once_for_all_views(small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pyrender import Primitive
+
+    uploads, upload = [], Primitive._add_to_context
+
+    def record_upload(primitive: Primitive) -> None:
+        uploads.append(primitive)
+        upload(primitive)
+
+    monkeypatch.setattr(Primitive, "_add_to_context", record_upload)
+    for loads in (1, 2):
+        small_renderer.load(_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+        for height_m in (20.0, 10.0):
+            small_renderer.draw(*_make_depth_view(height_m))
+        assert len(uploads) == loads
+    assert [primitive._in_context() for primitive in uploads] == [False, True]
+
+
+def test_images_reuse_the_compiled_shaders_and_the_context(
+    small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every image would use more memory if pyrender or PyOpenGL did not recognise the context."""
+    from OpenGL import contextdata
+    from pyrender.shader_program import ShaderProgram
+
+    compilations, compile_program = [], ShaderProgram._add_to_context
+
+    def record_compilation(program: ShaderProgram) -> None:
+        compilations.append(program)
+        compile_program(program)
+
+    monkeypatch.setattr(ShaderProgram, "_add_to_context", record_compilation)
+    context_counts = set()
+    for _ in range(3):
+        small_renderer.load(_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+        small_renderer.draw(*_make_depth_view(20.0))
+        context_counts.add(len(contextdata.storedPointers))
+    assert len(compilations) == 1
+    assert len(context_counts) == 1
+
+
+def test_too_many_vertices_are_reported(small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyrender stores vertex numbers in single precision, which would draw wrong triangles."""
+    monkeypatch.setattr("marsyard.sim.render.pinhole._MAX_VERTICES", 6)
+    ground, triangle = _make_level_ground(), np.eye(3)[None]
+    with pytest.raises(RenderingError, match="7 vertices are visible; maximum 6"):
+        small_renderer.load(ground, triangle, np.array([0]))
+    monkeypatch.undo()
+    small_renderer.load(ground, triangle, np.array([0]))
+
+
 def test_second_backend_in_one_process_is_rejected() -> None:
     program = (
-        "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
+        "from marsyard.sim.render.backend import RenderingError, create_depth_renderer\n"
         "import OpenGL\n"
-        "try:\n    DepthRenderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
+        "try:\n    create_depth_renderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
     )
     environment = os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
     run = subprocess.run(
@@ -131,8 +238,8 @@ def test_second_backend_in_one_process_is_rejected() -> None:
 @pytest.mark.slow
 def test_python_without_assertions_is_rejected() -> None:
     program = (
-        "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
-        "try:\n    DepthRenderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
+        "from marsyard.sim.render.backend import RenderingError, create_depth_renderer\n"
+        "try:\n    create_depth_renderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
     )
     run = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
     assert "without -O" in run.stdout
