@@ -115,6 +115,10 @@ class _VertexRenderer(pyrender.Renderer):  # type: ignore[misc]
     the near plane and 1 at the far plane, and the number of the background exceeds those of all vertices.
     """
 
+    _main_fb_ms: Any
+    _main_cb_ms: Any
+    _main_db_ms: Any
+
     def __init__(self, width_px: int, height_px: int) -> None:
         super().__init__(width_px, height_px)
         self._program_cache = ShaderProgramCache(str(_SHADERS))

@@ -1,6 +1,6 @@
 """Radiance and truth of a scene through an exact camera model.
 
-OpenGL draws pinhole views that contain the camera's field of view: the depth of the ground, and the numbers of the
+pyrender draws pinhole views that contain the camera's field of view: the depth of the ground, and the numbers of the
 object triangles in front of it. They are a first guess for each pixel's ray, which comes from the exact camera model.
 The intersection of the ray with the terrain is then solved by Newton's method, or its intersection with the triangle is
 computed. The surface is shaded at this point. The camera's distortion is therefore exact.
@@ -192,7 +192,7 @@ class Renderer:
     def _draw_views(
         self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float, numbers: Int64[np.ndarray, "triangles"]
     ) -> Views:
-        """Draw the pinhole views by OpenGL: the ground, and the triangles of objects with these numbers.
+        """Draw the pinhole views by pyrender: the ground, and the triangles of objects with these numbers.
 
         `clearance_m` is the height of the camera above the ground.
         """
