@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +38,7 @@ scene = Scene(surface, (10.0, 20.0), Sun(direction(1.0, 0.7)), Photometry())
 renderer = Renderer(sys.argv[1])
 frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
 camera_pose = Pose(pose.rotation.as_matrix(), pose.translation)
-depth = renderer._draw_views(scene, PixelRays.from_camera(camera), camera_pose, 1000.0).depth
+depth = renderer._draw_views(scene, PixelRays.from_camera(camera), camera_pose, 1000.0, np.empty(0, np.int64)).depth
 np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=depth)
 """
 
@@ -133,82 +134,65 @@ def test_views_contain_the_first_triangle_of_each_ray(small_renderer: DepthRende
 
     Most triangles are behind the camera, so that the vertex numbers of the others need three bytes.
     """
-    rng, height_m = np.random.default_rng(4), 20.0
+    rng, eye = np.random.default_rng(4), np.array([0.0, 0.0, 20.0])
     centres = rng.uniform([-8.0, -8.0, 1.0], [8.0, 8.0, 12.0], (40, 3))
     triangles = centres[:, None] + rng.uniform(-4.0, 4.0, (40, 3, 3)) * [1.0, 1.0, 0.2]
     # back faces are not drawn: the normals point upwards
     is_down = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] < 0.0
     triangles[is_down] = triangles[is_down, ::-1]
-    hidden = np.full((30_000, 3, 3), height_m + 5.0) * [0.0, 0.0, 1.0] + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    hidden = np.tile(eye + np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0.0, 1.0, 5.0]]), (30_000, 1, 1))
     numbers = rng.permutation(100_000)[:30_040]
     small_renderer.load(_make_level_ground(), np.concatenate([hidden, triangles]), numbers)
-    depth, ids = small_renderer.draw(*_make_depth_view(height_m))
+    depth, ids = small_renderer.draw(*_make_depth_view(eye[2]))
     x = (np.arange(64) + 0.5 - 32.0) / 40.0
     rays = np.stack([*np.broadcast_arrays(x, -x[:, None], -1.0)], axis=-1)
-    # corner 0 + u edge 1 + v edge 2 = eye + distance ray
-    edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=-1)
-    matrices = np.concatenate(
-        [
-            np.broadcast_to(edges[:, None, None], (40, 64, 64, 3, 2)),
-            np.broadcast_to(-rays[..., None], (40, 64, 64, 3, 1)),
-        ],
-        axis=-1,
-    )
-    right_side = np.array([0.0, 0.0, height_m]) - triangles[:, 0]
-    u, v, distance = np.moveaxis(np.linalg.solve(matrices, right_side[:, None, None, :, None])[..., 0], -1, 0)
-    inside = np.minimum(np.minimum(u, v), 1.0 - u - v)
-    distances = np.sort(np.where(inside > 0.0, distance, height_m), axis=0)
-    first = np.where(inside > 0.0, distance, np.inf).argmin(axis=0)
-    # undefined are pixels with an edge or an intersection at their centre: OpenGL rounds corners to 1/256 pixel
-    is_defined = (np.abs(inside).min(axis=0) > 0.01) & (distances[1] - distances[0] > 0.01)
-    is_ground = distances[0] == height_m
-    is_defined |= is_ground & (np.abs(inside).min(axis=0) > 0.01)
-    assert is_defined.mean() > 0.5
-    expected_ids = np.where(is_ground, 0, numbers[30_000 + first] + 1)
-    np.testing.assert_array_equal(ids[is_defined], expected_ids[is_defined])
+    # a ray is the sum of the three vectors to the corners with these weights; it meets the plane at 1 / (their sum)
+    weights = np.einsum("tij,rcj->trci", np.linalg.inv((triangles - eye).swapaxes(1, 2)), rays)
+    distance = 1.0 / weights.sum(axis=-1)
+    inside = (weights * distance[..., None]).min(axis=-1)
+    hits = np.where(inside > 0.0, distance, eye[2])
+    nearest, second = np.partition(hits, 1, axis=0)[:2]
+    is_ground = nearest == eye[2]
+    # excluded are pixels with an edge or an intersection at their centre, as OpenGL rounds corners to 1/256 pixel
+    tested = (np.abs(inside).min(axis=0) > 0.01) & (is_ground | (second - nearest > 0.01))
+    expected_ids = np.where(is_ground, 0, numbers[30_000 + hits.argmin(axis=0)] + 1)
+    np.testing.assert_array_equal(ids[tested], expected_ids[tested])
     # the resolution of a 24-bit depth between 1 and 100 m, and the rounding of corners on slopes
-    np.testing.assert_allclose(depth[is_defined], distances[0][is_defined], atol=3e-3)
-    assert len(np.unique(ids[is_defined])) > 10
+    np.testing.assert_allclose(depth[tested], nearest[tested], atol=3e-3)
+    assert tested.mean() > 0.5
+    assert len(np.unique(ids[tested])) > 10
 
 
-def test_a_mesh_is_uploaded_once_for_all_views(small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pyrender import Primitive
+def _record_transfers(monkeypatch: pytest.MonkeyPatch, kind: Any) -> list[Any]:
+    """Record the meshes (`Primitive`) or shaders (`ShaderProgram`) that pyrender transfers to OpenGL."""
+    transfers, transfer = [], kind._add_to_context
 
-    uploads, upload = [], Primitive._add_to_context
+    def record(item: Any) -> None:
+        transfers.append(item)
+        transfer(item)
 
-    def record_upload(primitive: Primitive) -> None:
-        uploads.append(primitive)
-        upload(primitive)
-
-    monkeypatch.setattr(Primitive, "_add_to_context", record_upload)
-    for loads in (1, 2):
-        small_renderer.load(_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
-        for height_m in (20.0, 10.0):
-            small_renderer.draw(*_make_depth_view(height_m))
-        assert len(uploads) == loads
-    assert [primitive._in_context() for primitive in uploads] == [False, True]
+    monkeypatch.setattr(kind, "_add_to_context", record)
+    return transfers
 
 
-def test_images_reuse_the_compiled_shaders_and_the_context(
+def test_shaders_are_compiled_once_and_meshes_are_kept_for_all_views(
     small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every image would use more memory if pyrender or PyOpenGL did not recognise the context."""
     from OpenGL import contextdata
+    from pyrender import Primitive
     from pyrender.shader_program import ShaderProgram
 
-    compilations, compile_program = [], ShaderProgram._add_to_context
-
-    def record_compilation(program: ShaderProgram) -> None:
-        compilations.append(program)
-        compile_program(program)
-
-    monkeypatch.setattr(ShaderProgram, "_add_to_context", record_compilation)
+    meshes, shaders = (_record_transfers(monkeypatch, kind) for kind in (Primitive, ShaderProgram))
     context_counts = set()
-    for _ in range(3):
+    for loads in (1, 2, 3):
         small_renderer.load(_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
-        small_renderer.draw(*_make_depth_view(20.0))
+        for height_m in (20.0, 10.0):
+            small_renderer.draw(*_make_depth_view(height_m))
+        assert len(meshes) == loads
         context_counts.add(len(contextdata.storedPointers))
-    assert len(compilations) == 1
+    assert [mesh._in_context() for mesh in meshes] == [False, False, True]
+    assert len(shaders) == 1
     assert len(context_counts) == 1
 
 
