@@ -24,6 +24,8 @@ from benchmarks.images import SUN, descent_pose, descent_scene, measure_all_core
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rays import VIEW_SIDE_PX
 from marsyard.sim.render.renderer import ground_mesh
 from marsyard.sim.render.scene import graded_offsets
@@ -82,6 +84,8 @@ def _make_descent_mesh() -> dict[str, Any]:
 
 def _prepare_pyrender(inputs: Mapping[str, Any]) -> Callable[[], None]:
     """Return a function that renders the mesh with pyrender."""
+    # chooses the backend, and makes pyrender find its compiled shaders again
+    process_renderer(default_backend()).description()
     import pyrender
 
     scene = pyrender.Scene(ambient_light=(0.1, 0.1, 0.1))
@@ -95,33 +99,8 @@ def _prepare_pyrender(inputs: Mapping[str, Any]) -> Callable[[], None]:
     )
     scene.add(camera, pose=inputs["pose"])
     renderer = pyrender.OffscreenRenderer(VIEW_SIDE_PX, VIEW_SIDE_PX)
-    _compile_shaders_once(renderer._renderer)
     flags = pyrender.RenderFlags.SHADOWS_DIRECTIONAL
     return lambda: renderer.render(scene, flags=flags)
-
-
-def _compile_shaders_once(renderer: Any) -> None:
-    """Make pyrender reuse its compiled shaders.
-
-    pyrender finds compiled shaders by the current context. PyOpenGL represents the OSMesa context by a new pointer
-    object each time. Therefore every frame would compile its shaders again and leak about 0.3 MB.
-    """
-    programs = renderer._program_cache
-    compile_program = programs.get_program
-    programs_by_key: dict[Any, Any] = {}
-
-    def get_program(
-        vertex_shader: str,
-        fragment_shader: str,
-        geometry_shader: str | None = None,
-        defines: dict[str, Any] | None = None,
-    ) -> Any:
-        key = (vertex_shader, fragment_shader, geometry_shader, tuple(sorted((defines or {}).items())))
-        if key not in programs_by_key:
-            programs_by_key[key] = compile_program(vertex_shader, fragment_shader, geometry_shader, defines)
-        return programs_by_key[key]
-
-    programs.get_program = get_program
 
 
 def _run_renderer(command: list[str], inputs: Mapping[str, Any], repeats: int) -> list[float]:

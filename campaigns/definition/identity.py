@@ -177,7 +177,7 @@ def hash_code(components: tuple[str, ...]) -> str:
     """Compute the hash of the sources that determine rows; `components`: names of scenario, algorithms and parts."""
     sources: list[tuple[str, Path]] = []
     for folder in _CODE_FOLDERS:
-        for pattern in ("*.py", "*.json"):
+        for pattern in ("*.py", "*.json", "shaders/*"):
             sources += relative_to(_PACKAGE_FOLDER, sorted((_PACKAGE_FOLDER / folder).rglob(pattern)))
     return hash_sources((*sources, *(source for name in components for source in custom_sources(name))))
 

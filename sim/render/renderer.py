@@ -1,6 +1,6 @@
 """Radiance and truth of a scene through an exact camera model.
 
-OpenGL draws pinhole views that contain the camera's field of view: the depth of the ground, and the numbers of the
+pyrender draws pinhole views that contain the camera's field of view: the depth of the ground, and the numbers of the
 object triangles in front of it. They are a first guess for each pixel's ray, which comes from the exact camera model.
 The intersection of the ray with the terrain is then solved by Newton's method, or its intersection with the triangle is
 computed. The surface is shaded at this point. The camera's distortion is therefore exact.
@@ -28,7 +28,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import rotation_matrix
-from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
+from marsyard.sim.render.backend import Backend, RenderingError, create_depth_renderer
 from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.kernels.primary import MAX_GRAZING_SINE, trace_primary_rays
 from marsyard.sim.render.kernels.shading import shade
@@ -41,6 +41,8 @@ from marsyard.sim.terrain import Surface
 
 if TYPE_CHECKING:
     import trimesh
+
+    from marsyard.sim.render.pinhole import DepthRenderer
 
 #: Number of terrain levels (resolutions) in a kernel call: kernels are compiled for a fixed number of arrays. A terrain
 #: with 2**15 samples along a side has 12 levels.
@@ -184,13 +186,13 @@ class Renderer:
 
     def _view_renderer(self, side_px: int) -> DepthRenderer:
         if side_px not in self._views:
-            self._views[side_px] = DepthRenderer(side_px, self._backend)
+            self._views[side_px] = create_depth_renderer(side_px, self._backend)
         return self._views[side_px]
 
     def _draw_views(
         self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float, numbers: Int64[np.ndarray, "triangles"]
     ) -> Views:
-        """Draw the pinhole views by OpenGL: the ground, and the triangles of objects with these numbers.
+        """Draw the pinhole views by pyrender: the ground, and the triangles of objects with these numbers.
 
         `clearance_m` is the height of the camera above the ground.
         """

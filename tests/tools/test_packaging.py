@@ -44,7 +44,13 @@ def test_wheel_contains_one_package(wheel: Path) -> None:
     assert {name for name in top_level_names if not name.endswith(".dist-info")} == {"marsyard"}
     for name in ("sim/render/renderer.py", "scenarios/descent/requirements.toml", "reports/templates/report.css"):
         assert f"marsyard/{name}" in names
-    sources = {path.relative_to(ROOT).as_posix() for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    sources = {
+        path.relative_to(ROOT).as_posix()
+        for folder in FOLDERS
+        for pattern in ("*.py", "shaders/*")
+        for path in (ROOT / folder).rglob(pattern)
+    }
+    assert "sim/render/shaders/segmentation.vert" in sources
     assert {f"marsyard/{source}" for source in sources} <= set(names)
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from marsyard.campaigns.definition.identity import hash_code
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
 from marsyard.scenarios.systems import catalogue
@@ -299,3 +300,9 @@ def test_unknown_parameter_error_lists_keys_of_its_table(campaign_file: Campaign
     text = load_and_expect_error(campaign_file(dispersions=dispersion))
     assert f"allowed: {allowed}" in text
     assert ("wind.*" in text) == path.startswith("wnd")
+
+
+def test_hash_of_the_code_includes_the_shaders(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("marsyard.campaigns.definition.identity.hash_sources", lambda sources: sorted(dict(sources)))
+    names = hash_code.__wrapped__(())
+    assert {"sim/render/pinhole.py", "sim/render/shaders/segmentation.vert"} <= set(names)

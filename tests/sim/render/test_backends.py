@@ -4,13 +4,16 @@ import ctypes
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 
-from marsyard.sim.render.backend import DepthRenderer, RenderingError, default_backend
+from marsyard.sim.render.backend import RenderingError, create_depth_renderer, default_backend
+from marsyard.sim.render.pinhole import DepthRenderer
 
 SCRIPT = """
 import sys
@@ -35,7 +38,7 @@ scene = Scene(surface, (10.0, 20.0), Sun(direction(1.0, 0.7)), Photometry())
 renderer = Renderer(sys.argv[1])
 frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
 camera_pose = Pose(pose.rotation.as_matrix(), pose.translation)
-depth = renderer._draw_views(scene, PixelRays.from_camera(camera), camera_pose, 1000.0).depth
+depth = renderer._draw_views(scene, PixelRays.from_camera(camera), camera_pose, 1000.0, np.empty(0, np.int64)).depth
 np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=depth)
 """
 
@@ -88,15 +91,19 @@ def _make_depth_view(height_m: float) -> tuple[np.ndarray, float, float, float]:
     return pose, 40.0, 1.0, 100.0
 
 
+def _make_level_ground() -> trimesh.Trimesh:
+    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
 def test_load_replaces_the_previous_geometry() -> None:
     """Depths of level ground and of a triangle above its centre are exact, for any load order.
 
     The rendered number of a triangle is its object number plus 1; the number of ground is 0.
     """
-    corners = np.array([[-30.0, -30.0, 0.0], [30.0, -30.0, 0.0], [30.0, 30.0, 0.0], [-30.0, 30.0, 0.0]])
-    ground = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    ground = _make_level_ground()
     triangle = np.array([[[-9.0, -9.0, 4.0], [9.0, -9.0, 4.0], [0.0, 9.0, 4.0]]])
-    renderer = DepthRenderer(64, default_backend())
+    renderer = create_depth_renderer(64, default_backend())
     with pytest.raises(RenderingError, match="no mesh"):
         renderer.draw(*_make_depth_view(20.0))
     no_triangles = (np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
@@ -115,11 +122,95 @@ def test_load_replaces_the_previous_geometry() -> None:
     renderer.close()
 
 
+@pytest.fixture
+def small_renderer() -> Iterator[DepthRenderer]:
+    renderer = create_depth_renderer(64, default_backend())
+    yield renderer
+    renderer.close()
+
+
+def test_views_contain_the_first_triangle_of_each_ray(small_renderer: DepthRenderer) -> None:
+    """Depth and number at each pixel's centre equal those of its ray, intersected with all triangles in float64.
+
+    Most triangles are behind the camera, so that the vertex numbers of the others need three bytes.
+    """
+    rng, eye = np.random.default_rng(4), np.array([0.0, 0.0, 20.0])
+    centres = rng.uniform([-8.0, -8.0, 1.0], [8.0, 8.0, 12.0], (40, 3))
+    triangles = centres[:, None] + rng.uniform(-4.0, 4.0, (40, 3, 3)) * [1.0, 1.0, 0.2]
+    # back faces are not drawn: the normals point upwards
+    is_down = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])[:, 2] < 0.0
+    triangles[is_down] = triangles[is_down, ::-1]
+    hidden = np.tile(eye + np.array([[0.0, 0.0, 5.0], [1.0, 0.0, 5.0], [0.0, 1.0, 5.0]]), (30_000, 1, 1))
+    numbers = rng.permutation(100_000)[:30_040]
+    small_renderer.load(_make_level_ground(), np.concatenate([hidden, triangles]), numbers)
+    depth, ids = small_renderer.draw(*_make_depth_view(eye[2]))
+    x = (np.arange(64) + 0.5 - 32.0) / 40.0
+    rays = np.stack([*np.broadcast_arrays(x, -x[:, None], -1.0)], axis=-1)
+    # a ray is the sum of the three vectors to the corners with these weights; it meets the plane at 1 / (their sum)
+    weights = np.einsum("tij,rcj->trci", np.linalg.inv((triangles - eye).swapaxes(1, 2)), rays)
+    distance = 1.0 / weights.sum(axis=-1)
+    inside = (weights * distance[..., None]).min(axis=-1)
+    hits = np.where(inside > 0.0, distance, eye[2])
+    nearest, second = np.partition(hits, 1, axis=0)[:2]
+    is_ground = nearest == eye[2]
+    # excluded are pixels with an edge or an intersection at their centre, as OpenGL rounds corners to 1/256 pixel
+    tested = (np.abs(inside).min(axis=0) > 0.01) & (is_ground | (second - nearest > 0.01))
+    expected_ids = np.where(is_ground, 0, numbers[30_000 + hits.argmin(axis=0)] + 1)
+    np.testing.assert_array_equal(ids[tested], expected_ids[tested])
+    # the resolution of a 24-bit depth between 1 and 100 m, and the rounding of corners on slopes
+    np.testing.assert_allclose(depth[tested], nearest[tested], atol=3e-3)
+    assert tested.mean() > 0.5
+    assert len(np.unique(ids[tested])) > 10
+
+
+def _record_transfers(monkeypatch: pytest.MonkeyPatch, kind: Any) -> list[Any]:
+    """Record the meshes (`Primitive`) or shaders (`ShaderProgram`) that pyrender transfers to OpenGL."""
+    transfers, transfer = [], kind._add_to_context
+
+    def record(item: Any) -> None:
+        transfers.append(item)
+        transfer(item)
+
+    monkeypatch.setattr(kind, "_add_to_context", record)
+    return transfers
+
+
+def test_shaders_are_compiled_once_and_meshes_are_kept_for_all_views(
+    small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every image would use more memory if pyrender or PyOpenGL did not recognise the context."""
+    from OpenGL import contextdata
+    from pyrender import Primitive
+    from pyrender.shader_program import ShaderProgram
+
+    meshes, shaders = (_record_transfers(monkeypatch, kind) for kind in (Primitive, ShaderProgram))
+    context_counts = set()
+    for loads in (1, 2, 3):
+        small_renderer.load(_make_level_ground(), np.empty((0, 3, 3)), np.empty(0, dtype=np.int64))
+        for height_m in (20.0, 10.0):
+            small_renderer.draw(*_make_depth_view(height_m))
+        assert len(meshes) == loads
+        context_counts.add(len(contextdata.storedPointers))
+    assert [mesh._in_context() for mesh in meshes] == [False, False, True]
+    assert len(shaders) == 1
+    assert len(context_counts) == 1
+
+
+def test_too_many_vertices_are_reported(small_renderer: DepthRenderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyrender stores vertex numbers in single precision, which would draw wrong triangles."""
+    monkeypatch.setattr("marsyard.sim.render.pinhole._MAX_VERTICES", 6)
+    ground, triangle = _make_level_ground(), np.eye(3)[None]
+    with pytest.raises(RenderingError, match="7 vertices are visible; maximum 6"):
+        small_renderer.load(ground, triangle, np.array([0]))
+    monkeypatch.undo()
+    small_renderer.load(ground, triangle, np.array([0]))
+
+
 def test_second_backend_in_one_process_is_rejected() -> None:
     program = (
-        "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
+        "from marsyard.sim.render.backend import RenderingError, create_depth_renderer\n"
         "import OpenGL\n"
-        "try:\n    DepthRenderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
+        "try:\n    create_depth_renderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
     )
     environment = os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
     run = subprocess.run(
@@ -131,8 +222,8 @@ def test_second_backend_in_one_process_is_rejected() -> None:
 @pytest.mark.slow
 def test_python_without_assertions_is_rejected() -> None:
     program = (
-        "from marsyard.sim.render.backend import DepthRenderer, RenderingError\n"
-        "try:\n    DepthRenderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
+        "from marsyard.sim.render.backend import RenderingError, create_depth_renderer\n"
+        "try:\n    create_depth_renderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
     )
     run = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
     assert "without -O" in run.stdout
