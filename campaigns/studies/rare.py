@@ -1,4 +1,19 @@
-"""Study `rare`: probability that a case violates a requirement, with an interval and a verdict on its limit."""
+"""Study `rare`: probability that a case violates a requirement, with an interval and a verdict on its limit.
+
+The margin g of a case is its signed distance from the bound of the requirement; a violation is g < 0. Random cases of
+the nominal distribution give the exact bounds of Clopper and Pearson (`studies.counting`): PASS rests on them alone.
+
+Subset simulation (`studies.subset`; Au & Beck 2001) computes the probability as a product of conditional probabilities,
+P(g < 0) = P(g <= b1) P(g <= b2 | g <= b1) ... P(g < 0 | g <= bm). Each threshold b is the quantile `LEVEL_FRACTION` of
+the margins of a level; Markov chains draw the next level from the cases below it. A simulation is a coroutine: it
+yields `Proposals`, receives their margins as `Evaluated`, and returns its estimate. This study runs several independent
+simulations (replicates) at once; their spread gives Cox's interval (`studies.interval`). Importance sampling
+(`studies.importance`; Melchers 1989) can refine the estimate with cases drawn around the violations that were found.
+
+A case is a point: a standard normal number per dispersion, and a blend, a weighted sum of numbered random streams that
+give the noise of the instruments. `NEW_STREAM` is the stream that the case creates; its number is that of the case.
+`studies.rare_decision` derives the verdict from all cases.
+"""
 
 from __future__ import annotations
 
@@ -171,7 +186,12 @@ def continue_rare(
 
 
 class _RareStudy:
-    """State of a running study: number of violations, independent cases, and random cases that are not yet run."""
+    """A running study.
+
+    - violations: number of violations among all cases
+    - is_violation, terrains: violation and terrain of each independent case of the nominal distribution
+    - reserved_cases: number of random cases, out of the limit of cases, that are not yet run
+    """
 
     def __init__(self, campaign: Campaign, parameters: RareParameters, runner: PointRunner) -> None:
         self._campaign, self._parameters, self._runner = campaign, parameters, runner
@@ -202,15 +222,7 @@ class _RareStudy:
                         shortfall = "The replicates found too few violations to fit a density for importance sampling."
             except CaseLimitError as error:
                 shortfall = f"The limit of cases was reached: {error}."
-        sample = RareSample(
-            results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
-        )
-        evaluations = len(parameters.replicates)
-        decision = decide_rare(sample, parameters.max_probability, parameters.confidence, evaluations)
-        evidence = self._runner.evidence
-        if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
-            reason = f"The verdict would be PASS. {evidence.text}"
-            decision = replace(decision, verdict=RareVerdict.INSUFFICIENT, basis=Basis.NONE, reason=reason)
+        decision = self._decide(results, violation_weights, shortfall)
         replicates_run = tuple(
             Replicate(item.probability, item.reached, item.end.value, item.thresholds) for item in results
         )
@@ -228,10 +240,6 @@ class _RareStudy:
         min_probability = MIN_PROBABILITY_FRACTION * self._parameters.max_probability
         levels = math.ceil(math.log(min_probability) / math.log(LEVEL_FRACTION))
         return math.ceil(replicates * self._parameters.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
-
-    def _generator(self, name: str) -> np.random.Generator:
-        """Create a random generator of the study, which does not depend on the cases."""
-        return Streams(self._campaign.definition.seed, self._campaign.definition.name, 0).generator(name)
 
     def _run_random(self, block: int, count: int) -> None:
         """Run independent cases of the nominal distribution."""
@@ -265,32 +273,6 @@ class _RareStudy:
             pending = next_pending
         return [results[number] for number in numbers]
 
-    def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
-        """Evaluate several groups of proposed cases together."""
-        coordinates = np.concatenate([group.coordinates for group in proposals])
-        blends = [blend for group in proposals for blend in group.blends]
-        first = self._runner.n_cases
-        candidates = [
-            Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
-            for point, blend in zip(coordinates, blends, strict=True)
-        ]
-        rows = self._runner.run(candidates, self._reserved_cases)
-        margins = np.array([compute_margin(row, self._requirement) for row in rows])
-        self._violations += int(np.sum(margins < 0.0))
-        is_independent = [group.is_independent for group in proposals for _ in group.blends]
-        for row, margin, is_counted in zip(rows, margins, is_independent, strict=True):
-            if is_counted:
-                terrain = row.get("terrain")
-                self._is_violation.append(bool(margin < 0.0))
-                self._terrains.append(None if terrain is None else str(terrain))
-        numbered = [
-            tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
-            for case, blend in enumerate(blends, start=first)
-        ]
-        ends = np.cumsum([len(group.blends) for group in proposals])
-        for start, end in zip([0, *ends[:-1]], ends, strict=True):
-            yield Evaluated(numbered[start:end], margins[start:end])
-
     def _run_importance(self, results: Sequence[SubsetResult]) -> list[float]:
         """Sample cases around the violations of the replicates, from a fitted density.
 
@@ -310,3 +292,47 @@ class _RareStudy:
             (evaluated,) = self._evaluate([proposal])
             violation_weights += (weights[batch] * (evaluated.margins < 0.0)).tolist()
         return violation_weights
+
+    def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
+        """Evaluate several groups of proposed cases together; yield the margins of each group."""
+        coordinates = np.concatenate([group.coordinates for group in proposals])
+        blends = [blend for group in proposals for blend in group.blends]
+        first = self._runner.n_cases
+        candidates = [
+            Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
+            for point, blend in zip(coordinates, blends, strict=True)
+        ]
+        rows = self._runner.run(candidates, self._reserved_cases)
+        margins = np.array([compute_margin(row, self._requirement) for row in rows])
+        self._violations += int(np.sum(margins < 0.0))
+        numbered = [
+            tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
+            for case, blend in enumerate(blends, start=first)
+        ]
+        ends = np.cumsum([len(group.blends) for group in proposals])
+        for group, start, end in zip(proposals, [0, *ends[:-1]], ends, strict=True):
+            if group.is_independent:
+                self._is_violation += (margins[start:end] < 0.0).tolist()
+                self._terrains += [
+                    None if (name := row.get("terrain")) is None else str(name) for row in rows[start:end]
+                ]
+            yield Evaluated(numbered[start:end], margins[start:end])
+
+    def _generator(self, name: str) -> np.random.Generator:
+        """Create a random generator of the study, which does not depend on the cases."""
+        return Streams(self._campaign.definition.seed, self._campaign.definition.name, 0).generator(name)
+
+    def _decide(
+        self, results: Sequence[SubsetResult], violation_weights: Sequence[float] | None, shortfall: str
+    ) -> Decision:
+        """Decide the verdict; a PASS becomes INSUFFICIENT on a seed from which the algorithm's options were set."""
+        parameters, evidence = self._parameters, self._runner.evidence
+        sample = RareSample(
+            results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
+        )
+        evaluations = len(parameters.replicates)
+        decision = decide_rare(sample, parameters.max_probability, parameters.confidence, evaluations)
+        if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
+            reason = f"The verdict would be PASS. {evidence.text}"
+            decision = replace(decision, verdict=RareVerdict.INSUFFICIENT, basis=Basis.NONE, reason=reason)
+        return decision
