@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.images import SUN, descent_pose, descent_scene, measure_all_cores, prepare_descent_exposure
 from benchmarks.timing import Measurement, core_seconds
-from marsyard.scenarios.descent.exposure import camera_optics
+from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render.rays import VIEW_SIDE_PX
 from marsyard.sim.render.renderer import ground_mesh

@@ -148,7 +148,7 @@ def open_result(directory: str | Path) -> Result:
 def _name_algorithms(algorithms: Sequence[Any], folder: Path) -> list[str]:
     """Return the specifications of algorithms; objects are stored in `folder`. Raises CampaignError."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.scenarios.objects import name_object
+    from marsyard.scenarios.stored_objects import name_object
 
     try:
         return [name_object(algorithm, folder) for algorithm in algorithms]
@@ -183,7 +183,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     """
     from rich.console import Console
 
-    from marsyard.campaigns.execution.workers import ExecutorConfig
+    from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import evaluate_and_store
     from marsyard.cli.progress import RunLog, campaign_progress

@@ -13,9 +13,9 @@ from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchS
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
-from marsyard.scenarios.estimators import Task, definitions
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.offline import SITE_FORMAT
+from marsyard.scenarios.offline_algorithms import SITE_FORMAT
+from marsyard.scenarios.tasks import Task, definitions
 
 LANDING: Task[SiteEstimator, HdaOptions] = Task(
     name="landing",

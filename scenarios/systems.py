@@ -48,7 +48,7 @@ class System:
     - title: title in reports
     - summary: one sentence on the tests
     - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
-    - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
+    - tasks: each a `marsyard.scenarios.tasks.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
     - folder: its files: campaigns in the folder `catalogue`, and the requirements that campaigns reference by id in
       `requirements.toml` (docs/reports.md)

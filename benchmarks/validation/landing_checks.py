@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
-from marsyard.scenarios.exposure import camera_optics
+from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.images import GroundTruth, LandingWorld, measure, take_images

@@ -22,8 +22,8 @@ from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.studies.contributions import MIN_COMMON, Budget, compute_budget

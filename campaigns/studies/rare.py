@@ -28,8 +28,8 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.runner import (

@@ -1,6 +1,6 @@
 """Run and continue studies (`rare`, `search`, `budget`), which choose the points of their cases.
 
-A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.points`).
+A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.study_points`).
 
 A study is a deterministic function of its parameters and of the rows of its cases. To continue an interrupted study, it
 is run again from its start. Cases with a stored row are not run again: their rows are read.
@@ -20,15 +20,16 @@ from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.executors import create_executor
+from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
 from marsyard.campaigns.execution.worker_process import Executor
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver, check_metrics, prepare_inputs
-from marsyard.campaigns.running.preparation import compile_kernels
+from marsyard.campaigns.running.compilation import compile_kernels
+from marsyard.campaigns.running.engine import check_metrics
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.replay import load_stored_campaign
+from marsyard.campaigns.running.shared_inputs import prepare_inputs
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion
-from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.lock import folder_lock
@@ -73,7 +74,7 @@ class CaseLimitError(Exception):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.points.StudyPoint`).
+    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.study_points.StudyPoint`).
 
     - coordinates: standard normal numbers of the random dispersions
     - stream: number of the case's random streams; None for new streams

@@ -28,9 +28,9 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError, report_write_errors
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver
-from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.progress import ProgressObserver
+from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,

@@ -14,8 +14,8 @@ from marsyard.cli.execution import default_directory, make_executor, run_and_eva
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.campaigns.execution.workers import ExecutorConfig
-    from marsyard.campaigns.running.engine import ProgressObserver
+    from marsyard.campaigns.execution.executors import ExecutorConfig
+    from marsyard.campaigns.running.progress import ProgressObserver
 
 
 @dataclass(frozen=True)

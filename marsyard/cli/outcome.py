@@ -24,9 +24,11 @@ from rich.table import Table
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
-from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
-from marsyard.campaigns.running.engine import ProgressObserver, append_cases, run_campaign
-from marsyard.campaigns.running.preparation import estimate_campaign
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.running.engine import append_cases, run_campaign
+from marsyard.campaigns.running.estimate import estimate_campaign
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record

@@ -15,7 +15,7 @@ from marsyard.cli.execution import default_directory, make_executor, show_progre
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.campaigns.execution.workers import ExecutorConfig
+    from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.studies.budget import BudgetResult
     from marsyard.campaigns.studies.rare import RareResult
     from marsyard.campaigns.studies.search import SearchResult

@@ -293,7 +293,7 @@ def _print_progress(text: str) -> None:
 
 def _note_compilation() -> None:
     """Print that the kernels are compiled first, unless this machine has rendered an image or a scenario before."""
-    from marsyard.campaigns.running.preparation import COMPILATION_NOTE
+    from marsyard.campaigns.running.compilation import COMPILATION_NOTE
     from marsyard.scenarios.systems import scenario_paths
     from marsyard.sim.kernel_cache import kernels_are_ready
 

@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.dimes.binning import check_binning
-from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.conditions import SizedFaults
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
-from marsyard.scenarios.exposure import SHIELD_FALL_M_S
+from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.place import (
+from marsyard.scenarios.site_parameters import (
     DustOpacity,
     Location,
     RenderParameters,

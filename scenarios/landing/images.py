@@ -11,13 +11,14 @@ from scipy.ndimage import distance_transform_edt
 
 from marsyard.algorithms.hda import MappedGround, Safety
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
-from marsyard.scenarios.exposure import Optics, camera_optics, draw_calibrated, render_state, sunlight_ratio
+from marsyard.scenarios.cameras import Optics, camera_optics, draw_calibrated
+from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults, raise_sun_deg
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
+from marsyard.scenarios.radiance import render_state, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage, LandingMeasurements

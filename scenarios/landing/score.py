@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.conditions import contrast_columns, sun_columns
+from marsyard.scenarios.condition_columns import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land

@@ -18,7 +18,7 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 from marsyard.scenarios.conformance.checks import BreachError
 from marsyard.scenarios.conformance.estimators import Protocol, StreamSuite, Unusual, unusual_images
 from marsyard.scenarios.localisation import conformance_inputs as inputs
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.streamed import StreamAnswers
 
 #: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s.

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marsyard.scenarios.exposure import sunlight_ratio
+from marsyard.scenarios.radiance import sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, mesh_size, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Scene, Sun

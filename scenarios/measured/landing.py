@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing_site import LANDING, motion_errors, stage_row
 from marsyard.scenarios.measured import store

@@ -14,8 +14,9 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.dimes.binning import check_binning
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images

@@ -8,7 +8,7 @@ from marsyard.algorithms.exchange import ExecutableTargetTracker
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import IMPROVEMENTS
-from marsyard.scenarios.estimators import Task, definitions
+from marsyard.scenarios.tasks import Task, definitions
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(
     name="tracking",

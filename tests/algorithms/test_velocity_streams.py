@@ -26,8 +26,8 @@ from marsyard.algorithms.exchange import (
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.input_copies import hash_inputs
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.velocity import check_velocity_answer
 from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, DescentMeasurements, ImuIncrements

@@ -5,11 +5,12 @@ from typing import ClassVar
 
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import AlgorithmSelection, run_algorithm
+from marsyard.scenarios.algorithm_run import run_algorithm
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
+from marsyard.scenarios.case_evaluation import case_result
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import Task
-from marsyard.scenarios.evaluation import case_result
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.tasks import Task
 from marsyard.scenarios.velocity import VELOCITY, velocity_row
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs

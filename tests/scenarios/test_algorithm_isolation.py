@@ -18,8 +18,8 @@ from marsyard.algorithms.interface import (
 )
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.verdicts import Status
-from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.conformance.inputs import descent
+from marsyard.scenarios.input_copies import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import scenario
 from marsyard.scenarios.velocity import run_estimator

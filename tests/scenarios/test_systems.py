@@ -18,7 +18,6 @@ from marsyard.cli.app import app
 from marsyard.doctor import CheckResult, check_systems
 from marsyard.scenarios import columns as column_declarations
 from marsyard.scenarios.columns import ENGINE, label, row_columns
-from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
     SCENARIOS_FOLDER,
     UnknownScenarioError,
@@ -34,6 +33,7 @@ from marsyard.scenarios.systems import (
     systems,
     templates,
 )
+from marsyard.scenarios.tasks import shipped_names
 
 CACHED_FUNCTIONS = (
     registry,

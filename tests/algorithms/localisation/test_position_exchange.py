@@ -21,8 +21,9 @@ from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, POSITION_STREAM, read_map, write_map
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.algorithm_run import hash_inputs, run_algorithm
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.algorithm_run import run_algorithm
+from marsyard.scenarios.input_copies import hash_inputs
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.sim.camera import Cahv, Cahvore

@@ -16,7 +16,7 @@ from scipy import stats
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies import budget, runner

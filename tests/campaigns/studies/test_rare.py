@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, DefinitionError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.rare import RareParameters, RareResult, continue_rare, start_rare

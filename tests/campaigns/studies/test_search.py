@@ -10,9 +10,9 @@ import pytest
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
-from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.rare import continue_rare
 from marsyard.campaigns.studies.runner import Candidate, prepare_campaign

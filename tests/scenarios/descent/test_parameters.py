@@ -8,8 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.dimes.binning import binned_size_for
-from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics
+from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 

@@ -13,7 +13,7 @@ from marsyard.campaigns.running.replay import create_subject
 from marsyard.scenarios.conformance import CandidateAlgorithm, check_names, determine_task, subject_kinds
 from marsyard.scenarios.conformance.inputs import make_blank
 from marsyard.scenarios.localisation import conformance_inputs as inputs
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from tests.scenarios import suites
 

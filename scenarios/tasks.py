@@ -4,10 +4,10 @@ An algorithm is specified by
 
 - the name of an algorithm of Marsyard (`dimes`), or of an entry point in the group `marsyard.algorithms`;
 - ``module:Class`` or ``module:function``, called without arguments; the module may be in the current folder;
-- ``FILE.pkl:Name``: a stored Python object (`marsyard.scenarios.objects`);
+- ``FILE.pkl:Name``: a stored Python object (`marsyard.scenarios.stored_objects`);
 - ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/custom-algorithms.md);
   ``exec-stream:`` or ``serve-stream:``: a program that receives images one by one;
-- ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline`).
+- ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline_algorithms`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from marsyard.algorithms import exchange
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.isolation.host import construct, reset
 from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, describe
-from marsyard.scenarios.offline import AnswerFormat, answers_file, create_offline, is_offline, read_answers
+from marsyard.scenarios.offline_algorithms import AnswerFormat, answers_file, create_offline, is_offline, read_answers
 from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
 from marsyard.scenarios.systems import systems
 

@@ -25,8 +25,8 @@ from marsyard.algorithms.exchange.files import (
 from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
-from marsyard.scenarios.offline import AnswerFormat
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
+from marsyard.scenarios.offline_algorithms import AnswerFormat
 from marsyard.scenarios.streamed import StreamAnswers
 
 
