@@ -153,7 +153,7 @@ def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
     if not evidence.excludes_pass:
         return verdict
     if not verdict.status.is_met:
-        return replace(verdict, further_cases=None)
+        return replace(verdict, additional_cases=None)
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
     return replace(verdict.withhold(reason), withheld_status=verdict.status)
 

@@ -161,7 +161,7 @@ def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdi
             f"Confirmation {failure.number} of this claim resulted in FAIL, which is final: a changed algorithm is a "
             "new claim."
         )
-        return replace(verdict, status=Status.FAIL, reason=reason, further_cases=None)
+        return replace(verdict, status=Status.FAIL, reason=reason, additional_cases=None)
     block = joint.find_block(cases)
     if block and verdict.status.is_met:
         return verdict.withhold(block)

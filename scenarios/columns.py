@@ -136,16 +136,19 @@ def text(name: str, meaning: str, kind: Kind = Kind.CONDITION) -> Column:
 
 
 #: Columns of the engine in every row.
-ENGINE = (
+#: The first columns of a row, and the last ones.
+LEADING = (
     Column("case", Kind.PROVENANCE, "number of the case"),
     text("outcome", "outcome of the answer, or reason of the failure", Kind.OUTCOME),
     flag("answered", "an answer is given", "with an answer"),
+)
+TRAILING = (
     Column("wall_time_s", Kind.PROVENANCE, "wall-clock time of the case"),
     Column("cpu_time_s", Kind.PROVENANCE, "processor time of the case"),
     text("error", "message of a failure", Kind.OUTCOME),
     text("traceback", "traceback of a failure", Kind.OUTCOME),
-    text("standard_point", "point of a study at which the case was run", Kind.PROVENANCE),
 )
+ENGINE = (*LEADING, *TRAILING, text("standard_point", "point of a study at which the case was run", Kind.PROVENANCE))
 
 
 @dataclass(frozen=True)

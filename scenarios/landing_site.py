@@ -19,7 +19,7 @@ from marsyard.scenarios.tasks import Task, definitions
 
 LANDING: Task[SiteEstimator, HdaOptions] = Task(
     name="landing",
-    what="estimator of landing sites",
+    noun="estimator of landing sites",
     methods=("estimate",),
     answers=(SiteEstimate, SiteOutcome),
     shipped={

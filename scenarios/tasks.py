@@ -67,7 +67,7 @@ class Task(Generic[Algorithm, Options]):
     """A task of a system and its algorithms.
 
     - name: name on the command line and in the exchange with programs
-    - what: noun for an algorithm of the task in messages, such as "velocity estimator"
+    - noun: noun for an algorithm of the task in messages, such as "velocity estimator"
     - methods: required methods of an algorithm that receives all measurements at once; empty if all receive them one by
       one (streams)
     - answers: data classes and enumerations of its answers
@@ -81,7 +81,7 @@ class Task(Generic[Algorithm, Options]):
     """
 
     name: str
-    what: str
+    noun: str
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     options: type[Options]
@@ -98,9 +98,9 @@ class Task(Generic[Algorithm, Options]):
         command = exchange.parse_command(spec)
         if command is not None:
             if self.executable is None:
-                raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a name, module:Class")
+                raise ValueError(f"'{spec}': a {self.noun} cannot be a program; allowed: a name, module:Class")
             if command.stream and not self.accepts_streams:
-                raise ValueError(f"'{spec}': a {self.what} does not accept a stream of images; allowed: exec:, serve:")
+                raise ValueError(f"'{spec}': a {self.noun} does not accept a stream of images; allowed: exec:, serve:")
             return
         if is_offline(spec):
             answer_format, file = self._answer_format(spec), answers_file(spec)
@@ -112,9 +112,9 @@ class Task(Generic[Algorithm, Options]):
         methods = STREAM_METHODS if is_stream else self.methods
         missing = [method for method in methods if method not in factory.members]
         if not factory.is_callable:
-            raise ValueError(f"'{spec}' is not a valid {self.what}: {factory.kind}, not a class or function")
+            raise ValueError(f"'{spec}' is not a valid {self.noun}: {factory.kind}, not a class or function")
         if missing and factory.is_class:
-            raise ValueError(f"'{spec}' is not a valid {self.what}: missing members: {', '.join(missing)}")
+            raise ValueError(f"'{spec}' is not a valid {self.noun}: missing members: {', '.join(missing)}")
 
     def make(self, spec: str, options: Options, limits: exchange.ExecutableLimits, case: int = 0) -> Algorithm:
         """Create an algorithm by name. Raises ValueError, and the exceptions of a user's constructor.
@@ -159,7 +159,7 @@ class Task(Generic[Algorithm, Options]):
 
     def _answer_format(self, spec: str) -> AnswerFormat[Any]:
         if self.offline is None:
-            raise ValueError(f"'{spec}': a {self.what} cannot run offline: each answer determines the next image")
+            raise ValueError(f"'{spec}': a {self.noun} cannot run offline: each answer determines the next image")
         return self.offline
 
 

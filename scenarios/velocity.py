@@ -36,7 +36,7 @@ _FIRST_TRIPLE: ImageTriple = (0, 1, 2)
 
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     name="velocity",
-    what="velocity estimator",
+    noun="velocity estimator",
     methods=("estimate",),
     answers=(VelocityEstimate, VelocityOutcome),
     shipped={

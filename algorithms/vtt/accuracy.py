@@ -120,9 +120,9 @@ def table_1() -> tuple[AccuracyRow, AccuracyRow]:
 
 
 class HandOffOutcome(Enum):
-    """Outcome of a hand-off. All members except HANDED_OVER are expected failures: the arm receives no target."""
+    """Outcome of a hand-off. All members except HANDED_OFF are expected failures: the arm receives no target."""
 
-    HANDED_OVER = "the arm has received the target"
+    HANDED_OFF = "the arm has received the target"
     NOT_TRACKED = "the target is not tracked"
     NOT_AT_GOAL = "the rover is not at the commanded distance from the target"
 
@@ -137,7 +137,7 @@ class ArmTarget:
 
 @dataclass(frozen=True)
 class HandOff:
-    """Outcome of a hand-off, and the target; None if it was not handed over."""
+    """Outcome of a hand-off, and the target; None if it was not handed off."""
 
     outcome: HandOffOutcome
     target: ArmTarget | None
@@ -172,4 +172,4 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration, d
         stereo_range_error_m(range_m, disparity_px_m(mast.left, mast.right), 1.0),
         drift_error_m(range_m, mast.left.focal_lengths[0], drift_px),
     )
-    return HandOff(HandOffOutcome.HANDED_OVER, ArmTarget(position, error))
+    return HandOff(HandOffOutcome.HANDED_OFF, ArmTarget(position, error))

@@ -75,8 +75,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
     for table in _comparison_tables(evaluation.sampling.exclude_nominal_case(run.frame), run.requirements, verdicts):
         console.print(table)
     lines = [f"verdict: {evaluation.overall_verdict.word}", evaluation.overall_verdict.sentence]
-    if is_finished and evaluation.overall_verdict.cases_to_append:
-        lines.append(f"to decide: marsyard append {directory} {evaluation.overall_verdict.cases_to_append}")
+    if is_finished and evaluation.overall_verdict.additional_cases:
+        lines.append(f"to decide: marsyard append {directory} {evaluation.overall_verdict.additional_cases}")
     if multiplicity := multiplicity_text(verdicts):
         lines.append(multiplicity)
     if not any(verdict.withheld_status for verdict in verdicts):

@@ -15,7 +15,7 @@ from marsyard.scenarios.tasks import Task
 
 LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
-    what="position estimator",
+    noun="position estimator",
     methods=(),
     answers=(PositionEstimate, PositionOutcome),
     shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},

@@ -112,8 +112,8 @@ class RoverRun:
     target: DesignatedTarget
     stops: list[Stop] = field(default_factory=list)  #: stops with a tracking update, in order
     outcome: RunOutcome = RunOutcome.NOT_AT_GOAL
-    handed_over: bool = False  #: whether the target was handed over to the arm at the end
-    placement: Placement | None = None  #: placement of the instrument; None without a hand-over
+    handed_off: bool = False  #: whether the target was handed off to the arm at the end
+    placement: Placement | None = None  #: placement of the instrument; None without a hand-off
     visual_odometry_updates: int = 0
     visual_odometry_failures: int = 0  #: updates without an estimate; wheel odometry was used
     autonav_updates: int = 0
@@ -285,7 +285,7 @@ def track_target(p: RoverScenarioParameters, run: RoverRun) -> RoverRun:
     if run.outcome is RunOutcome.COMPLETED and last_leg.motion == "approach":
         goal = GoalCriterion(last_leg.goal_m, 2.0 * GOAL_TOLERANCE_M)
         result = hand_off(run.stops[-1].update, goal, run.setup.rig.calibrated)
-        run.handed_over = result.outcome is HandOffOutcome.HANDED_OVER
+        run.handed_off = result.outcome is HandOffOutcome.HANDED_OFF
     return run
 
 

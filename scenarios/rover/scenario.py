@@ -339,8 +339,8 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
 
 def place_target(run: RoverRun) -> RoverRun:
-    """Place the instrument on a target that was handed over to the arm; return the run."""
-    target = run.stops[-1].update.position_rover if run.handed_over else None
+    """Place the instrument on a target that was handed off to the arm; return the run."""
+    target = run.stops[-1].update.position_rover if run.handed_off else None
     if target is not None:
         measurements = run.stops[-1].measurements(run.setup.rig.calibrated)
         run.placement = placement.auto_place(measurements, np.asarray(target))

@@ -91,7 +91,7 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
         "track_margin_px": p.score.false_track_px - _finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), NAN),
-        "handed_over": run.handed_over,
+        "handed_off": run.handed_off,
     }
 
 

@@ -12,7 +12,7 @@ from marsyard.scenarios.tasks import Task, definitions
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(
     name="tracking",
-    what="target tracker",
+    noun="target tracker",
     methods=("designate", "aim", "update", "clear", "state"),
     answers=(MastAim, PixelBox, TargetUpdate, TargetLoss, TrackingState),
     shipped={

@@ -126,7 +126,7 @@ def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     target_m, goal = np.array([1.5, 0.0, 0.1]), GoalCriterion(distance_m=1.5, tolerance_m=0.05)
     tracked_target = TargetUpdate(NORMAL, (), target_m)
     at_goal = hand_off(tracked_target, goal, navcam())
-    assert at_goal.outcome is HandOffOutcome.HANDED_OVER
+    assert at_goal.outcome is HandOffOutcome.HANDED_OFF
     assert at_goal.target is not None
     np.testing.assert_array_equal(at_goal.target.position_rover, target_m)
     # Eq. 5 of the tracking paper at 1.735 m from the mast's elevation axis, which is 0.35 m ahead of the rover's origin

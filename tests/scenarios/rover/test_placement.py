@@ -46,7 +46,7 @@ def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, RoverRun]) -
     placeable, run = placed_run
     row = placement_row(run)
     assert placeable
-    assert run.handed_over
+    assert run.handed_off
     assert (row["placed"], row["placement_safe"]) == (True, True)
     assert run.placement is not None
     # along the normal the contact is on the measured surface, within 3 cm; across, within 8 mm
@@ -87,7 +87,7 @@ def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, RoverRu
     assert not row["placement_safe"]
 
 
-def test_run_without_a_hand_over_is_not_placed() -> None:
+def test_run_without_a_hand_off_is_not_placed() -> None:
     parameters = RoverScenarioParameters.model_validate({**SLAB, "legs": [{"motion": "stay", "steps": 1}]})
     run = place_target(track_target(parameters, prepare_run(parameters, Streams(1, "placement tests", 0))))
     assert run.placement is None
