@@ -36,7 +36,7 @@ from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
-from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_study, table
+from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
@@ -228,11 +228,7 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
 
 def study_sentences(record: Mapping[str, Any]) -> list[str]:
     """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
-    return [
-        *rare_sentences(read_study(record, "rare")),
-        *search_sentences(read_study(record, "search")),
-        *budget_sentences(read_study(record, "budget")),
-    ]
+    return [*rare_sentences(record), *search_sentences(record), *budget_sentences(record)]
 
 
 def describe_study(record: Mapping[str, Any]) -> StudySummary | None:

@@ -1,4 +1,4 @@
-"""Radiance of an image: the rendered view, haze in dusty air, and the brightness of sunlight."""
+"""Radiance of an image: the sun and the brightness of its light, the rendered view, and haze in dusty air."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.scenarios.cameras import Optics
 from marsyard.sim.dynamics import State
+from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.render.kernels.photometry import add_air_light
@@ -51,6 +52,11 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
     flat_arrays = (array.reshape(-1) for array in (frame.radiance, frame.range_m, transmission))
     add_air_light(*flat_arrays, frame.rays.directions, (east, north, up), scattering, hazy.reshape(-1))
     return hazy
+
+
+def sun_at(air: Environment, azimuth_deg: float, elevation_deg: float) -> Sun:
+    """Return the sun over a site; azimuth clockwise from north."""
+    return Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), air.sun_radius_rad)
 
 
 def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:

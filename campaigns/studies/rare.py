@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +32,7 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
+from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult, Replicate
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -40,7 +41,6 @@ from marsyard.campaigns.studies.runner import (
     check_margin,
     continue_study,
     find_requirement,
-    read_study,
     start_study,
 )
 from marsyard.campaigns.studies.subset import (
@@ -54,84 +54,10 @@ from marsyard.campaigns.studies.subset import (
 )
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the parameters of this study.
-KIND = "rare"
-#: Subset simulation alone, or with importance sampling around the violations that it found.
-METHODS = ("subset", "importance")
 #: Subset simulation stops at levels less likely than this fraction of the limit, which cannot change the verdict.
 MIN_PROBABILITY_FRACTION = 0.01
 #: Number of importance samples, and of random cases, that are evaluated together.
 _IMPORTANCE_BATCH, _RANDOM_BATCH = 100, 1000
-
-
-@dataclass(frozen=True)
-class RareParameters:
-    """Parameters of the study.
-
-    - requirement: id of the requirement; max_probability: limit of the probability that a case violates it
-    - method: see `METHODS`
-    - samples: cases per level of one subset simulation
-    - replicates, random_cases: numbers of replicates, and of random cases, of the first run and of each continuation.
-      Random cases are drawn independently for the counting bound, as is the first level of each replicate
-    - importance_cases: cases of importance sampling
-    - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
-    """
-
-    requirement: str
-    max_probability: float
-    method: str = "subset"
-    samples: int = 200
-    replicates: tuple[int, ...] = (6,)
-    random_cases: tuple[int, ...] = (600,)
-    importance_cases: int = 600
-    confidence: float = 0.9
-
-    def __post_init__(self) -> None:
-        problems = {
-            f"--max-probability {self.max_probability}: allowed: above 0 and below 1": 0.0 < self.max_probability < 1.0,
-            f"--method {self.method}: allowed: {', '.join(METHODS)}": self.method in METHODS,
-            f"--samples {self.samples}: at least 50": self.samples >= 50,
-            f"--replicates {self.replicates[0]}: at least 2": self.replicates[0] >= 2,
-            f"--random-cases {self.random_cases[0]}: at least 0": self.random_cases[0] >= 0,
-            f"--importance-cases {self.importance_cases}: at least 50": self.importance_cases >= 50,
-            f"--confidence {self.confidence}: allowed: 0.5 to 0.999": 0.5 <= self.confidence <= 0.999,
-        }
-        for message, is_met in problems.items():
-            if not is_met:
-                raise CampaignError(message)
-
-
-@dataclass(frozen=True)
-class Replicate:
-    """One subset simulation: estimated probability, whether it is an estimate, reason of its end, level thresholds."""
-
-    probability: float
-    reached: bool
-    end: str
-    thresholds: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class RareResult:
-    """Result of the study.
-
-    - verdict, decision: verdict, and its evidence
-    - cases, violations: numbers of evaluated cases, and of those that violate the requirement
-    - replicates: subset simulations
-    - margin_text: definition of the margin
-    """
-
-    verdict: RareVerdict
-    decision: Decision
-    cases: int
-    violations: int
-    replicates: tuple[Replicate, ...]
-    margin_text: str
-
-    @property
-    def exit_code(self) -> int:
-        """Exit status of the verdict."""
-        return {RareVerdict.PASS: 0, RareVerdict.FAIL: 1, RareVerdict.INSUFFICIENT: 3}[self.verdict]
 
 
 def start_rare(
@@ -152,7 +78,7 @@ def start_rare(
         executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
     )
     total_cases = max_cases + sum(parameters.random_cases)
-    return start_study(campaign, total_cases, directory, session, {"kind": KIND, **asdict(parameters)})
+    return start_study(campaign, total_cases, directory, session, RARE.encode(parameters))
 
 
 def continue_rare(
@@ -163,12 +89,7 @@ def continue_rare(
     replicates, random_cases: numbers to add; the result is evaluated again if one of them is not 0
     Raises CampaignError if the folder contains no such study, or the program has changed.
     """
-    study = read_study(directory) or {}
-    if study.get("kind") != KIND:
-        raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
-    values = {name: study[name] for name in RareParameters.__dataclass_fields__}
-    blocks = {name: tuple(values[name]) for name in ("replicates", "random_cases")}
-    parameters = RareParameters(**{**values, **blocks})
+    parameters = RARE.read_parameters(directory)
     if replicates and parameters.method == "importance":
         raise CampaignError(
             f"{directory}: no replicates can be added to a study with importance sampling; start a new study with more"
@@ -182,7 +103,7 @@ def continue_rare(
     session = StudySession(
         executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
     )
-    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)}, random_cases)
+    return continue_study(directory, session, RARE.encode(parameters), random_cases)
 
 
 class _RareStudy:

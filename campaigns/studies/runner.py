@@ -8,7 +8,6 @@ is run again from its start. Cases with a stored row are not run again: their ro
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -37,13 +36,12 @@ from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
+from marsyard.campaigns.studies.study_record import STUDY_KEY, convert_to_json
 from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.sim.streams import Blend
 
 #: A study is stopped with an error if none of this number of first cases has finished.
 _MAX_FIRST_CRASHES = 20
-#: Key of a study's parameters and results in the record of its folder.
-STUDY_KEY = "study"
 
 
 class StudyResult(Protocol):
@@ -279,15 +277,6 @@ def _run_study(
     return result
 
 
-def convert_to_json(value: Any) -> Any:
-    """Convert nested tables and lists to JSON types; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {name: convert_to_json(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [convert_to_json(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def check_identity(campaign: Campaign, directory: Path) -> None:
     """Raise CampaignError if program, definition or input files differ from those of the stored study."""
     changes = Identity.read(record.read(directory)["identity"]).differences(create_identity(campaign.definition))
@@ -295,9 +284,3 @@ def check_identity(campaign: Campaign, directory: Path) -> None:
         text = "\n  ".join(changes)
         reason = "was run with another program, definition or input files; its rows would not be comparable"
         raise CampaignError(f"{directory} {reason}. Changed:\n  {text}\nStart a new study in another folder")
-
-
-def read_study(directory: Path) -> dict[str, Any] | None:
-    """Read the parameters and results of a study from the record of its folder; None for an ordinary campaign."""
-    study = record.read(directory).get(STUDY_KEY)
-    return study if isinstance(study, dict) else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
-from marsyard.scenarios.radiance import sunlight_ratio
+from marsyard.scenarios.radiance import sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Photometry, Scene, Sun
@@ -44,12 +44,11 @@ class DescentWorld:
         terrain = add_terrain_fault(p.faults, p.terrain)
         bank = TerrainBank(terrain, p.location.bank_seed)
         surface = bank.terrain(p.location.terrain)
-        elevation = float(np.radians(p.sun.elevation_deg))
-        towards_sun = direction(np.radians(p.sun.azimuth_deg), elevation)
+        azimuth, elevation = np.radians([p.sun.azimuth_deg, p.sun.elevation_deg]).tolist()
         if p.preset is None:
-            return cls(surface, None, Sun(towards_sun), p.meshes)
+            return cls(surface, None, Sun(direction(azimuth, elevation)), p.meshes)
         air = p.preset.environment
-        sun = Sun(towards_sun, air.sun_radius_rad)
+        sun = sun_at(air, p.sun.azimuth_deg, p.sun.elevation_deg)
         ground = SiteGround(p.preset, terrain, surface, bank.rocks(p.location.terrain, surface))
         return cls(surface, ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
 

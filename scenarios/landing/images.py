@@ -18,9 +18,8 @@ from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults, raise_sun_deg
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
-from marsyard.scenarios.radiance import render_state, sunlight_ratio
+from marsyard.scenarios.radiance import render_state, sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
-from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage, LandingMeasurements
 from marsyard.sim.render import Frame, Sun
 from marsyard.sim.sensor import Detector, auto_expose
@@ -53,9 +52,9 @@ class LandingWorld:
         scaled_texture = SiteTexture(coarsest_m=texture.coarsest_m, amplitudes=amplitudes)
         ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": scaled_texture}))
         air = p.preset.environment
-        elevation = float(np.radians(raise_sun_deg(p.faults, p.sun.elevation_deg)))
-        sun = Sun(direction(np.radians(p.sun.azimuth_deg), elevation), air.sun_radius_rad)
-        return cls(ground, sun, p.meshes, sunlight_ratio(air, elevation, p.detector))
+        elevation_deg = raise_sun_deg(p.faults, p.sun.elevation_deg)
+        sun = sun_at(air, p.sun.azimuth_deg, elevation_deg)
+        return cls(ground, sun, p.meshes, sunlight_ratio(air, float(np.radians(elevation_deg)), p.detector))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 from marsyard.scenarios.condition_columns import attitude_rate_deg_s, contrast_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.localisation.map_product import MapTruth
-from marsyard.scenarios.localisation.world import sun_at
+from marsyard.scenarios.radiance import sun_at
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 

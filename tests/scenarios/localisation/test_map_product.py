@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.localisation.fields import SmoothField
 from marsyard.scenarios.localisation.map_product import MapParameters, blur, make_map, orbital_rays
 from marsyard.scenarios.localisation.sites import localisation_site
-from marsyard.scenarios.localisation.world import LocalisationWorld, sun_at
-from marsyard.scenarios.radiance import add_haze
+from marsyard.scenarios.localisation.world import LocalisationWorld
+from marsyard.scenarios.radiance import add_haze, sun_at
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
