@@ -29,7 +29,7 @@ from marsyard.scenarios.site_parameters import (
 )
 from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
 from marsyard.scenarios.velocity import VELOCITY, check_image_size
-from marsyard.sim.dynamics.swing import SwingParameters
+from marsyard.sim.dynamics.pendulum import SwingParameters
 from marsyard.sim.error_sources import CALIBRATION, CLOUDS, DETECTOR, SHADOW
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
