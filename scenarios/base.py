@@ -21,12 +21,9 @@ LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
 class BankLocation(Protocol):
     """Terrain of a bank: number of terrains in the bank, its seed, and number of the terrain in it, from 0."""
 
-    @property
-    def bank(self) -> int: ...  # noqa: D102
-    @property
-    def bank_seed(self) -> int: ...  # noqa: D102
-    @property
-    def terrain(self) -> int: ...  # noqa: D102
+    bank: int
+    bank_seed: int
+    terrain: int
 
 
 class BaseScenario(Generic[ParametersType]):

@@ -1,4 +1,4 @@
-"""Create algorithms by name: algorithms of Marsyard, of installed packages, and of the user.
+"""Tasks of the systems: creation of their algorithms by name, and the parameters that select those of a case.
 
 An algorithm is specified by
 
@@ -21,7 +21,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
+
+from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms import exchange
 from marsyard.scenarios.imports import import_object, source_files
@@ -30,6 +32,7 @@ from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, de
 from marsyard.scenarios.offline_algorithms import AnswerFormat, answers_file, create_offline, is_offline, read_answers
 from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
 from marsyard.scenarios.systems import systems
+from marsyard.sim.parameters import Parameters
 
 #: Entry point group of other packages' algorithms.
 GROUP = "marsyard.algorithms"
@@ -250,3 +253,57 @@ def labels(specs: Sequence[str]) -> tuple[str, ...]:
         candidates = itertools.chain([label], (f"{label}_{number}" for number in itertools.count(2)))
         unique_labels.append(next(name for name in candidates if name not in unique_labels))
     return tuple(unique_labels)
+
+
+class AlgorithmSelection(Parameters):
+    """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
+
+    task: ClassVar[Task[Any, Any]]
+
+    algorithm: str
+    compared: Annotated[
+        tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
+    ] = ()
+    executable: Annotated[exchange.ExecutableLimits, Field(description="limits and isolation of custom algorithms")] = (
+        exchange.ExecutableLimits()
+    )
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """All algorithms; the first is the one under test."""
+        return (self.algorithm, *self.compared)
+
+    @property
+    def options(self) -> Any:
+        """Options of the published algorithm, for all algorithms of Marsyard."""
+        return next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
+
+    def make(self, algorithm: str, case: int) -> Any:
+        """Create an algorithm for a case. Raises ValueError, and the exceptions of a user's constructor."""
+        return self.task.make(algorithm, self.options, self.executable, case)
+
+    @field_validator("algorithm")
+    @classmethod
+    def _check_algorithm(cls, name: str) -> str:
+        cls.task.check(name)
+        return name
+
+    @field_validator("compared")
+    @classmethod
+    def _check_compared(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        check_algorithms(cls.task, names)
+        return names
+
+    @model_validator(mode="after")
+    def _check_distinct(self) -> AlgorithmSelection:
+        if self.algorithm in self.compared:
+            raise ValueError(f"the algorithm '{self.algorithm}' is listed twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_options(self) -> AlgorithmSelection:
+        """Create the algorithms of Marsyard once, which checks their options."""
+        for name in self.algorithms:
+            if name in self.task.shipped:
+                self.task.shipped[name](self.options)
+        return self

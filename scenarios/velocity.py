@@ -21,11 +21,10 @@ from marsyard.algorithms.dimes.options import IMPROVEMENTS
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline_algorithms import VELOCITY_FORMAT, CaseExporter, RecordedAnswer
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
-from marsyard.scenarios.tasks import Task, definitions
+from marsyard.scenarios.tasks import AlgorithmSelection, Task, definitions
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]

@@ -81,19 +81,15 @@ def start_budget(
     # Saltelli's design has d + 2 cases per base sample for d variables: the dispersions and the random streams
     n_cases = parameters.cases * len(list_variants(sources)) if sources else 0
     n_cases += parameters.sobol * (len(campaign.drawn_paths) + 3) if parameters.sobol else 0
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, parameters, runner).run(observer)
-    )
-    return start_study(campaign, n_cases, directory, session, BUDGET.encode(parameters))
+    session = StudySession(BUDGET, parameters, _BudgetStudy, executor, observer)
+    return start_study(campaign, n_cases, directory, session)
 
 
 def continue_budget(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> BudgetResult:
     """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
     parameters = BUDGET.read_parameters(directory)
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, parameters, runner).run(observer)
-    )
-    return continue_study(directory, session, BUDGET.encode(parameters))
+    session = StudySession(BUDGET, parameters, _BudgetStudy, executor, observer)
+    return continue_study(directory, session)
 
 
 def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:

@@ -74,11 +74,9 @@ def start_rare(
     stored, and `continue_rare` continues.
     """
     check_margin(find_requirement(campaign, parameters.requirement))
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
-    )
+    session = StudySession(RARE, parameters, _RareStudy, executor, observer)
     total_cases = max_cases + sum(parameters.random_cases)
-    return start_study(campaign, total_cases, directory, session, RARE.encode(parameters))
+    return start_study(campaign, total_cases, directory, session)
 
 
 def continue_rare(
@@ -100,10 +98,8 @@ def continue_rare(
             replicates=(*parameters.replicates, replicates),
             random_cases=(*parameters.random_cases, random_cases),
         )
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
-    )
-    return continue_study(directory, session, RARE.encode(parameters), random_cases)
+    session = StudySession(RARE, parameters, _RareStudy, executor, observer)
+    return continue_study(directory, session, random_cases)
 
 
 class _RareStudy:

@@ -81,19 +81,15 @@ def start_search(
     stored, and `continue_search` continues.
     """
     find_requirement(campaign, parameters.requirement)
-    session = StudySession(
-        executor, observer, lambda campaign, runner: SearchStudy(campaign, parameters, runner).run(observer)
-    )
-    return start_study(campaign, max_cases, directory, session, SEARCH.encode(parameters))
+    session = StudySession(SEARCH, parameters, SearchStudy, executor, observer)
+    return start_study(campaign, max_cases, directory, session)
 
 
 def continue_search(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> SearchResult:
     """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
     parameters = SEARCH.read_parameters(directory)
-    session = StudySession(
-        executor, observer, lambda campaign, runner: SearchStudy(campaign, parameters, runner).run(observer)
-    )
-    return continue_study(directory, session, SEARCH.encode(parameters))
+    session = StudySession(SEARCH, parameters, SearchStudy, executor, observer)
+    return continue_study(directory, session)
 
 
 class SearchStudy:

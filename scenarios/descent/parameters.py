@@ -10,7 +10,6 @@ from pydantic import Field, Tag, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
@@ -27,6 +26,7 @@ from marsyard.scenarios.site_parameters import (
     complete_terrain,
     preset_terrain,
 )
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
 from marsyard.scenarios.velocity import VELOCITY, check_image_size
 from marsyard.sim.dynamics.pendulum import SwingParameters

@@ -10,7 +10,6 @@ from jaxtyping import Float64, Int64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
@@ -26,6 +25,7 @@ from marsyard.scenarios.site_parameters import (
     complete_terrain,
     preset_terrain,
 )
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR, ErrorSource

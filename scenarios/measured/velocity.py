@@ -14,7 +14,6 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
@@ -22,6 +21,7 @@ from marsyard.scenarios.measured.consistency import agreement_products, agreemen
 from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.velocity import (
     VELOCITY,
     check_image_size,

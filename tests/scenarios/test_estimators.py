@@ -20,14 +20,13 @@ from marsyard.algorithms.vtt import VttOptions
 from marsyard.reports.comparison import select_algorithm
 from marsyard.scenarios import tasks
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
-from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.streamed import StreamedEstimator
-from marsyard.scenarios.tasks import Task, check_algorithms, labels
+from marsyard.scenarios.tasks import AlgorithmSelection, Task, check_algorithms, labels
 from marsyard.scenarios.velocity import VELOCITY, consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
