@@ -33,9 +33,9 @@ from marsyard.sim.camera import read_cameras as read_cameras
 if TYPE_CHECKING:
     import pandas as pd
 
-    from marsyard.cli.images import RenderedImage
     from marsyard.reports.verdicts import Verdict
     from marsyard.result import Result
+    from marsyard.site_images import RenderedImage
 
 
 def catalogue() -> list[str]:
@@ -228,7 +228,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     - pose: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
       sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
-    from marsyard.cli.images import ImageRequest, render_images
+    from marsyard.site_images import ImageRequest, render_images
 
     return render_images(ImageRequest.from_defaults(site, camera, **pose), detector=detector)
 

@@ -265,8 +265,8 @@ def render(arguments: RenderOptions) -> None:
 
     A stereo camera adds -left and -right to PREFIX.
     """
-    from marsyard.cli.images import ImageRequest, check_files, render_images, write_image
     from marsyard.sim.kernel_cache import mark_ready
+    from marsyard.site_images import ImageRequest, check_files, render_images, write_image
 
     with report_image_errors(arguments.out):
         values = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}

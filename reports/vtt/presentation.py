@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.algorithms.vtt.accuracy import HandOffOutcome
+from marsyard.algorithms.vtt.arm_target import HandOffOutcome
 from marsyard.reports.presentation import (
     CaseFigure,
     CaseKind,

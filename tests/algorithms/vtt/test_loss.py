@@ -9,17 +9,15 @@ from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingStat
 from marsyard.algorithms.vtt.accuracy import (
     NAVCAM,
     PANCAM,
-    GoalCriterion,
-    HandOffOutcome,
     StereoDesign,
     accuracy_row,
     drift_error_m,
-    hand_off,
     round_half_up,
     stereo_range_error_m,
     table_1,
     tracked_approach_error_m,
 )
+from marsyard.algorithms.vtt.arm_target import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.placement import Instrument, PlacementOutcome, place_instrument, tool_overlap_m
 from marsyard.algorithms.vtt.tracker import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
