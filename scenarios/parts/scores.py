@@ -30,7 +30,7 @@ from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, 
 from marsyard.sim.parameters import Parameters
 
 if TYPE_CHECKING:
-    from marsyard.scenarios.landing.images import GroundTruth
+    from marsyard.scenarios.landing.ground_truth import GroundTruth
 
 
 @dataclass(frozen=True, kw_only=True)
