@@ -12,7 +12,7 @@ from benchmarks.stages import DESCENT_STAGES, measure_stages
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.scenarios.descent.exposure import camera_optics
+from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend

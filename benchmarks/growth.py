@@ -31,9 +31,9 @@ from benchmarks.timing import core_seconds
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
-from marsyard.scenarios.descent.exposure import camera_optics
+from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.render import PixelRays, process_renderer

@@ -15,8 +15,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.processes import used_memory
-from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.flight import create_flight
+from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
 from marsyard.scenarios.views import SiteGround, Viewpoint, nadir_pose, site_scene
 from marsyard.sim.camera import Cahv, Cahvor

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.images import SUN, descent_pose, descent_scene, measure_all_cores, prepare_descent_exposure
 from benchmarks.timing import Measurement, core_seconds
-from marsyard.scenarios.descent.exposure import camera_optics
+from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend

@@ -37,7 +37,7 @@ from benchmarks.engine import BusyScenario, Stopwatch
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
 from marsyard.campaigns.execution.batches import MAX_BATCH, batch_duration_s
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams

@@ -13,7 +13,7 @@ from benchmarks.timing import Measurement
 Stages = Mapping[str, tuple[tuple[str, str], ...]]
 #: Stages of a `dimes-gusev` case.
 DESCENT_STAGES: Stages = {
-    "terrain and rocks": (("descent/exposure.py", "from_parameters"), ("descent/exposure.py", "scene")),
+    "terrain and rocks": (("descent/world.py", "from_parameters"), ("descent/world.py", "scene")),
     "flight": (("descent/flight.py", "create_flight"),),
     "mesh and OpenGL": (("render/renderer.py", "_draw_views"),),
     "ray intersection": (("kernels/primary.py", "trace_primary_rays"),),

@@ -16,8 +16,8 @@ from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.matching import extract_patch, search_window
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import run_case
 from marsyard.sim.measurements import RoverMeasurements, RoverTarget
 from marsyard.sim.streams import Streams
 from tests.algorithms.vtt.synthetic_drive import Drive, Plane, Scene, draw_waves, navcam, pose

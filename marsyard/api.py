@@ -33,9 +33,9 @@ from marsyard.sim.camera import read_cameras as read_cameras
 if TYPE_CHECKING:
     import pandas as pd
 
-    from marsyard.cli.images import RenderedImage
     from marsyard.reports.verdicts import Verdict
     from marsyard.result import Result
+    from marsyard.site_images import RenderedImage
 
 
 def catalogue() -> list[str]:
@@ -148,7 +148,7 @@ def open_result(directory: str | Path) -> Result:
 def _name_algorithms(algorithms: Sequence[Any], folder: Path) -> list[str]:
     """Return the specifications of algorithms; objects are stored in `folder`. Raises CampaignError."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.scenarios.objects import name_object
+    from marsyard.scenarios.stored_objects import name_object
 
     try:
         return [name_object(algorithm, folder) for algorithm in algorithms]
@@ -183,7 +183,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     """
     from rich.console import Console
 
-    from marsyard.campaigns.execution.workers import ExecutorConfig
+    from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import evaluate_and_store
     from marsyard.cli.progress import RunLog, campaign_progress
@@ -228,7 +228,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     - pose: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
       sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
-    from marsyard.cli.images import ImageRequest, render_images
+    from marsyard.site_images import ImageRequest, render_images
 
     return render_images(ImageRequest.from_defaults(site, camera, **pose), detector=detector)
 

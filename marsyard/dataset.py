@@ -22,8 +22,8 @@ import numpy as np
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.identity import definition_hash
 from marsyard.campaigns.errors import CampaignError, StoreError
-from marsyard.campaigns.running.preparation import plan_inputs
-from marsyard.scenarios.exposure import ProvidesSamples
+from marsyard.campaigns.running.shared_inputs import plan_inputs
+from marsyard.scenarios.image_samples import ProvidesSamples
 from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
 from marsyard.sim.sensor.compression import compress

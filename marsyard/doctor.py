@@ -366,15 +366,15 @@ def check_threads(environment: Mapping[str, str], cores: int) -> DoctorCheck:
 def check_systems() -> Iterator[DoctorCheck]:
     """Check the definitions of the systems under test, built in and plug-ins."""
     try:
-        from marsyard.scenarios.systems import own_paths, registry
+        from marsyard.scenarios.systems import registry
 
-        (systems, problems), own_systems = registry(), len(own_paths())
+        systems = registry()
     except ImportError as error:
         yield DoctorCheck("systems", f"cannot be read: {error}", CheckResult.FAIL, REINSTALL)
         return
-    others = ", ".join(system.name for system in systems[own_systems:])
-    yield DoctorCheck("systems", f"{own_systems} built in; plug-ins: {others or 'none'}")
-    for problem in problems:
+    plugins = ", ".join(system.name for system in systems.plugins)
+    yield DoctorCheck("systems", f"{len(systems.own)} built in; plug-ins: {plugins or 'none'}")
+    for problem in systems.problems:
         yield DoctorCheck(
             "systems", problem, CheckResult.WARN, "correct or uninstall the package that defines the system"
         )

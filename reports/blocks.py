@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -236,11 +236,24 @@ def quantile_block(
     return Block(heading=heading, grid=Grid(["", *columns], rows), note=note) if rows else None
 
 
-def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[dict[str, Any]]:
-    """Compute the effect of every condition `x` that varies on every response `y`.
+@dataclass(frozen=True)
+class Effect:
+    """Effect of a condition on a response: their titles, Spearman's rank correlation with its interval, and bins.
 
-    Keys: `driver`, `error`, Spearman's `rank_correlation` with its interval, `centres` and `medians` of the bins.
+    centres, medians: medians of the condition and of the response in each bin of the condition
     """
+
+    condition: str
+    response: str
+    rank_correlation: float
+    lower: float
+    upper: float
+    centres: list[float]
+    medians: list[float]
+
+
+def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[Effect]:
+    """Compute the effect of every condition `x` that varies on every response `y`."""
     effects, groups = [], rates.terrain_groups(frame)
     for condition in (condition for condition in x if varies(frame, condition.column)):
         for response in y:
@@ -249,9 +262,7 @@ def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) 
             centres, medians = ([float(np.median(values[mask])) for mask in bins] for values in (conditions, responses))
             ranks = estimate_driver(conditions, responses, groups, CONFIDENCE)
             rank_values = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
-            effect: dict[str, Any] = {"driver": condition.title, "error": response.title}
-            effect |= zip(("rank_correlation", "lower", "upper"), rank_values, strict=True)
-            effects.append(effect | {"centres": centres, "medians": medians})
+            effects.append(Effect(condition.title, response.title, *rank_values, centres, medians))
     return effects
 
 
@@ -268,15 +279,15 @@ def scatter_block(
         return None
     columns = {quantity.title: quantity.values(frame) for quantity in (*x, *y)}
     panels = {
-        (effect["driver"], effect["error"]): (
-            (columns[effect["driver"]], columns[effect["error"]]),
-            (effect["centres"], effect["medians"]) if statistics else ((), ()),
+        (effect.condition, effect.response): (
+            (columns[effect.condition], columns[effect.response]),
+            (effect.centres, effect.medians) if statistics else ((), ()),
         )
         for effect in effects
     }
     texts_by_condition: dict[str, list[str]] = {}
     for effect in effects:
-        texts_by_condition.setdefault(effect["driver"], []).append(correlation_text(effect))
+        texts_by_condition.setdefault(effect.condition, []).append(correlation_text(effect))
     head = ["Rank correlation", *(response.title for response in y)]
     grid = Grid(head, [[name, *cells] for name, cells in texts_by_condition.items()]) if statistics else None
     figure = svg_figure(scatter_panels(panels, logarithmic=logarithmic), key, caption, wide=len(effects) > 1)
@@ -284,10 +295,16 @@ def scatter_block(
         f"The intervals are at {format_fraction(CONFIDENCE)} confidence. A dash means that there are fewer than "
         f"{MIN_CASES} cases or only one value."
     )
-    return Block(heading=heading, figures=[figure], grid=grid, note=note, data={"effects": effects})
+    return Block(
+        heading=heading,
+        figures=[figure],
+        grid=grid,
+        note=note,
+        data={"effects": [asdict(effect) for effect in effects]},
+    )
 
 
-def correlation_text(effect: Mapping[str, Any]) -> str:
+def correlation_text(effect: Effect) -> str:
     """Format a rank correlation with its interval; a dash for NaN."""
-    value, lower, upper = (coefficient(effect[key]) for key in ("rank_correlation", "lower", "upper"))
-    return NOTHING if math.isnan(effect["rank_correlation"]) else f"{value} ({lower} to {upper})"
+    value, lower, upper = map(coefficient, (effect.rank_correlation, effect.lower, effect.upper))
+    return NOTHING if math.isnan(effect.rank_correlation) else f"{value} ({lower} to {upper})"

@@ -43,12 +43,12 @@ def add_independent_bounds(verdict: Verdict, success: Mask, member: Mask, looks:
         confidences = 1.0 - pass_test.significance_level(n), 1.0 - fail_test.significance_level(n)
     else:
         confidences = (confidence_at(verdict.confidence, looks.risk_fraction),) * 2
-    further: int | None = None
+    additional: int | None = None
     if looks.in_first_look is None and looks.risk_fraction < 1.0:
-        further = proportions.further_cases_needed(n, failures, verdict.probability, confidences[0])
+        additional = proportions.additional_cases_needed(n, failures, verdict.probability, confidences[0])
     else:
-        further = pass_test.cases_needed(n, failures) - n
-    return _add_binomial_bounds(verdict, n, (n - failures, n - failures), confidences, further)
+        additional = pass_test.cases_needed(n, failures) - n
+    return _add_binomial_bounds(verdict, n, (n - failures, n - failures), confidences, additional)
 
 
 def add_clustered_bounds(verdict: Verdict, cases: ClusteredCases, looks: Looks) -> Verdict:
@@ -59,12 +59,12 @@ def add_clustered_bounds(verdict: Verdict, cases: ClusteredCases, looks: Looks) 
     confidence = confidence_at(verdict.confidence, looks.risk_fraction)
     risk = 1.0 - confidence
     if looks.risk_fraction < 1.0:
-        further = cases.further_cases_needed(max_failure_rate, risk)
+        additional = cases.additional_cases_needed(max_failure_rate, risk)
     else:
         # these cases would be evaluated at a later look
         terrains = int((cases.is_first_on_terrain & cases.member).sum())
         pass_test = _clustered_test(cases, np.ones_like(cases.member), max_failure_rate, 1.0 - verdict.confidence)
-        further = pass_test.cases_needed(terrains, min(evidence.failed_terrains, terrains)) - terrains
+        additional = pass_test.cases_needed(terrains, min(evidence.failed_terrains, terrains)) - terrains
     return replace(
         verdict,
         lower=1.0 - cases.max_failure_rate(risk),
@@ -72,7 +72,7 @@ def add_clustered_bounds(verdict: Verdict, cases: ClusteredCases, looks: Looks) 
         bounds_confidence=confidence,
         upper_confidence=confidence,
         consumer_risk=cases.consumer_risk(max_failure_rate, risk),
-        further_cases=further,
+        additional_cases=additional,
         clustered=evidence,
     )
 
@@ -88,8 +88,8 @@ def _add_bounds_at_later_look(verdict: Verdict, cases: ClusteredCases, in_first_
     )
     confidences = 1.0 - pass_test.significance_level(terrains), 1.0 - fail_test.significance_level(terrains)
     successes = terrains - failed, min(evidence.successful_terrains, terrains)
-    further = pass_test.cases_needed(terrains, failed) - terrains
-    return replace(_add_binomial_bounds(verdict, terrains, successes, confidences, further), clustered=evidence)
+    additional = pass_test.cases_needed(terrains, failed) - terrains
+    return replace(_add_binomial_bounds(verdict, terrains, successes, confidences, additional), clustered=evidence)
 
 
 def _clustered_test(cases: ClusteredCases, in_first_look: Mask, rate: float, risk: float) -> SequentialTest:
@@ -102,12 +102,12 @@ def _clustered_test(cases: ClusteredCases, in_first_look: Mask, rate: float, ris
 
 
 def _add_binomial_bounds(
-    verdict: Verdict, n: int, successes: tuple[int, int], confidences: tuple[float, float], further: int | None
+    verdict: Verdict, n: int, successes: tuple[int, int], confidences: tuple[float, float], additional: int | None
 ) -> Verdict:
     """Add the bounds of n independent cases.
 
     - successes, confidences: those of the lower and of the upper bound
-    - further: additional cases for PASS
+    - additional: additional cases for PASS
     """
     return replace(
         verdict,
@@ -116,5 +116,5 @@ def _add_binomial_bounds(
         bounds_confidence=confidences[0],
         upper_confidence=confidences[1],
         consumer_risk=proportions.consumer_risk(successes[0], n, verdict.probability),
-        further_cases=further,
+        additional_cases=additional,
     )

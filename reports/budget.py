@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from matplotlib.figure import Figure
 
+from marsyard.campaigns.studies.contributions import Budget
+from marsyard.campaigns.studies.results import BUDGET, BudgetResult
+from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.reports.section import (
     GRID,
     INK,
@@ -20,7 +24,6 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.stored import read_study, table
 from marsyard.reports.wording import count, format_fraction, label, number
 from marsyard.scenarios.columns import split_unit
 
@@ -37,77 +40,72 @@ def signed_percent(fraction: float) -> str:
     return f"{100.0 * fraction:z.1f} %".replace("-", "−")
 
 
-def budget_sentences(study: Mapping[str, Any]) -> list[str]:
-    """Describe total, largest contributions and additivity of an error budget; empty without a result."""
-    if not study:
+def budget_sentences(record: Mapping[str, Any]) -> list[str]:
+    """Describe total, largest contributions and additivity of an error budget in a record; empty without a result."""
+    study = BUDGET.read(record)
+    if study is None:
         return []
-    result = study["result"]
+    parameters, result = study
     sentences: list[str] = []
-    budget = table(result["budget"])
-    if budget:
-        total = budget["total"]
+    budget = result.budget
+    if budget is not None:
         largest = ", ".join(
-            f"{item['title']} {signed_percent(item['mean'] / total)}"
-            for item in budget["contributions"][:3]
-            if item["mean"] > 0
+            f"{item.title} {signed_percent(item.mean / budget.total)}"
+            for item in budget.contributions[:3]
+            if item.mean > 0
         )
         sentences += [
-            f"{study['requirement']}: {_statistic(result)} of {label(result['quantity'])}: {number(math.sqrt(total))} "
-            f"with all sources of error, {_format_root(budget['remaining'])} without any, from the {budget['common']} "
-            f"of {count(int(result['cases']), 'base case')} that were answered in every variant.",
+            f"{parameters.requirement}: {_statistic(result)} of {label(result.quantity)}: "
+            f"{number(math.sqrt(budget.total))} with all sources of error, {_format_root(budget.remaining)} without "
+            f"any, from the {budget.common} of {count(result.cases, 'base case')} that were answered in every variant.",
             f"Largest contributions to the mean square: {largest}; "
-            f"{REMAINING} {signed_percent(budget['remaining'] / total)}.",
-            _closure_sentence(budget, float(study["confidence"])),
+            f"{REMAINING} {signed_percent(budget.remaining / budget.total)}.",
+            _closure_sentence(budget, parameters.confidence),
         ]
-    if result["indices"]:
-        first = ", ".join(f"{item['name']} {number(item['total'])}" for item in result["indices"][:3])
-        sentences.append(
-            f"Largest total Sobol indices: {first}, from {count(int(result['index_samples']), 'base sample')}."
-        )
-    elif study["sobol"]:
+    if result.indices:
+        first = ", ".join(f"{item.name} {number(item.total)}" for item in result.indices[:3])
+        sentences.append(f"Largest total Sobol indices: {first}, from {count(result.index_samples, 'base sample')}.")
+    elif parameters.sobol:
         sentences.append(
             "Sobol indices are not available: fewer than 8 base samples were answered in all their cases, or all "
             "errors are equal."
         )
-    if result.get("reason"):
-        sentences.append(str(result["reason"]))
-    return [*sentences, f"The study ran {count(int(result['evaluated']), 'case')}."]
+    return [*sentences, *filter(None, [result.reason]), f"The study ran {count(result.evaluated, 'case')}."]
 
 
-def _statistic(result: Mapping[str, Any]) -> str:
+def _statistic(result: BudgetResult) -> str:
     """Return the name of the root of the mean square, which is centred on the mean for a margin."""
-    return "standard deviation" if result["centred"] else "RMS"
+    return "standard deviation" if result.centred else "RMS"
 
 
-def _closure_sentence(budget: Mapping[str, Any], confidence: float) -> str:
-    bounds = f"{signed_percent(budget['closure_lower'])} to {signed_percent(budget['closure_upper'])}"
+def _closure_sentence(budget: Budget, confidence: float) -> str:
+    bounds = f"{signed_percent(budget.closure_lower)} to {signed_percent(budget.closure_upper)}"
     interval = f"{format_fraction(confidence)} interval {bounds}"
-    text = f"Contributions and remaining part add up to {signed_percent(budget['closure'])} of the total ({interval})"
-    if abs(budget["closure"] - 1.0) > MAX_CLOSURE_ERROR:
+    text = f"Contributions and remaining part add up to {signed_percent(budget.closure)} of the total ({interval})"
+    if abs(budget.closure - 1.0) > MAX_CLOSURE_ERROR:
         return f"{text}: three or more sources interact, so that the contributions do not add up."
     return f"{text}."
 
 
 def budget_section(subject: Subject) -> Section | None:
     """Create the section of an error budget; None for another run."""
-    study = read_study(subject.run.record, "budget")
-    if not study:
+    study = BUDGET.read(subject.run.record)
+    if study is None:
         return None
-    result = study["result"]
+    parameters, result = study
     blocks: list[Block] = []
-    budget = table(result["budget"])
-    if budget:
-        blocks.append(_budget_block(result, budget, float(study["confidence"])))
-    if result["indices"]:
+    if result.budget is not None:
+        blocks.append(_budget_block(result, result.budget, parameters.confidence))
+    if result.indices:
         blocks.append(_index_block(result))
     if not blocks:
-        blocks.append(Block(text=str(result.get("reason") or "No result.")))
-    data = {**result, "requirement": study["requirement"]}
+        blocks.append(Block(text=result.reason or "No result."))
+    data = convert_to_json(asdict(result)) | {"requirement": parameters.requirement}
     return Section("budget", "Error budget", "Error budget", tuple(blocks), data)
 
 
-def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confidence: float) -> Block:
-    unit, total, n_cases = split_unit(result["quantity"])[1], budget["total"], int(result["cases"])
+def _budget_block(result: BudgetResult, budget: Budget, confidence: float) -> Block:
+    unit, total, n_cases = split_unit(result.quantity)[1], budget.total, result.cases
     root_unit = f", {unit}" if unit else ""
     head = [
         "Source of error", "Contribution", f"{format_fraction(confidence)} interval", "Interaction",
@@ -115,20 +113,18 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
     ]  # fmt: skip
     rows = [
         [
-            item["title"],
-            signed_percent(item["mean"] / total),
-            f"{signed_percent(item['lower'] / total)} to {signed_percent(item['upper'] / total)}",
-            signed_percent(0.5 * (item["removed"] - item["alone"]) / total),
-            _format_root(item["alone"] + budget["remaining"]),
-            _format_root(total - item["removed"]),
-            f"{item['answered'][1]}, {item['answered'][0]}",
+            item.title,
+            signed_percent(item.mean / total),
+            f"{signed_percent(item.lower / total)} to {signed_percent(item.upper / total)}",
+            signed_percent(0.5 * (item.removed - item.alone) / total),
+            _format_root(item.alone + budget.remaining),
+            _format_root(total - item.removed),
+            f"{item.answered[1]}, {item.answered[0]}",
         ]
-        for item in budget["contributions"]
+        for item in budget.contributions
     ]
-    rows.append(
-        [REMAINING, signed_percent(budget["remaining"] / total), "", "", _format_root(budget["remaining"]), "", ""]
-    )
-    statistic, name = _statistic(result), label(result["quantity"]).split(" (")[0]
+    rows.append([REMAINING, signed_percent(budget.remaining / total), "", "", _format_root(budget.remaining), "", ""])
+    statistic, name = _statistic(result), label(result.quantity).split(" (")[0]
     figure = svg_figure(
         _draw_waterfall(budget, f"mean square of {name}, ({unit})²" if unit else f"mean square of {name}"),
         "budget-waterfall",
@@ -136,16 +132,14 @@ def _budget_block(result: Mapping[str, Any], budget: Mapping[str, Any], confiden
         "mean square with all sources. Black lines: intervals.",
         wide=True,
     )
-    inactive = (
-        f" Sources that this campaign does not have: {'; '.join(result['inactive'])}." if result["inactive"] else ""
-    )
+    inactive = f" Sources that this campaign does not have: {'; '.join(result.inactive)}." if result.inactive else ""
     note = (
         "Each base case runs with the same dispersions and random streams in all variants. 'With it only' is the "
         f"{statistic} with this source and no other, 'Without it' that with all other sources; both include the part "
         "that remains without any source. 'Answered' is the number of answered base cases, with the source only and "
         "without it. The contribution is the mean of two increases of the mean square: if the source is added to no "
         "other source, and if it is added to all others. The interaction is half of the second minus the first. "
-        f"Intervals: bootstrap over terrains. {count(int(result['violations']), 'base case')} with all sources "
+        f"Intervals: bootstrap over terrains. {count(result.violations, 'base case')} with all sources "
         f"violate the requirement.{inactive}"
     )
     return Block("Sources of error", figures=[figure], grid=Grid(head, rows), note=note)
@@ -156,18 +150,18 @@ def _format_root(square: float) -> str:
     return number(math.sqrt(max(square, 0.0)))
 
 
-def _index_block(result: Mapping[str, Any]) -> Block:
-    indices: Sequence[Mapping[str, Any]] = result["indices"]
+def _index_block(result: BudgetResult) -> Block:
+    indices = result.indices
     rows = [
         [
-            item["name"],
-            f"{number(item['total'])} ± {number(item['total_width'])}",
-            f"{number(item['first'])} ± {number(item['first_width'])}",
+            item.name,
+            f"{number(item.total)} ± {number(item.total_width)}",
+            f"{number(item.first)} ± {number(item.first_width)}",
         ]
         for item in indices[:_MAX_INDICES]
     ]
     note = (
-        f"Saltelli's design with {count(int(result['index_samples']), 'complete base sample')}. The first-order index "
+        f"Saltelli's design with {count(result.index_samples, 'complete base sample')}. The first-order index "
         "is the fraction of the variance that a variable causes alone, the total index the fraction with all its "
         "interactions. Correlated dispersions are represented by their independent variables. The "
         "intervals are bootstrap intervals; an index whose interval contains 0 is not significant."
@@ -180,24 +174,24 @@ def _index_block(result: Mapping[str, Any]) -> Block:
 
 
 @in_page_style
-def _draw_waterfall(budget: Mapping[str, Any], axis_label: str) -> Figure:
+def _draw_waterfall(budget: Budget, axis_label: str) -> Figure:
     """Draw horizontal bars: remaining mean square, contributions from the end of the previous bar, and total."""
-    contributions = budget["contributions"]
+    contributions = budget.contributions
     figure, axes = new_axes(9.0, 1.2 + 0.34 * (len(contributions) + 2))
-    titles = [REMAINING, *(item["title"] for item in contributions), "all sources of error"]
+    titles = [REMAINING, *(item.title for item in contributions), "all sources of error"]
     rows = range(len(titles))
-    level = budget["remaining"]
+    level = budget.remaining
     axes.barh(0, level, color=SERIES[5], height=0.62)
     for row, item in enumerate(contributions, start=1):
-        color = SERIES[0] if item["mean"] >= 0.0 else SERIES[1]
-        axes.barh(row, item["mean"], left=level, color=color, height=0.62)
-        axes.plot([level + item["lower"], level + item["upper"]], [row, row], color=INK, linewidth=1.2)
+        color = SERIES[0] if item.mean >= 0.0 else SERIES[1]
+        axes.barh(row, item.mean, left=level, color=color, height=0.62)
+        axes.plot([level + item.lower, level + item.upper], [row, row], color=INK, linewidth=1.2)
         # connect the end of the previous bar with the start of this bar
         axes.plot([level, level], [row - 1.31, row + 0.31], color=GRID, linewidth=0.8, zorder=0)
-        level += item["mean"]
+        level += item.mean
     last = len(titles) - 1
-    axes.barh(last, budget["total"], color=SERIES[2], height=0.62)
-    axes.plot([budget["total_lower"], budget["total_upper"]], [last, last], color=INK, linewidth=1.2)
+    axes.barh(last, budget.total, color=SERIES[2], height=0.62)
+    axes.plot([budget.total_lower, budget.total_upper], [last, last], color=INK, linewidth=1.2)
     axes.set_yticks(list(rows), titles)
     axes.invert_yaxis()
     axes.set(xlabel=axis_label)

@@ -22,7 +22,7 @@ from markupsafe import Markup, escape
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.key import sign
 from marsyard.campaigns.store.lock import replace_file
-from marsyard.reports import common_sections, explorer, sections
+from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences
 from marsyard.reports.comparison import comparison_section
@@ -31,12 +31,12 @@ from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.overall import OverallVerdict, multiplicity_text
 from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
 from marsyard.reports.rare import rare_section, rare_sentences
-from marsyard.reports.record import SCHEMA, CampaignReport, StudySummary
+from marsyard.reports.report_file import SCHEMA, CampaignReport, StudySummary
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
-from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_study, table
+from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
@@ -99,13 +99,13 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     rows = requirement_evidence(run.name, verdicts, algorithms, evaluation.evidence.title)
     write_atomic(directory / VERIFICATION_FILE, hide_folders(verification_csv(rows)))
     write_atomic(directory / JUNIT_FILE, hide_folders(junit_xml(run.name, verdicts, overall_verdict, algorithms)))
-    page = directory / PAGE_FILE
+    page_file = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context["evidence"] = evaluation.evidence
-    write_atomic(page, hide_folders(page_environment().get_template("report.html.j2").render(context)))
+    write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))
     with suppress(StoreError, RuntimeError):  # without a key or a home folder, the dashboard writes the report again
         sign_report(directory, run.directory)
-    return page
+    return page_file
 
 
 def sign_report(directory: Path, campaign: Path) -> None:
@@ -156,33 +156,33 @@ def page_context(
         "overall_verdict": overall,
         "cautions": [*cautions, *sampling_cautions(run, metric)],
         "interrupted": run.recorded("state") not in (None, "finished"),
-        "verdicts": [sections.verdict_row(verdict) for verdict in verdicts],
+        "verdicts": [page.verdict_row(verdict) for verdict in verdicts],
         "multiplicity": multiplicity_text(verdicts),
         "metric": metric,
         "metric_label": "" if metric is None else label(metric),
         "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],
         "bound": bound,
         "extra_sections": extra,
-        "outcomes": sections.outcome_grid(run.all_cases, str(run.definition.get("scenario") or "")),
-        "outcome_figures": sections.outcome_figures(run.all_cases),
-        "crashed": sections.crashed_rows(run),
-        "dispersions": sections.dispersion_grid(subject.run),
+        "outcomes": page.outcome_grid(run.all_cases, str(run.definition.get("scenario") or "")),
+        "outcome_figures": page.outcome_figures(run.all_cases),
+        "crashed": page.crashed_rows(run),
+        "dispersions": page.dispersion_grid(subject.run),
         "requirement_cases": finder.requirement_cases(),
         "showcases": showcases,
         "links": {case.case: f"#case-{case.case}" for case in showcases},
         "summaries": {case.case: finder.summary(case.case) for case in showcases},
-        "provenance": sections.list_provenance(run),
-        "versions": sections.list_versions(run),
+        "provenance": page.list_provenance(run),
+        "versions": page.list_versions(run),
         "definition": json.dumps(run.definition, indent=2, ensure_ascii=False, default=str),
         "algorithms": read_algorithms(run.record),
-        "rerun": sections.rerun_commands(run),
+        "rerun": page.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
-        "replay": sections.replay_command(run, "CASE"),
+        "replay": page.replay_command(run, "CASE"),
         "gallery": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
     cases_with_images = [str(case.case) for case in context["showcases"]]
     if metric is None:
-        empty_table = sections.CaseTable((), ())
+        empty_table = page.CaseTable((), ())
         context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
         return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
     context["explorer"], random_run = None, subject.run
@@ -191,14 +191,14 @@ def page_context(
             explorer.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images),
             explorer.read_script(),
         )
-        content_hash = sections.script_hash(script)
-        context["explorer"] = {"data": data, "json": sections.embed_json(data), "script": script, "hash": content_hash}
+        content_hash = page.script_hash(script)
+        context["explorer"] = {"data": data, "json": page.embed_json(data), "script": script, "hash": content_hash}
     return context | {
-        "error_figures": sections.error_figures(random_run.frame, random_run.all_cases, metric, bound),
-        "driver_figures": sections.driver_figures(random_run.frame, metric, bound, random_run.driver_columns(metric)),
+        "error_figures": page.error_figures(random_run.frame, random_run.all_cases, metric, bound),
+        "driver_figures": page.driver_figures(random_run.frame, metric, bound, random_run.driver_columns(metric)),
         "statistics": statistics_grid(random_run.all_cases, metric),
-        "worst": sections.worst_cases(random_run, metric, cases_with_images),
-        "unanswered": sections.unanswered_cases(random_run, metric, cases_with_images),
+        "worst": page.worst_cases(random_run, metric, cases_with_images),
+        "unanswered": page.unanswered_cases(random_run, metric, cases_with_images),
     }
 
 
@@ -228,11 +228,7 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
 
 def study_sentences(record: Mapping[str, Any]) -> list[str]:
     """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
-    return [
-        *rare_sentences(read_study(record, "rare")),
-        *search_sentences(read_study(record, "search")),
-        *budget_sentences(read_study(record, "budget")),
-    ]
+    return [*rare_sentences(record), *search_sentences(record), *budget_sentences(record)]
 
 
 def describe_study(record: Mapping[str, Any]) -> StudySummary | None:
@@ -250,7 +246,7 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
     """Create the record of `report.json`."""
     run, overall_verdict, metric = evaluation.run, evaluation.overall_verdict, subject.metric
     summaries = error_summaries(subject.all_cases, metric) if metric is not None else []
-    worst_rows = [] if metric is None else sections.worst_cases(subject.run, metric).rows
+    worst_rows = [] if metric is None else page.worst_cases(subject.run, metric).rows
     return CampaignReport(
         schema=SCHEMA,
         campaign=run.name,

@@ -58,14 +58,11 @@ from marsyard.reports.wording import (
     p_text,
     percent,
 )
-from marsyard.scenarios.columns import split_unit
-
-#: Boolean column: whether the images of each pair show enough common ground.
-FEASIBLE_OVERLAP = "feasible_overlap"
+from marsyard.scenarios.columns import enabling_columns, split_unit
 
 
 def answers_section(subject: Subject) -> Section | None:
-    """Create the section on availability, feasible overlap and wrong answers; None if the rows contain no answers."""
+    """Create the section on availability and wrong answers; None if the rows contain no answers."""
     fractions = answer_fractions(subject)
     if not fractions:
         return None
@@ -95,13 +92,15 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
         return {}
     is_answered = rates.population_mask(frame, "valid")
     fractions = {"answered (of all cases)": rates.fraction_of(is_answered, frame)}
-    if rates.is_flag(frame, FEASIBLE_OVERLAP):
-        is_feasible, is_completed = (rates.population_mask(frame, name) for name in (FEASIBLE_OVERLAP, "completed"))
-        fractions["answered, of cases with feasible overlap"] = rates.fraction_of(
-            is_answered[is_feasible], frame[is_feasible]
+    for column in enabling_columns(map(str, frame.columns)):
+        if not rates.is_flag(frame, column.name):
+            continue
+        is_enabled, is_completed = (rates.population_mask(frame, name) for name in (column.name, "completed"))
+        fractions[f"answered, of cases {column.population}"] = rates.fraction_of(
+            is_answered[is_enabled], frame[is_enabled]
         )
-        fractions["no feasible overlap (of completed cases)"] = rates.fraction_of(
-            ~is_feasible[is_completed], frame[is_completed]
+        fractions[f"no {column.population.removeprefix('with ')} (of completed cases)"] = rates.fraction_of(
+            ~is_enabled[is_completed], frame[is_completed]
         )
     if subject.metric is not None and subject.bound is not None:
         is_wrong = ~rates.success_mask(frame[is_answered], subject.metric, subject.bound)

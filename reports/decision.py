@@ -150,7 +150,7 @@ def _evaluate(
     if not members.any():
         needed_cases = SequentialTest(1.0 - verdict.probability, 1.0 - verdict.confidence, 0).cases_needed(0, 0)
         reason = f"No case belongs to the population '{verdict.population}'."
-        return replace(verdict, reason=reason, further_cases=needed_cases if sampling.independent else None)
+        return replace(verdict, reason=reason, additional_cases=needed_cases if sampling.independent else None)
     own = [
         _case_evidence(verdict, mask, sampling, frame, has_own_terrains=_has_own_terrains(earlier))
         for mask in (members, members_and_unfinished)
@@ -208,7 +208,7 @@ def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, 
     in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look
     looks = Looks(in_first_look, sampling.risk_fraction_at(len(frame)))
     bounded = _add_bounds(with_counts, evidence, looks)
-    additional, verdict_with_bounds = bounded.further_cases or 0, replace(bounded, further_cases=None)
+    additional, verdict_with_bounds = bounded.additional_cases or 0, replace(bounded, additional_cases=None)
     status = verdict_with_bounds.confident_status
     decides_by_rate = decides_by_rate and status is not Status.PASS
     if decides_by_rate:
@@ -217,11 +217,11 @@ def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, 
     if status is not Status.INSUFFICIENT:
         return verdict_with_bounds
     if decides_by_rate:
-        return replace(verdict_with_bounds, further_cases=min_cases_for_rate(verdict.probability) - n)
+        return replace(verdict_with_bounds, additional_cases=min_cases_for_rate(verdict.probability) - n)
     # number of additional cases, or advice if the campaign has too few terrains for them
     clustered, supply = verdict_with_bounds.clustered, sampling.terrains
     if clustered is None or supply is None or clustered.terrains + additional <= supply.terrains:
-        return replace(verdict_with_bounds, further_cases=additional)
+        return replace(verdict_with_bounds, additional_cases=additional)
     needed_terrains = proportions.minimum_sample_size(verdict.probability, verdict.confidence)
     return replace(verdict_with_bounds, advice=supply.advice(needed_terrains, verdict.probability, verdict.confidence))
 

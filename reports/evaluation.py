@@ -16,6 +16,7 @@ import pandas as pd
 from marsyard.campaigns.definition.claims import requirement_key
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.store.confirmations import add_result
+from marsyard.campaigns.studies.results import BUDGET, RARE, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.overall import QUALIFIED_EXIT_CODE, OverallVerdict, combine_verdicts, compute_exit_code
@@ -60,9 +61,8 @@ def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
     """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows."""
     run = read_run(directory, requirements)
     sampling = read_sampling_design(run.definition)
-    study = table(run.record.get("study"))
-    if study:
-        return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(study, run.all_cases))
+    if table(run.record.get("study")):
+        return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(run.record, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
     joint = read_joint_evidence(evidence)
     evidence = replace(evidence, notes=joint.notes)
@@ -113,20 +113,20 @@ def _withhold_unfinished(verdict: Verdict, reason: str) -> Verdict:
     return replace(verdict.withhold(reason), advice="", all_cases=None, clustered=None, **unknown)
 
 
-def _evaluate_study(study: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
+def _evaluate_study(record: Mapping[str, Any], frame: pd.DataFrame) -> OverallVerdict:
     """Return the verdict of a study; its cases are not random samples, so no requirement is evaluated by rates."""
     crashed = int(engine_failed(frame).sum())
-    result = table(study.get("result"))
-    if not result:
-        return OverallVerdict(Status.INSUFFICIENT, crashed, "The study is not finished.")
-    if study.get("kind") == "search":
-        violations, status = int(result.get("violations") or 0), Status.FAIL if result.get("violations") else None
-        sentence = f"{count(violations, 'violation')} of {study.get('requirement')} found. See the section."
-        return OverallVerdict(status, crashed, sentence, _NO_VERDICT)
-    if study.get("kind") == "budget":
+    if search := SEARCH.read(record):
+        parameters, found = search
+        sentence = f"{count(found.violations, 'violation')} of {parameters.requirement} found. See the section."
+        return OverallVerdict(Status.FAIL if found.violations else None, crashed, sentence, _NO_VERDICT)
+    if BUDGET.read(record):
         return OverallVerdict(None, crashed, "The study computes an error budget. See the section.", _NO_VERDICT)
-    statement = f"a violation of {study.get('requirement')} has a probability of at most {study.get('max_probability')}"
-    return OverallVerdict(Status(result["verdict"]), crashed, f"Statement: {statement}.")
+    if rare := RARE.read(record):
+        limit, result = rare
+        statement = f"a violation of {limit.requirement} has a probability of at most {limit.max_probability}"
+        return OverallVerdict(Status(result.verdict), crashed, f"Statement: {statement}.")
+    return OverallVerdict(Status.INSUFFICIENT, crashed, "The study is not finished.")
 
 
 def read_evidence(record: Mapping[str, Any], *, uses_campaign_requirements: bool = True) -> Evidence:
@@ -153,7 +153,7 @@ def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
     if not evidence.excludes_pass:
         return verdict
     if not verdict.status.is_met:
-        return replace(verdict, further_cases=None)
+        return replace(verdict, additional_cases=None)
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
     return replace(verdict.withhold(reason), withheld_status=verdict.status)
 

@@ -13,8 +13,8 @@ import pandas as pd
 from jaxtyping import Bool, Int
 from markupsafe import Markup
 
+from marsyard.reports.page import replay_command
 from marsyard.reports.rates import engine_failed
-from marsyard.reports.sections import replay_command
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import axis_columns, is_varying_number, label, numbers
 
@@ -41,14 +41,17 @@ def explorer_data(
 ) -> dict[str, Any]:
     """Create the data of the explorer: numeric columns of the points with labels, initial axes, and requirements.
 
-    Columns that a large campaign has not read for a case are missing values of this case.
+    In a large campaign, `run.frame` contains all columns of the first cases, and `run.all_cases` some columns of all
+    cases; the other columns of the other cases are missing values.
     """
-    frame, all_cases = run.frame, run.all_cases
-    components = axis_columns(metric, [str(name) for name in frame.columns])[:2]
+    first_cases, all_cases = run.frame, run.all_cases
+    components = axis_columns(metric, [str(name) for name in first_cases.columns])[:2]
     drivers = run.driver_columns(metric)
     first = [*components, metric, *drivers]
     explored = [
-        str(name) for name in frame.columns if name not in _NOT_EXPLORED and is_varying_number(frame, str(name))
+        str(name)
+        for name in first_cases.columns
+        if name not in _NOT_EXPLORED and is_varying_number(first_cases, str(name))
     ]
     names = list(dict.fromkeys([*first, *explored]))
     is_violation = np.zeros(len(all_cases), dtype=np.bool_)
@@ -57,7 +60,8 @@ def explorer_data(
     rows = choose_points(all_cases, metric, is_violation)
     points = all_cases.iloc[rows]
     cases = points["case"].tolist() if "case" in points else rows.tolist()
-    complete = frame.set_index("case").reindex(cases) if "case" in frame else frame.iloc[rows]
+    is_numbered = "case" in first_cases
+    complete = first_cases.set_index("case").reindex(cases) if is_numbered else first_cases.iloc[rows]
     outcomes = points["outcome"].astype(str) if "outcome" in points else pd.Series("", index=points.index)
     distinct_outcomes = list(dict.fromkeys(outcomes))
 

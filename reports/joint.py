@@ -22,7 +22,7 @@ from marsyard.campaigns.store.confirmations import (
     list_related_claims,
     read_record,
 )
-from marsyard.campaigns.store.registration import UNKNOWN, find_registration_problem
+from marsyard.campaigns.store.git_registration import UNKNOWN, find_registration_problem
 from marsyard.reports.case_evidence import RequirementEvidence
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
@@ -161,7 +161,7 @@ def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdi
             f"Confirmation {failure.number} of this claim resulted in FAIL, which is final: a changed algorithm is a "
             "new claim."
         )
-        return replace(verdict, status=Status.FAIL, reason=reason, further_cases=None)
+        return replace(verdict, status=Status.FAIL, reason=reason, additional_cases=None)
     block = joint.find_block(cases)
     if block and verdict.status.is_met:
         return verdict.withhold(block)

@@ -30,7 +30,7 @@ class OverallVerdict:
     - sentence: explanation
     - without_status: headline if `status` is None
     - is_exploration: whether the run is an exploration, which the headline of PASS states
-    - cases_to_append: additional cases, all without a failure, that would decide the campaign; None if unknown
+    - additional_cases: additional cases, all without a failure, that would decide the campaign; None if unknown
     """
 
     status: Status | None
@@ -38,7 +38,7 @@ class OverallVerdict:
     sentence: str
     without_status: str = "NO REQUIREMENT"
     is_exploration: bool = False
-    cases_to_append: int | None = None
+    additional_cases: int | None = None
 
     @property
     def word(self) -> str:
@@ -89,9 +89,9 @@ def combine_verdicts(
         Status.INSUFFICIENT: f"{count(len(frame), 'case')} are too few to decide {subject}.{remedy_text}",
     }[worst]
     is_exploration = evidence is not None and evidence.kind is EvidenceKind.EXPLORATION
-    cases_to_append = remedy.cases if worst is Status.INSUFFICIENT and sampling.max_cases is None else None
+    additional_cases = remedy.cases if worst is Status.INSUFFICIENT and sampling.max_cases is None else None
     return OverallVerdict(
-        worst, crashed, sentence + crash_text, is_exploration=is_exploration, cases_to_append=cases_to_append
+        worst, crashed, sentence + crash_text, is_exploration=is_exploration, additional_cases=additional_cases
     )
 
 
@@ -134,14 +134,14 @@ def find_remedy(verdicts: Sequence[Verdict], cases: int) -> Remedy:
     verdict_with_advice = next((verdict for verdict in verdicts if verdict.advice), None)
     if verdict_with_advice is not None:
         return Remedy(None, verdict_with_advice.advice)
-    undecided_verdicts = [verdict for verdict in verdicts if verdict.further_cases is not None]
+    undecided_verdicts = [verdict for verdict in verdicts if verdict.additional_cases is not None]
     if not undecided_verdicts:
         return Remedy()
     populated = [verdict for verdict in undecided_verdicts if verdict.n]
     if len(populated) < len(undecided_verdicts):
-        largest = max(undecided_verdicts, key=lambda verdict: verdict.further_cases or 0)
+        largest = max(undecided_verdicts, key=lambda verdict: verdict.additional_cases or 0)
         return Remedy(None, f"{_needed_text(largest)}, all without a failure, would be enough.")
-    numbers = [_cases_for(verdict, verdict.further_cases or 0, cases) for verdict in populated]
+    numbers = [_cases_for(verdict, verdict.additional_cases or 0, cases) for verdict in populated]
     number, largest = max(numbers), populated[numbers.index(max(numbers))]
     text = f"{_needed_text(largest)}, all without a failure, would be enough"
     if largest.population != "all":
@@ -153,7 +153,7 @@ def _needed_text(verdict: Verdict) -> str:
     """Describe the additional cases of the population of a requirement."""
     population = f" of the population of {verdict.requirement_id}" if verdict.population != "all" else ""
     terrain_text = "" if verdict.clustered is None else ", each on a new terrain"
-    return f"{count(verdict.further_cases or 0, 'additional case')}{population}{terrain_text}"
+    return f"{count(verdict.additional_cases or 0, 'additional case')}{population}{terrain_text}"
 
 
 def _cases_for(verdict: Verdict, needed: int, cases: int) -> int:

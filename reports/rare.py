@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from matplotlib.figure import Figure
 
+from marsyard.campaigns.studies.counting import CountingBound
+from marsyard.campaigns.studies.interval import ProbabilityInterval
+from marsyard.campaigns.studies.rare_decision import Basis, ContinuityCheck, Decision
+from marsyard.campaigns.studies.results import RARE, Replicate
+from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.campaigns.studies.subset import LEVEL_FRACTION
 from marsyard.reports.section import (
     MARKERS,
@@ -21,7 +27,6 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.stored import read_study, table
 from marsyard.reports.wording import count, format_fraction
 
 #: Maximum number of replicates in the figure.
@@ -33,67 +38,65 @@ def probability_text(value: object) -> str:
     return f"{value:.2g}" if isinstance(value, int | float) and math.isfinite(value) else "–"
 
 
-def rare_sentences(study: Mapping[str, Any]) -> list[str]:
-    """Describe verdict, counting bound, estimate and cost of a study; empty without a result.
+def rare_sentences(record: Mapping[str, Any]) -> list[str]:
+    """Describe verdict, counting bound, estimate and cost of a study in a record; empty without a result.
 
     The first sentence contains the verdict, the second the counting bound.
     """
-    if not study:
+    study = RARE.read(record)
+    if study is None:
         return []
-    result = study["result"]
-    decision = result["decision"]
-    limit = probability_text(study["max_probability"])
+    parameters, result = study
+    decision, limit = result.decision, probability_text(parameters.max_probability)
     basis = {
-        "counting": ", by counting independent cases",
-        "simulation": ", by the interval of the simulations; it assumes a continuous margin",
-    }.get(str(decision["basis"]), "")
+        Basis.COUNTING: ", by counting independent cases",
+        Basis.SIMULATION: ", by the interval of the simulations; it assumes a continuous margin",
+    }.get(decision.basis, "")
     return [
-        f"{study['requirement']}: {result['verdict']}{basis}.",
-        f"{_counting_sentence(decision['counting'])} The limit is {limit}.",
-        _estimate_sentence(study, decision),
-        *filter(None, [str(decision["reason"]), *_remedies(study, decision)]),
-        f"The study ran {count(int(result['cases']), 'case')}; {int(result['violations']):,} of them violate the "
-        "requirement.",
-        str(result["margin_text"]),
+        f"{parameters.requirement}: {result.verdict}{basis}.",
+        f"{_counting_sentence(decision.counting)} The limit is {limit}.",
+        _estimate_sentence(parameters.method, decision.interval),
+        *filter(None, [decision.reason, *_remedies(decision)]),
+        f"The study ran {count(result.cases, 'case')}; {result.violations:,} of them violate the requirement.",
+        result.margin_text,
     ]
 
 
-def _counting_sentence(counting: Mapping[str, Any]) -> str:
+def _counting_sentence(counting: CountingBound) -> str:
     """Describe the counting bound."""
-    cases, units = int(counting["cases"]), int(counting["units"])
+    cases, units = counting.cases, counting.units
     shared = f" on {count(units, 'terrain')}, which are counted instead of cases" if units < cases else ""
     sentence = (
-        f"Probability of a violation per case by counting: at most {probability_text(counting['upper'])} "
-        f"({format_fraction(counting['upper_confidence'])} confidence), from "
-        f"{count(int(counting['violations']), 'violation')} in {count(cases, 'independent random case')}{shared}."
+        f"Probability of a violation per case by counting: at most {probability_text(counting.upper)} "
+        f"({format_fraction(counting.upper_confidence)} confidence), from "
+        f"{count(counting.violations, 'violation')} in {count(cases, 'independent random case')}{shared}."
     )
-    if counting["lower"] > 0.0:
-        confidence = format_fraction(counting["lower_confidence"])
-        sentence += f" It is at least {probability_text(counting['lower'])} ({confidence} confidence)."
+    if counting.lower > 0.0:
+        confidence = format_fraction(counting.lower_confidence)
+        sentence += f" It is at least {probability_text(counting.lower)} ({confidence} confidence)."
     return sentence
 
 
-def _estimate_sentence(study: Mapping[str, Any], decision: Mapping[str, Any]) -> str:
+def _estimate_sentence(method: str, interval: ProbabilityInterval) -> str:
     """Describe the estimate of the simulations."""
-    interval = decision["interval"]
-    method = "Subset simulation" if study["method"] == "subset" else "Importance sampling"
-    if interval["estimate"] is None:
-        return f"{method} has no estimate."
-    bounds = f"{probability_text(interval['lower'])} to {probability_text(interval['upper'])}"
+    title = "Subset simulation" if method == "subset" else "Importance sampling"
+    if math.isnan(interval.estimate):
+        return f"{title} has no estimate."
+    bounds = f"{probability_text(interval.lower)} to {probability_text(interval.upper)}"
     return (
-        f"{method} estimates {probability_text(interval['estimate'])}, {format_fraction(interval['confidence'])} "
+        f"{title} estimates {probability_text(interval.estimate)}, {format_fraction(interval.confidence)} "
         f"interval {bounds}. The interval assumes that the margin falls continuously to a violation. Fewer cases than "
         "counting needs cannot show this, so that no PASS rests on it."
     )
 
 
-def _remedies(study: Mapping[str, Any], decision: Mapping[str, Any]) -> list[str]:
+def _remedies(decision: Decision) -> list[str]:
     """Describe the additional cases or replicates that would decide the verdict."""
-    random_cases, replicates = decision["additional_random_cases"], decision["additional_replicates"]
+    random_cases, replicates = decision.additional_random_cases, decision.additional_replicates
     sentences = []
     if random_cases:
-        counting = decision["counting"]
-        unit = "random cases" if counting["units"] == counting["cases"] else "random cases, each on a new terrain,"
+        is_case = decision.counting.units == decision.counting.cases
+        unit = "random cases" if is_case else "random cases, each on a new terrain,"
         sentences.append(
             f"PASS needs {random_cases:,} additional {unit} without a violation: "
             f"marsyard append DIR {random_cases} --random."
@@ -108,19 +111,13 @@ def _remedies(study: Mapping[str, Any], decision: Mapping[str, Any]) -> list[str
 
 def rare_section(subject: Subject) -> Section | None:
     """Create the section of a study of rare violations; None for another run."""
-    study = read_study(subject.run.record, "rare")
-    if not study:
+    study = RARE.read(subject.run.record)
+    if study is None:
         return None
-    result = study["result"]
-    replicates = result["replicates"]
+    parameters, result = study
     rows = [
-        [
-            str(index + 1),
-            probability_text(replicate["probability"]),
-            str(len(replicate["thresholds"])),
-            str(replicate["end"]),
-        ]
-        for index, replicate in enumerate(replicates)
+        [str(number), probability_text(replicate.probability), str(len(replicate.thresholds)), replicate.end]
+        for number, replicate in enumerate(result.replicates, start=1)
     ]
     grid = Grid(["Replicate", "Probability", "Levels", "End"], rows)
     note = (
@@ -128,51 +125,47 @@ def rare_section(subject: Subject) -> Section | None:
         "The standard error within one replicate is too small, since its cases are correlated. "
         + (
             "The interval comes from the spread of the replicates."
-            if study["method"] == "subset"
+            if parameters.method == "subset"
             else "The interval contains those of importance sampling around the violations, and of the replicates."
         )
         + " Without an end at violations, the probability is that of the last level."
-        + _continuity_note(table(result["decision"]["continuity"]))
+        + _continuity_note(result.decision.continuity)
     )
     figure = svg_figure(
-        _draw_levels(replicates, float(study["max_probability"])),
+        _draw_levels(result.replicates, parameters.max_probability),
         "rare-levels",
         "Probability that the margin of a case is at most the value on the horizontal axis. Each line is one "
         "replicate; a violation is a margin below 0. Dashed: limit of the probability.",
     )
     blocks = (Block("Replicates", figures=[figure], grid=grid, note=note),)
-    data = {
-        **result,
-        "requirement": study["requirement"],
-        "max_probability": study["max_probability"],
-        "method": study["method"],
-    }
+    names = ("requirement", "max_probability", "method")
+    data = convert_to_json(asdict(result)) | {name: getattr(parameters, name) for name in names}
     return Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
 
 
-def _continuity_note(continuity: Mapping[str, Any]) -> str:
+def _continuity_note(continuity: ContinuityCheck | None) -> str:
     """Describe the violations that were reached without intermediate margins; empty without the check."""
-    if not continuity:
+    if continuity is None:
         return ""
     return (
-        f" Random cases, and levels far above the last one, reached {count(int(continuity['direct']), 'violation')} "
-        f"directly; the interval predicts {continuity['expected_lower']:.2g} to {continuity['expected_upper']:.2g}."
+        f" Random cases, and levels far above the last one, reached {count(continuity.direct, 'violation')} "
+        f"directly; the interval predicts {continuity.expected_lower:.2g} to {continuity.expected_upper:.2g}."
     )
 
 
 @in_page_style
-def _draw_levels(replicates: list[Mapping[str, Any]], max_probability: float) -> Figure:
+def _draw_levels(replicates: Sequence[Replicate], max_probability: float) -> Figure:
     """Draw the probability of a margin at or below the threshold of each level, a line for each replicate.
 
     A replicate that reached a violation also has the point of margin 0: its estimated probability of a violation.
     """
     figure, axes = new_axes(6.0, 3.4)
     for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
-        thresholds = [value for value in replicate["thresholds"] if value is not None]
+        margins = [value for value in replicate.thresholds if math.isfinite(value)]
         # each level contains this fraction of the cases of the previous level
-        probabilities = [LEVEL_FRACTION ** (level + 1) for level in range(len(thresholds))]
-        margins = [*thresholds, 0.0] if replicate["reached"] else thresholds
-        probabilities = [*probabilities, replicate["probability"]] if replicate["reached"] else probabilities
+        probabilities = [LEVEL_FRACTION ** (level + 1) for level in range(len(margins))]
+        if replicate.reached:
+            margins, probabilities = [*margins, 0.0], [*probabilities, replicate.probability]
         style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
         axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
     axes.axhline(max_probability, color=REQUIREMENT, linestyle="--", linewidth=1.0)

@@ -5,44 +5,52 @@ A reduced violation is a violating case in which as few parameters as possible d
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
+from marsyard.campaigns.studies.results import SEARCH, FoundFailure
+from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.reports.section import Block, Grid, Section, Subject
-from marsyard.reports.stored import read_study
 from marsyard.reports.wording import NOTHING, count, number
 
 
-def search_sentences(study: Mapping[str, Any]) -> list[str]:
-    """Describe the result of a search: violations, reduced violations, and cost; empty without a result."""
-    if not study:
+def search_sentences(record: Mapping[str, Any]) -> list[str]:
+    """Describe the result of a search in a record: violations, reduced violations, and cost; empty without a result."""
+    study = SEARCH.read(record)
+    if study is None:
         return []
-    result = study["result"]
-    cases_text = count(int(result["search_cases"]), "case")
-    total_text = f"{count(int(result['cases']), 'case')} in all"
-    if not result["violations"]:
-        margin = number(float(result["min_margin"])) if result.get("min_margin") is not None else NOTHING
-        sentences = [f"{study['requirement']}: no violation in {cases_text}; the smallest margin is {margin}."]
+    parameters, result = study
+    cases_text, total_text = count(result.search_cases, "case"), f"{count(result.cases, 'case')} in all"
+    if not result.violations:
+        text = f"no violation in {cases_text}; the smallest margin is {_margin_text(result.min_margin)}."
     else:
-        violations, n_reduced = count(int(result["violations"]), "violation"), len(result["failures"])
-        sentences = [
-            f"{study['requirement']}: {violations} in {cases_text}, the first after {result['first_violation']}; "
+        violations, n_reduced = count(result.violations, "violation"), len(result.failures)
+        text = (
+            f"{violations} in {cases_text}, the first after {result.first_violation}; "
             f"{count(n_reduced, 'reduced violation')} after {total_text}."
-        ]
-    sentences += [failure_sentence(index, failure) for index, failure in enumerate(result["failures"], start=1)]
-    return [*sentences, *([str(result["reason"])] if result.get("reason") else []), str(result["margin_text"])]
+        )
+    failures = [failure_sentence(index, failure) for index, failure in enumerate(result.failures, start=1)]
+    return [f"{parameters.requirement}: {text}", *failures, *filter(None, [result.reason]), result.margin_text]
 
 
-def failure_sentence(index: int, failure: Mapping[str, Any]) -> str:
+def failure_sentence(index: int, failure: FoundFailure) -> str:
     """Describe a reduced violation: its values, its margin, and how often it repeats."""
-    values = ", ".join(f"{path} = {value_text(value)}" for path, value in failure["values"].items())
-    margin = failure["margin"]
-    margin_text = f"margin {number(float(margin))}" if margin is not None else str(failure["outcome"])
+    margin_text = failure.outcome if math.isnan(failure.margin) else f"margin {number(failure.margin)}"
     return (
-        f"{index}. {values or 'The parameters of the campaign file'}, other parameters not dispersed: {margin_text} "
-        f"(case {failure['case']}); {failure['repeated']} of {failure['repetitions']} repetitions with new random "
+        f"{index}. {_list_values(failure) or 'The parameters of the campaign file'}, other parameters not dispersed: "
+        f"{margin_text} (case {failure.case}); {failure.repeated} of {failure.repetitions} repetitions with new random "
         "streams violate the requirement."
     )
+
+
+def _list_values(failure: FoundFailure) -> str:
+    return ", ".join(f"{path} = {value_text(value)}" for path, value in failure.values.items())
+
+
+def _margin_text(margin: float) -> str:
+    return NOTHING if math.isnan(margin) else number(margin)
 
 
 def value_text(value: object) -> str:
@@ -52,21 +60,21 @@ def value_text(value: object) -> str:
 
 def search_section(subject: Subject) -> Section | None:
     """Create the section of a search; None for a run that is no search."""
-    study = read_study(subject.run.record, "search")
-    if not study:
+    study = SEARCH.read(subject.run.record)
+    if study is None:
         return None
-    result = study["result"]
+    parameters, result = study
     rows = [
         [
             str(index),
-            ", ".join(f"{path} = {value_text(value)}" for path, value in failure["values"].items()) or NOTHING,
-            NOTHING if failure["margin"] is None else number(float(failure["margin"])),
-            number(float(failure["distance"])),
-            str(failure["similar"]),
-            f"{failure['repeated']} of {failure['repetitions']}",
-            str(failure["case"]),
+            _list_values(failure) or NOTHING,
+            _margin_text(failure.margin),
+            number(failure.distance),
+            str(failure.similar),
+            f"{failure.repeated} of {failure.repetitions}",
+            str(failure.case),
         ]
-        for index, failure in enumerate(result["failures"], start=1)
+        for index, failure in enumerate(result.failures, start=1)
     ]
     head = ["", "Parameters", "Margin", "Distance (standard deviations)", "Similar violations", "Repeated", "Case"]
     note = (
@@ -75,6 +83,5 @@ def search_section(subject: Subject) -> Section | None:
         "folder failures, and nightly.toml lists them for nightly runs."
     )
     block = Block("Reduced violations", grid=Grid(head, rows), note=note) if rows else Block(text="No violation.")
-    return Section(
-        "search", "Search", "Search for violations", (block,), {**result, "requirement": study["requirement"]}
-    )
+    data = convert_to_json(asdict(result)) | {"requirement": parameters.requirement}
+    return Section("search", "Search", "Search for violations", (block,), data)

@@ -17,7 +17,7 @@ from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
 from marsyard.campaigns.store.table import check_table
 from marsyard.reports.wording import axis_columns, driver_columns, looks_like_condition, primary_metric
-from marsyard.scenarios.columns import Columns, row_columns
+from marsyard.scenarios.columns import Columns, enabling_columns, row_columns
 from marsyard.sim.files import report_damage
 
 #: Maximum number of cases of which all columns are read. In a larger campaign, all columns are read only for the first
@@ -169,7 +169,8 @@ def _read_rows(path: Path, record: Mapping[str, Any]) -> tuple[pd.DataFrame, pd.
     first_rows = next(file.iter_batches(batch_size=FIRST_CASES)).to_pandas()
     requirements = _read_requirements(record)
     # columns of all cases that verdicts, outcomes and figures use
-    columns = {"case", "outcome", "answered", "terrain", "feasible_overlap", "error", "traceback"}
+    columns = {"case", "outcome", "answered", "terrain", "error", "traceback"}
+    columns.update(column.name for column in enabling_columns(stored_names))
     for requirement in requirements:
         columns.update(
             str(requirement.get("metric", "")).split(" + "), str(requirement.get("population", "")).split(" and ")
@@ -211,12 +212,6 @@ def _sort_rows(frame: pd.DataFrame) -> pd.DataFrame:
     if "case" not in frame or frame["case"].is_monotonic_increasing:
         return frame
     return frame.sort_values("case", kind="stable").reset_index(drop=True)
-
-
-def read_study(record: Mapping[str, Any], kind: str) -> Mapping[str, Any]:
-    """Return the parameters of a study of a kind with its `result`; empty for another run, or without a result."""
-    study = table(record.get("study"))
-    return study if study.get("kind") == kind and table(study.get("result")) else {}
 
 
 def table(value: object) -> Mapping[str, Any]:

@@ -56,7 +56,7 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
             f"{verdict.failures} of {verdict.n}",
             percent(verdict.estimate),
             NOTHING if math.isnan(verdict.lower) else f"≥ {percent(verdict.lower)}\n≤ {percent(verdict.upper)}",
-            NOTHING if verdict.further_cases is None else str(verdict.further_cases),
+            NOTHING if verdict.additional_cases is None else str(verdict.additional_cases),
         )
     if not verdicts:
         table.add_row(Text("no requirement"), "", "", "", "", "")

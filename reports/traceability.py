@@ -92,7 +92,7 @@ _EVIDENCE_COLUMNS = {
     "verdict": "status", "metric": "metric", "bound": "bound", "population": "population", "probability": "probability",
     "confidence": "confidence", "decided_by": "decide_by", "cases": "n", "failures": "failures", "terrains": "terrains",
     "rate": "estimate", "lower_bound": "lower", "upper_bound": "upper",
-    "consumer_risk": "consumer_risk", "further_cases": "further_cases", "note": "note",
+    "consumer_risk": "consumer_risk", "additional_cases": "additional_cases", "note": "note",
 }  # fmt: skip
 #: Columns of the result on all cases, and its fields.
 _ALL_CASES_COLUMNS = {"all_cases": "n", "all_failures": "failures", "all_rate": "estimate", "all_verdict": "status"}

@@ -80,7 +80,7 @@ class Verdict:
       probability, INSUFFICIENT for fewer cases than `min_cases_for_rate`, otherwise MET BY RATE
     - failures: cases with a missing, NaN or too large metric, unfinished cases, cases with a missing population flag
     - estimate, lower, upper: success rate and its one-sided bounds; NaN for no cases; no bounds for other designs
-    - further_cases: additional cases without failure for PASS, on new terrains if terrains are shared; None if unknown
+    - additional_cases: those without failure for PASS, on new terrains if terrains are shared; None if unknown
     - consumer_risk: probability of this result or a better one if the true rate equals the required rate
     - reason: why the requirement is not evaluated, or why the verdict is withheld
     - advice: why more cases cannot lead to PASS, and which change of the campaign can
@@ -108,7 +108,7 @@ class Verdict:
     estimate: Number = math.nan
     lower: Number = math.nan
     upper: Number = math.nan
-    further_cases: int | None = None
+    additional_cases: int | None = None
     decide_by: str = "confidence"
     reason: str = ""
     terrains: int | None = None
@@ -130,7 +130,7 @@ class Verdict:
 
     def withhold(self, reason: str) -> Verdict:
         """Return the verdict INSUFFICIENT for a reason that more cases cannot change."""
-        return replace(self, status=Status.INSUFFICIENT, reason=reason, further_cases=None)
+        return replace(self, status=Status.INSUFFICIENT, reason=reason, additional_cases=None)
 
     @property
     def plain_status(self) -> Status | None:
@@ -183,8 +183,8 @@ class Verdict:
         text += ". The bounds hold for every distribution of failure rates over terrains."
         if self.plain_status is not None and self.plain_status is not self.status:
             text += f" For independent cases the lower bound would be {percent(self.plain_lower)}: {self.plain_status}."
-        if self.further_cases and self.decide_by != ESTIMATE:
-            cases = count(self.further_cases, "additional case")
+        if self.additional_cases and self.decide_by != ESTIMATE:
+            cases = count(self.additional_cases, "additional case")
             text += f" {cases} without a failure, each on a new terrain, would lead to PASS."
         return text
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from pydantic import BaseModel
 
@@ -16,6 +16,14 @@ ParametersType = TypeVar("ParametersType", bound=BaseModel)
 
 #: Function that loads a terrain by site, terrain parameters, seed of the bank, and number of the terrain in the bank.
 LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
+
+
+class BankLocation(Protocol):
+    """Terrain of a bank: number of terrains in the bank, its seed, and number of the terrain in it, from 0."""
+
+    bank: int
+    bank_seed: int
+    terrain: int
 
 
 class BaseScenario(Generic[ParametersType]):
@@ -50,9 +58,10 @@ class TerrainScenario(BaseScenario[ParametersType]):
     def __init__(self, max_cached_grounds: int = 0) -> None:
         self.load_ground: LoadGround = lru_cache(maxsize=max_cached_grounds)(SiteGround.from_bank)
 
-    def location(self, p: Any) -> Any:
-        """Return the parameters with size of the bank, number of the terrain, and seed of the bank."""
-        return p.location
+    def location(self, p: ParametersType) -> BankLocation:
+        """Return the terrain of the parameters; by default their table `location`."""
+        location: BankLocation = p.location  # type: ignore[attr-defined]
+        return location
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
         """Return the numbers of the bank's terrains; empty for a large bank, whose terrains are built by the cases."""

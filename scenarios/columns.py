@@ -7,7 +7,7 @@ The engine adds its own columns (`ENGINE`) and the sampled values of the case, e
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
@@ -71,6 +71,7 @@ class Column:
     - meaning: noun phrase; for a flag, a clause
     - label: the quantity in words, for axes and tables, with the stars of the name; by default the words of the name
     - population: phrase after "cases" for the cases with a true flag; by default the clause
+    - enables_answer: whether an algorithm can answer only in the cases with a true flag
     """
 
     name: str
@@ -79,6 +80,7 @@ class Column:
     label: str = ""
     population: str = ""
     type: type[float | bool | str] = float
+    enables_answer: bool = False
 
     @property
     def unit(self) -> str:
@@ -136,16 +138,19 @@ def text(name: str, meaning: str, kind: Kind = Kind.CONDITION) -> Column:
 
 
 #: Columns of the engine in every row.
-ENGINE = (
+#: The first columns of a row, and the last ones.
+LEADING = (
     Column("case", Kind.PROVENANCE, "number of the case"),
     text("outcome", "outcome of the answer, or reason of the failure", Kind.OUTCOME),
     flag("answered", "an answer is given", "with an answer"),
+)
+TRAILING = (
     Column("wall_time_s", Kind.PROVENANCE, "wall-clock time of the case"),
     Column("cpu_time_s", Kind.PROVENANCE, "processor time of the case"),
     text("error", "message of a failure", Kind.OUTCOME),
     text("traceback", "traceback of a failure", Kind.OUTCOME),
-    text("standard_point", "point of a study at which the case was run", Kind.PROVENANCE),
 )
+ENGINE = (*LEADING, *TRAILING, text("standard_point", "point of a study at which the case was run", Kind.PROVENANCE))
 
 
 @dataclass(frozen=True)
@@ -229,6 +234,11 @@ def _all_columns() -> Columns:
 def find_column(name: str) -> Column | None:
     """Return the declaration of a column of any scenario; None if there is none."""
     return _all_columns().find(name)
+
+
+def enabling_columns(names: Iterable[str]) -> list[Column]:
+    """Return the declarations of the flags without which an algorithm cannot answer, among columns given by name."""
+    return [column for name in names if (column := find_column(name)) is not None and column.enables_answer]
 
 
 @cache

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from marsyard.scenarios.objects import SUFFIX, load_object
+from marsyard.scenarios.stored_objects import SUFFIX, load_object
 
 
 def search_current_folder() -> None:

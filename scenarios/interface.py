@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from marsyard.sim.streams import Streams
 
 if TYPE_CHECKING:
-    from marsyard.scenarios.estimators import Task
     from marsyard.scenarios.parts.named import PartKind
+    from marsyard.scenarios.tasks import Task
 
 #: Value of a column of the results.
 Scalar = float | int | str | bool

@@ -13,13 +13,13 @@ from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchS
 from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
-from marsyard.scenarios.estimators import Task, variants
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.offline import SITE_FORMAT
+from marsyard.scenarios.offline_algorithms import SITE_FORMAT
+from marsyard.scenarios.tasks import Task, variants
 
 LANDING: Task[SiteEstimator, HdaOptions] = Task(
     name="landing",
-    what="estimator of landing sites",
+    noun="estimator of landing sites",
     methods=("estimate",),
     answers=(SiteEstimate, SiteOutcome),
     shipped={

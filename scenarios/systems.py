@@ -48,7 +48,7 @@ class System:
     - title: title in reports
     - summary: one sentence on the tests
     - scenarios: classes that implement `marsyard.scenarios.interface.Scenario`, by the names in campaign files
-    - tasks: each a `marsyard.scenarios.estimators.Task`: the published algorithm, the baselines, and the accepted forms
+    - tasks: each a `marsyard.scenarios.tasks.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
     - folder: its files: campaigns in the folder `catalogue`, and the requirements that campaigns reference by id in
       `requirements.toml` (docs/reports.md)
@@ -97,25 +97,38 @@ def own_paths() -> dict[str, str]:
     return {folder: f"marsyard.scenarios.{folder}.system:SYSTEM" for folder in folders}
 
 
+@dataclass(frozen=True)
+class Registry:
+    """Systems of this installation: those of Marsyard by folder, those of other packages by name, and problems.
+
+    problems: one message for each system that is omitted
+    """
+
+    own: tuple[System, ...]
+    plugins: tuple[System, ...]
+    problems: tuple[str, ...]
+
+
 @cache
-def registry() -> tuple[tuple[System, ...], tuple[str, ...]]:
-    """Read the systems of this installation, once per process; also return one message for each omitted system."""
-    paths = [*own_paths().items()]
-    points = sorted((point.name, point.value) for point in entry_points(group=GROUP))
-    paths += [(name, path) for name, path in points if path not in own_paths().values()]
-    loaded_systems: list[System] = []
+def registry() -> Registry:
+    """Read the systems of this installation, once per process."""
+    own: list[System] = []
+    plugins: list[System] = []
     problems: list[str] = []
-    for name, path in paths:
-        try:
-            loaded_systems.append(_load(path, loaded_systems))
-        except ValueError as error:
-            problems.append(f"system '{name}' ({path}) is omitted: {error}")
-    return tuple(loaded_systems), tuple(problems)
+    points = sorted((point.name, point.value) for point in entry_points(group=GROUP))
+    others = [(name, path) for name, path in points if path not in own_paths().values()]
+    for group, paths in ((own, own_paths().items()), (plugins, others)):
+        for name, path in paths:
+            try:
+                group.append(_load(path, [*own, *plugins]))
+            except ValueError as error:
+                problems.append(f"system '{name}' ({path}) is omitted: {error}")
+    return Registry(tuple(own), tuple(plugins), tuple(problems))
 
 
 def systems() -> tuple[System, ...]:
     """Return all systems: those of Marsyard by folder, then those of other packages by name."""
-    return registry()[0]
+    return (*registry().own, *registry().plugins)
 
 
 def catalogue() -> dict[str, Path]:
@@ -125,7 +138,7 @@ def catalogue() -> dict[str, Path]:
 
 def problems() -> tuple[str, ...]:
     """Return one message for each system that is omitted."""
-    return registry()[1]
+    return registry().problems
 
 
 def scenario_paths() -> Mapping[str, str]:

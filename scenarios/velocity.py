@@ -16,14 +16,15 @@ from marsyard.algorithms import exchange
 from marsyard.algorithms.answers import check_and_set_span
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesOptions, dimes_products
 from marsyard.algorithms.dimes.baselines import HomographyEstimator, PhaseCorrelationEstimator
+from marsyard.algorithms.dimes.binning import check_binning
 from marsyard.algorithms.dimes.options import IMPROVEMENTS
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityEstimator, VelocityOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.estimators import Task, variants
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.offline import VELOCITY_FORMAT, CaseExporter, RecordedAnswer
+from marsyard.scenarios.offline_algorithms import VELOCITY_FORMAT, CaseExporter, RecordedAnswer
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
+from marsyard.scenarios.tasks import AlgorithmSelection, Task, variants
 from marsyard.sim.measurements import DescentMeasurements
 
 Horizontal = Float64[np.ndarray, "2"]
@@ -36,7 +37,7 @@ _FIRST_TRIPLE: ImageTriple = (0, 1, 2)
 
 VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     name="velocity",
-    what="velocity estimator",
+    noun="velocity estimator",
     methods=("estimate",),
     answers=(VelocityEstimate, VelocityOutcome),
     shipped={
@@ -52,6 +53,12 @@ VELOCITY: Task[VelocityEstimator, DimesOptions] = Task(
     offline=VELOCITY_FORMAT,
     accepts_streams=True,
 )
+
+
+def check_image_size(p: AlgorithmSelection, size: tuple[int, int]) -> None:
+    """Raise ValueError if DIMES is selected and cannot bin images of this size (columns, rows)."""
+    if any(name.startswith("dimes") for name in p.algorithms):
+        check_binning(p.options.binned_size, size)
 
 
 def run_estimator(

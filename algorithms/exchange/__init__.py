@@ -7,7 +7,7 @@ from marsyard.algorithms.exchange.executable import (
     ExecutableTargetTracker,
 )
 from marsyard.algorithms.exchange.files import (
-    FORMAT_VERSION,
+    EXCHANGE_VERSION,
     ImageFormat,
     read_case,
     read_frame,
@@ -22,7 +22,7 @@ from marsyard.algorithms.exchange.forms import SITE_FORM, VELOCITY_FORM, AnswerF
 from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, parse_command
 from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 
-__all__ = ["FORMAT_VERSION", "PREFIXES", "SITE_FORM", "SITE_REQUESTS", "VELOCITY_FORM", "VELOCITY_REQUESTS"]
+__all__ = ["EXCHANGE_VERSION", "PREFIXES", "SITE_FORM", "SITE_REQUESTS", "VELOCITY_FORM", "VELOCITY_REQUESTS"]
 __all__ += ["VELOCITY_STREAM", "AnswerForm", "Command", "ExecutableAlgorithm", "ExecutableLimits"]
 __all__ += ["ExecutableTargetTracker", "ImageFormat", "ProgramDetails", "StreamForm", "answer_time_s", "parse_command"]
 __all__ += ["read_case", "read_frame", "read_mast", "read_pose", "read_stop"]

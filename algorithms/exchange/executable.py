@@ -13,7 +13,7 @@ from typing import Any
 
 from marsyard.algorithms import interface
 from marsyard.algorithms.answers import check_aim, check_update
-from marsyard.algorithms.exchange.files import encode_pose, write_case, write_mast, write_stop
+from marsyard.algorithms.exchange.files import encode_rover_pose, write_case, write_mast, write_stop
 from marsyard.algorithms.exchange.forms import (
     SITE_FORM,
     VELOCITY_FORM,
@@ -161,12 +161,8 @@ def _read_update(
 #: Requests of the tasks' programs, by method.
 VELOCITY_REQUESTS, SITE_REQUESTS = _estimate_requests(VELOCITY_FORM), _estimate_requests(SITE_FORM)
 TRACKER_REQUESTS: Mapping[str, Request] = {
-    "designate": Request(
-        lambda target, pose: {"target": encode(target), "world_from_rover": encode_pose(pose)}, _read_state
-    ),
-    "aim": Request(
-        lambda pose, mast: {"world_from_rover": encode_pose(pose), "mast": KeptFolder(mast, write_mast)}, _read_aim
-    ),
+    "designate": Request(lambda target, pose: {"target": encode(target), **encode_rover_pose(pose)}, _read_state),
+    "aim": Request(lambda pose, mast: {**encode_rover_pose(pose), "mast": KeptFolder(mast, write_mast)}, _read_aim),
     "update": Request(
         lambda stop: {"mast": KeptFolder(stop.mast, write_mast), "stop": lambda folder: write_stop(folder, stop)},
         _read_update,

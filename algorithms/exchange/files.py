@@ -17,11 +17,10 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt16
-from scipy.spatial.transform import RigidTransform, Rotation
+from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.exchange.values import decode, encode
+from marsyard.algorithms.exchange.values import decode, decode_pose, encode, encode_pose
 from marsyard.sim.camera import BODY_FRAME, HEAD_FRAME, read_cahvor, write_cahvor
-from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import (
     DescentFrame,
     DescentMeasurements,
@@ -38,16 +37,17 @@ from marsyard.sim.measurements import (
     TargetDesignation,
 )
 
-#: Version of the exchange file format.
-FORMAT_VERSION = 1
-#: Supported versions of request lines and answers. From version 2 a request has an `id`, and its answer the same `id`.
-ANSWER_VERSIONS = (1, 2)
+#: Version of the exchange: of files, request lines and answers.
+EXCHANGE_VERSION = 3
 
 #: JSON files of a case and of a single descent image.
 CASE_FILE, IMAGE_FILE = "case.json", "image.json"
 
 #: Fields of `DetectorCalibration` except the flat field.
 _CALIBRATION_KEYS = tuple(field.name for field in fields(DetectorCalibration) if field.name != "flat_field")
+
+#: Key of the pose of a rover.
+_ROVER = "world_from_rover"
 
 #: Image file format.
 ImageFormat = Literal["pgm", "png"]
@@ -59,14 +59,14 @@ def write_case(
     """Write the measurements of a case into an existing folder. Raises OSError if that fails."""
     task = "velocity" if isinstance(measurements, DescentMeasurements) else "landing"
     images = write_images(folder, measurements.images, image_format)
-    content = {"exchange": FORMAT_VERSION, "task": task, **encode(measurements, ["images"]), "images": images}
+    content = {"exchange": EXCHANGE_VERSION, "task": task, **encode(measurements, ["images"]), "images": images}
     write_json(folder / CASE_FILE, content)
 
 
 def write_image(folder: Path, image: DetectorImage, content: Mapping[str, Any] | None = None) -> None:
     """Write one image and further values into an existing folder. Raises OSError if that fails."""
     (record,) = write_images(folder, [image], "pgm")
-    write_json(folder / IMAGE_FILE, {"exchange": FORMAT_VERSION, "image": record, **(content or {})})
+    write_json(folder / IMAGE_FILE, {"exchange": EXCHANGE_VERSION, "image": record, **(content or {})})
 
 
 def write_frame(folder: Path, frame: DescentFrame) -> None:
@@ -76,15 +76,22 @@ def write_frame(folder: Path, frame: DescentFrame) -> None:
 
 def read_detector_image(folder: Path) -> DetectorImage:
     """Read the image that `write_image` wrote. Raises ValueError if it is missing or has another version."""
-    with open_json(folder / IMAGE_FILE, "descent image") as content:
-        check_version(content)
-        return read_image(folder, content["image"])
+    with _open_image(folder) as (image, _):
+        return image
 
 
 def read_frame(folder: Path) -> DescentFrame:
     """Read the frame that `write_frame` wrote. Raises ValueError if it is missing or has another version."""
+    with _open_image(folder) as (image, content):
+        return decode(DescentFrame, content, image=image)
+
+
+@contextmanager
+def _open_image(folder: Path) -> Iterator[tuple[DetectorImage, Mapping[str, Any]]]:
+    """Yield the image that `write_image` wrote, and the table of its further values."""
     with open_json(folder / IMAGE_FILE, "descent image") as content:
-        return decode(DescentFrame, content, image=read_detector_image(folder))
+        check_version(content)
+        yield read_image(folder, content["image"]), content
 
 
 def read_case(folder: Path) -> DescentMeasurements | LandingMeasurements:
@@ -113,8 +120,8 @@ def open_json(path: Path, kind: str) -> Iterator[Mapping[str, Any]]:
 
 def check_version(content: Mapping[str, Any]) -> None:
     """Raise ValueError if the table of a file has another version."""
-    if content["exchange"] != FORMAT_VERSION:
-        raise ValueError(f"exchange format version {content['exchange']} is not supported; supported: {FORMAT_VERSION}")
+    if content["exchange"] != EXCHANGE_VERSION:
+        raise ValueError(f"exchange version {content['exchange']} is not supported; supported: {EXCHANGE_VERSION}")
 
 
 def write_images(folder: Path, images: Sequence[DetectorImage], image_format: ImageFormat) -> list[dict[str, Any]]:
@@ -197,7 +204,7 @@ def read_mast(folder: Path) -> MastCalibration:
 def write_stop(folder: Path, measurements: RoverMeasurements) -> None:
     """Write the images and mast angles measured at one rover stop (imaging position), without the mast calibration."""
     content: dict[str, Any] = {name: getattr(measurements, name) for name in ("azimuth_rad", "elevation_rad")}
-    content["world_from_rover"] = encode_pose(measurements.world_from_rover)
+    content |= encode_rover_pose(measurements.world_from_rover)
     for name, image in (("left", measurements.left), ("right", measurements.right)):
         write_counts(folder / f"{name}.pgm", image.counts)
         rows, columns = image.counts.shape
@@ -213,19 +220,17 @@ def read_stop(folder: Path, mast: MastCalibration) -> RoverMeasurements:
             for record in (content["left"], content["right"])
         )
         azimuth, elevation = float(content["azimuth_rad"]), float(content["elevation_rad"])
-        return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content["world_from_rover"]))
+        return RoverMeasurements(left, right, mast, azimuth, elevation, read_pose(content[_ROVER]))
 
 
-def encode_pose(pose: RigidTransform) -> dict[str, Any]:
-    """Encode the pose of a rover for JSON: position in the world and unit quaternion, scalar last."""
-    position, quaternion = np.asarray(pose.translation).tolist(), pose.rotation.as_quat().tolist()
-    return {"position_world_m": position, "world_from_rover_xyzw": quaternion}
+def encode_rover_pose(pose: RigidTransform) -> dict[str, dict[str, Any]]:
+    """Encode the pose of a rover as a table of a request or file."""
+    return {_ROVER: encode_pose(_ROVER, pose)}
 
 
 def read_pose(content: Mapping[str, Any]) -> RigidTransform:
-    """Decode a pose that `encode_pose` encoded."""
-    position = np.array(content["position_world_m"], dtype=np.float64)
-    return rigid(Rotation.from_quat(content["world_from_rover_xyzw"]), position)
+    """Decode the table of a rover's pose."""
+    return decode_pose(_ROVER, content)
 
 
 def read_target(content: Mapping[str, Any]) -> TargetDesignation:

@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from marsyard.algorithms.answers import check_site, check_velocity
-from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
+from marsyard.algorithms.exchange.files import EXCHANGE_VERSION
 from marsyard.algorithms.exchange.process import shorten
 from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
@@ -71,10 +71,9 @@ class AnswerForm(Generic[Answer]):
 
 
 def check_keys(answer: Mapping[str, Any], allowed: set[str]) -> None:
-    """Raise AlgorithmError (BAD_ANSWER) for an unsupported version of the exchange format or an unknown key."""
-    if type(answer.get("exchange")) is not int or answer["exchange"] not in ANSWER_VERSIONS:
-        versions = ", ".join(map(str, ANSWER_VERSIONS))
-        raise bad_answer(f"the answer's exchange is {answer.get('exchange')!r}; allowed: {versions}")
+    """Raise AlgorithmError (BAD_ANSWER) for another version of the exchange or an unknown key."""
+    if type(answer.get("exchange")) is not int or answer["exchange"] != EXCHANGE_VERSION:
+        raise bad_answer(f"the answer's exchange is {answer.get('exchange')!r}; allowed: {EXCHANGE_VERSION}")
     keys = allowed | {"exchange"}
     if unknown := sorted(set(answer) - keys):
         raise bad_answer(f"the answer has an unknown key '{unknown[0]}'; allowed: {', '.join(sorted(keys))}")

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marsyard.algorithms.exchange.files import ANSWER_VERSIONS
+from marsyard.algorithms.exchange.files import EXCHANGE_VERSION
 from marsyard.algorithms.exchange.process import (
     Command,
     ExecutableLimits,
@@ -54,12 +54,10 @@ def parse_object(output: Output) -> Mapping[str, Any]:
 class Server:
     """Running program that has written its greeting line.
 
-    - version: Version of the exchange format in the greeting, one of `ANSWER_VERSIONS`
     - request_count: Number of requests sent, which is the `id` of the last request
     """
 
     child: RunningProgram
-    version: int
     request_count: int = 0
 
     def send_request(self, request: Mapping[str, Any], time_s: float | None = None) -> tuple[Mapping[str, Any], Output]:
@@ -70,19 +68,19 @@ class Server:
         is ended and AlgorithmError raised.
         """
         self.request_count += 1
-        id_field = {"id": self.request_count} if self.version > 1 else {}
-        line = json.dumps({"exchange": self.version, **id_field, **request}, allow_nan=False)
+        header = {"exchange": EXCHANGE_VERSION, "id": self.request_count}
+        line = json.dumps({**header, **request}, allow_nan=False)
         output = self.child.read_line(line, time_s)
         try:
             answer = parse_object(output)
-            for key, expected in {"exchange": self.version, **id_field}.items():
+            for key, expected in header.items():
                 if type(answer.get(key)) is not int or answer[key] != expected:
                     message = f"the answer's {key} is {answer.get(key)!r}; allowed: {expected}, as in the request"
                     raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
         except AlgorithmError:
             self.child.stop()
             raise
-        return {key: value for key, value in answer.items() if key not in id_field}, output
+        return {key: value for key, value in answer.items() if key != "id"}, output
 
 
 #: Idle persistent programs by command and limits.
@@ -100,17 +98,14 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
     child = command.start(limits)
     output = child.read_line(time_s=child.loading_s)
     try:
-        greeting = dict(parse_object(output))
-        version = greeting.get("exchange")
-        is_ready = greeting == {"exchange": version, "ready": True}
-        if type(version) is not int or version not in ANSWER_VERSIONS or not is_ready:
-            expected = f'{{"exchange": {ANSWER_VERSIONS[-1]}, "ready": true}}'
-            message = f"its first line is {shorten(output.stdout)}; expected {expected}"
+        expected = {"exchange": EXCHANGE_VERSION, "ready": True}
+        if parse_object(output) != expected:
+            message = f"its first line is {shorten(output.stdout)}; expected {json.dumps(expected)}"
             raise AlgorithmError(Fault.BAD_ANSWER, message, output.stderr)
     except AlgorithmError:
         child.stop()
         raise
-    return Server(child, version)
+    return Server(child)
 
 
 def release_server(command: Command, limits: ExecutableLimits, server: Server) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from marsyard.algorithms.exchange.executable import Request
-from marsyard.algorithms.exchange.files import ANSWER_VERSIONS, read_frame, write_frame
+from marsyard.algorithms.exchange.files import EXCHANGE_VERSION, read_frame, write_frame
 from marsyard.algorithms.exchange.forms import VELOCITY_FORM, AnswerForm, ProgramDetails, check_keys
 from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.faults import bad_answer
@@ -62,13 +62,14 @@ class StreamForm(Generic[Answer]):
 
         The stream's own output goes to standard error. Its exceptions end the program.
         """
-        version, output = ANSWER_VERSIONS[-1], sys.stdout if answers is None else answers
-        print(json.dumps({"exchange": version, "ready": True}), file=output, flush=True)
+        output = sys.stdout if answers is None else answers
+        print(json.dumps({"exchange": EXCHANGE_VERSION, "ready": True}), file=output, flush=True)
         with redirect_stdout(sys.stderr):
             for line in sys.stdin if requests is None else requests:
                 request = json.loads(line)
                 answer = self.answer.encode(self._call(stream, request))
-                print(json.dumps({"exchange": version, "id": request["id"], **answer}), file=output, flush=True)
+                line = json.dumps({"exchange": EXCHANGE_VERSION, "id": request["id"], **answer})
+                print(line, file=output, flush=True)
 
     def _call(self, stream: Any, request: Mapping[str, Any]) -> Answer | None:
         """Call the stream's method of a request, if it has it. Raises ValueError for an unknown request."""

@@ -27,13 +27,22 @@ def encode(item: Any, excluded: Collection[str] = ()) -> dict[str, Any]:
     for name in (field.name for field in fields(item) if field.name not in excluded):
         value = getattr(item, name)
         if isinstance(value, RigidTransform):
-            content[_POSITION] = np.asarray(value.translation).tolist()
-            value = value.rotation
-        if isinstance(value, Rotation):
+            content |= encode_pose(name, value)
+        elif isinstance(value, Rotation):
             content[name + _ROTATION] = value.as_quat().tolist()
         elif value is not None:
             content[name] = _encode_value(value)
     return content
+
+
+def encode_pose(name: str, pose: RigidTransform) -> dict[str, Any]:
+    """Encode a pose: its position in the world, and the unit quaternion of its rotation under its name."""
+    return {_POSITION: np.asarray(pose.translation).tolist(), name + _ROTATION: pose.rotation.as_quat().tolist()}
+
+
+def decode_pose(name: str, content: Mapping[str, Any]) -> RigidTransform:
+    """Decode a pose that `encode_pose` encoded."""
+    return rigid(Rotation.from_quat(content[name + _ROTATION]), np.array(content[_POSITION], dtype=np.float64))
 
 
 def _encode_value(value: Any) -> Any:
@@ -54,9 +63,9 @@ def decode(kind: type[Item], content: Mapping[str, Any], **given: Any) -> Item:
     values, types = dict(given), get_type_hints(kind)
     for name in (field.name for field in fields(kind) if field.name not in given):  # type: ignore[arg-type]
         if name + _ROTATION in content:
-            rotation = Rotation.from_quat(content[name + _ROTATION])
             is_pose = types[name] is RigidTransform
-            values[name] = rigid(rotation, np.array(content[_POSITION], np.float64)) if is_pose else rotation
+            rotation = decode_pose(name, content) if is_pose else Rotation.from_quat(content[name + _ROTATION])
+            values[name] = rotation
         elif name in content:
             values[name] = _decode_value(types[name], content[name])
     return kind(**values)

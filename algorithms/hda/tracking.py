@@ -21,11 +21,9 @@ from marsyard.algorithms.image.registration import RegistrationLimits, register_
 #: Half width of the search window at all levels except the coarsest; minimum half width of all templates and windows
 #: (Eq. 5), pixels.
 MIN_HALF_PX = 2
-#: Largest template at a pyramid level, as a fraction of the shorter side of the image. At level 6 an image of 640 x 480
-#: pixels has 10 x 7: a template of 5 x 5 has only three vertical positions, which cover displacements of up to 128 px,
-#: and templates of different features are nearly the same. Of 25 pairs of the calibration seed of hda-limits within the
-#: limits of the paper, 4 have 90 % of their features tracked from level 6, 6 from level 5, 12 from level 4 (30 rows), 8
-#: from level 3 and 2 from level 2, where wrong peaks in the large window are more frequent.
+#: Maximum size of the template at a pyramid level, as a fraction of the shorter image side. A larger template has
+#: only a few positions in the image (three at level 6 of 640 x 480 pixels), which cover large displacements, and
+#: templates of different features are nearly the same. Without coarse levels, the larger window has more wrong peaks.
 MAX_TEMPLATE_FRACTION = 0.25
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.exchange.files import (
-    FORMAT_VERSION,
+    EXCHANGE_VERSION,
     check_version,
     open_json,
     read_detector_image,
@@ -38,7 +38,7 @@ _MAX_NORM_ERROR = 1e-3
 def write_map(folder: Path, map_product: MapProduct) -> None:
     """Write a map into an existing folder: two rasters of little-endian float32, row by row, and a table."""
     rows, columns = map_product.appearance.shape
-    content: dict[str, Any] = {"exchange": FORMAT_VERSION, "rows": rows, "columns": columns}
+    content: dict[str, Any] = {"exchange": EXCHANGE_VERSION, "rows": rows, "columns": columns}
     for name, raster in (("appearance", map_product.appearance), ("elevation", map_product.elevation_m)):
         content[name] = f"{name}.f32"
         raster.astype("<f4").tofile(folder / content[name])

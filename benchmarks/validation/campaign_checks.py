@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.validation.chaos import FAULTS, ChaosParameters, draw_fault
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store.table import read_rows

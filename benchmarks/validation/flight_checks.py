@@ -14,8 +14,8 @@ import numpy as np
 import marsyard
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes.details import TRACK_COLUMNS
-from marsyard.cli.images import ImageRequest, render_images
 from marsyard.sim.image_statistics import ImageStatistics, compute_image_statistics
+from marsyard.site_images import ImageRequest, render_images
 
 #: Altitudes of two of Spirit's descent images, metres.
 ALTITUDES_M = (1433.0, 1983.0)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from marsyard.scenarios.algorithm_run import InputCopy
+from marsyard.scenarios.input_copies import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.sim.streams import Streams
 

@@ -9,12 +9,14 @@ import numpy as np
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
-from marsyard.scenarios.exposure import camera_optics
+from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.images import GroundTruth, LandingWorld, measure, take_images
+from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.images import measure, take_images
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import map_row, motion_row
+from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.sim.sensor import DetectorParameters, LaserParameters, preset
 from marsyard.sim.streams import Streams
 

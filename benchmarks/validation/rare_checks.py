@@ -21,8 +21,8 @@ from marsyard.campaigns.studies.interval import (
     replicate_interval,
     weighted_interval,
 )
-from marsyard.campaigns.studies.rare import RareParameters
 from marsyard.campaigns.studies.rare_decision import MIN_EFFECTIVE_VIOLATIONS
+from marsyard.campaigns.studies.results import RareParameters
 from marsyard.campaigns.studies.subset import SubsetResult
 from marsyard.sim.streams import Blend
 

@@ -16,8 +16,9 @@ from benchmarks.validation.limit_states import KnownState, discontinuous_states,
 from benchmarks.validation.records import Check, Measure
 from marsyard.campaigns.studies.counting import find_units_needed
 from marsyard.campaigns.studies.interval import replicate_interval
-from marsyard.campaigns.studies.rare import MIN_PROBABILITY_FRACTION, RareParameters
+from marsyard.campaigns.studies.rare import MIN_PROBABILITY_FRACTION
 from marsyard.campaigns.studies.rare_decision import Decision, RareSample, RareVerdict, decide_rare
+from marsyard.campaigns.studies.results import RareParameters
 from marsyard.campaigns.studies.subset import SubsetResult
 
 #: Parameters of `marsyard rare` without options, and its one-sided risk of a wrong verdict.

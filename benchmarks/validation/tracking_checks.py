@@ -17,8 +17,8 @@ from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.rover.closed_loop import RoverRun, run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import RoverRun, run_case
 from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score_run
 from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
@@ -152,14 +152,14 @@ def _simulate_designation(number: int, camera: str) -> tuple[float, float] | Non
 def _range_error_m(run: RoverRun) -> float:
     """First reported position minus the designated point, along the line of sight."""
     stop = run.stops[0]
-    eye = stop.stance.world_from_rover.inv().apply(run.rig.camera_positions(stop.world_from_head)[0])
+    eye = stop.stance.world_from_rover.inv().apply(run.setup.rig.camera_positions(stop.world_from_head)[0])
     line_of_sight = (stop.point_rover - eye) / np.linalg.norm(stop.point_rover - eye)
     return float(stop.error_m() @ line_of_sight)
 
 
 def _expected_range_error_m(run: RoverRun, disparity_error_px: float) -> float:
     """Compute the range error of the first pair by Eq. 1 of the tracking paper, metres."""
-    rig = run.rig.calibrated
+    rig = run.setup.rig.calibrated
     return stereo_range_error_m(run.stops[0].range_m, disparity_px_m(rig.left, rig.right), 1.0, disparity_error_px)
 
 

@@ -1,7 +1,7 @@
 """A campaign and the parameters of each of its cases: the campaign's parameters with the case's sampled values.
 
 A path is the dotted path of a parameter in nested tables and lists, such as `wind.east_m_s`. A study evaluates cases at
-points that it chooses (`marsyard.campaigns.sampling.points`).
+points that it chooses (`marsyard.campaigns.sampling.study_points`).
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from marsyard.campaigns.sampling.design import (
     correlate_uniform,
     locate_case,
 )
-from marsyard.campaigns.sampling.dispersion import Dispersion
+from marsyard.campaigns.sampling.dispersion_base import Dispersion
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, GridDispersion, Normal
-from marsyard.campaigns.sampling.points import StudyPoint, transform_to_uniform
+from marsyard.campaigns.sampling.study_points import StudyPoint, transform_to_uniform
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.interface import Scenario
 from marsyard.sim.parameters import stream_name

@@ -16,9 +16,9 @@ from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
 from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag, row_columns
-from marsyard.scenarios.estimators import labels
 from marsyard.scenarios.interface import HasParts
 from marsyard.scenarios.parts.named import SCORE
+from marsyard.scenarios.tasks import labels
 
 #: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
 _CHECKED_CASES = 32

@@ -25,12 +25,12 @@ from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
-from marsyard.scenarios.estimators import algorithm_sources, custom_path, describe_custom
 from marsyard.scenarios.imports import relative_to, source_files
 from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
 from marsyard.scenarios.isolation.description import plain_options
-from marsyard.scenarios.offline import answers_file, is_offline
+from marsyard.scenarios.offline_algorithms import answers_file, is_offline
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
+from marsyard.scenarios.tasks import algorithm_sources, custom_path, describe_custom
 from marsyard.scenarios.user_files import input_files
 
 #: Folders of the packages whose code determines rows; reports and commands do not affect rows.

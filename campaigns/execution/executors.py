@@ -3,10 +3,28 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 
 from marsyard.campaigns.execution.cluster import ClusterExecutor
 from marsyard.campaigns.execution.worker_process import Executor
-from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
+from marsyard.campaigns.execution.workers import LocalExecutor
+
+
+@dataclass(frozen=True)
+class ExecutorConfig:
+    """Parameters of an executor: `jobs` worker processes on this machine, or a cluster if `cluster` is set.
+
+    `cluster` is the address of a Dask scheduler (`tcp://host:8786`), or `local:N` for a new local cluster of N workers.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+
+    def describe(self) -> str:
+        """Describe the executor for the campaign's record, without the names of hosts."""
+        if self.cluster is None:
+            return f"{self.jobs} on this machine"
+        return f"cluster {self.cluster}" if self.cluster.startswith("local:") else "cluster"
 
 
 def create_executor(config: ExecutorConfig) -> AbstractContextManager[Executor]:

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -234,20 +234,3 @@ def free_memory() -> float:
         return math.inf
     match = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
     return float(match[1]) * 1024.0 if match else math.inf
-
-
-@dataclass(frozen=True)
-class ExecutorConfig:
-    """Parameters of an executor: `jobs` worker processes on this machine, or a cluster if `cluster` is set.
-
-    `cluster` is the address of a Dask scheduler (`tcp://host:8786`), or `local:N` for a new local cluster of N workers.
-    """
-
-    jobs: int = 1
-    cluster: str | None = None
-
-    def describe(self) -> str:
-        """Describe the executor for the campaign's record, without the names of hosts."""
-        if self.cluster is None:
-            return f"{self.jobs} on this machine"
-        return f"cluster {self.cluster}" if self.cluster.startswith("local:") else "cluster"

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -18,20 +17,14 @@ from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, DefinitionError, Problem, StoreError
-from marsyard.campaigns.execution.cases import (
-    CompletedCase,
-    create_loader,
-    definition_text,
-    prepare_input,
-    run_cases,
-    work_limits,
-)
-from marsyard.campaigns.execution.executors import create_executor
-from marsyard.campaigns.execution.worker_process import Executor, Work
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.preparation import compile_kernels, plan_inputs
+from marsyard.campaigns.execution.cases import CompletedCase, run_cases
+from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
+from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.running.compilation import compile_kernels
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard
+from marsyard.campaigns.running.shared_inputs import prepare_inputs
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
@@ -48,19 +41,6 @@ from marsyard.campaigns.store.table import (
     write_table,
 )
 from marsyard.scenarios.columns import Columns, row_columns
-
-
-class ProgressObserver(Protocol):
-    """Receiver of progress reports of a campaign."""
-
-    def begin(self, stage: str, total: int) -> None:
-        """Start a stage with a number of steps."""
-
-    def step(self) -> None:
-        """Count a finished step of the stage."""
-
-    def note(self, text: str) -> None:
-        """Report a text to the user; may be called from another thread."""
 
 
 @dataclass(frozen=True)
@@ -268,35 +248,6 @@ def _list_missing_cases(run: _CampaignRun, store: RowStore) -> list[range]:
     ranges = store.list_missing_cases(run.campaign.definition.total_cases)
     limited = [range(max(part.start, run.cases.start), min(part.stop, run.cases.stop)) for part in ranges]
     return [part for part in limited if part]
-
-
-def prepare_inputs(
-    campaign: Campaign, executor: Executor, observer: ProgressObserver, cases: Iterable[int] | None
-) -> None:
-    """Build the inputs that several cases share (see `plan_inputs`).
-
-    A case whose input could not be prepared builds it; if this fails, its row contains the error.
-    """
-    definition = campaign.definition
-    plan = plan_inputs(campaign, cases)
-    inputs = plan.to_prepare
-    if plan.build_bytes > plan.limit_bytes:
-        sizes = f"{plan.build_bytes / 1e9:.1f} GB, more than the cache limit ({plan.limit_bytes / 1e9:.1f} GB)"
-        advice = "some are built more than once; MARSYARD_CACHE_GB sets the limit"
-        observer.note(f"the terrains to be built need {sizes}: {advice}")
-    if not inputs:
-        return
-    observer.begin("preparing", len(inputs))
-    task = partial(prepare_input, definition_text(definition))
-    limits = work_limits(definition.limits, definition.limits.prepare_time_s)
-    work = Work(task, inputs, limits, len(inputs), create_loader(definition))
-    for result in itertools.chain.from_iterable(executor.run(work)):
-        if result.error is not None:
-            error = f"{type(result.error).__name__}: {result.error}"
-            observer.note(f"shared input {result.item} could not be prepared: {error}")
-        elif result.result:
-            observer.note(result.result)
-        observer.step()
 
 
 def _run_cases(run: _CampaignRun, store: RowStore, executor: Executor, case_groups: Sequence[Sequence[int]]) -> None:

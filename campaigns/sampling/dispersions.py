@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, model_validator
 
 from marsyard.campaigns.errors import suggest_similar
-from marsyard.campaigns.sampling import dispersion as base
+from marsyard.campaigns.sampling import dispersion_base as base
 
 #: Maximum number of levels of one grid.
 MAX_LEVELS = 100_000

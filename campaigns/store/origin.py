@@ -19,7 +19,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.key import is_signature, sign
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, readable_store
 from marsyard.scenarios.imports import search_current_folder
-from marsyard.scenarios.offline import is_offline
+from marsyard.scenarios.offline_algorithms import is_offline
 
 #: Keys of a definition that can name code.
 _KEYS = {"scenario", "parameters", "dispersions"}

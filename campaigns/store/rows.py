@@ -26,6 +26,7 @@ from typing import Any
 from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError
 from marsyard.campaigns.store import chain
 from marsyard.campaigns.store.lock import replace_file
+from marsyard.scenarios.columns import LEADING, TRAILING
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
@@ -344,5 +345,4 @@ def classify_value(value: Any) -> str:
 #: Row of one case as stored.
 Row = Mapping[str, Scalar]
 #: Columns that the engine writes in front of and after those of the scenario.
-LEADING_COLUMNS = ("case", "outcome", "answered")
-TRAILING_COLUMNS = ("wall_time_s", "cpu_time_s", "error", "traceback")
+LEADING_COLUMNS, TRAILING_COLUMNS = ([column.name for column in columns] for columns in (LEADING, TRAILING))

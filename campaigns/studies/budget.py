@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,12 @@ from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.store.rows import Row
-from marsyard.campaigns.studies.contributions import MIN_COMMON, Budget, compute_budget
+from marsyard.campaigns.studies.contributions import MIN_COMMON, compute_budget
+from marsyard.campaigns.studies.results import BUDGET, BudgetParameters, BudgetResult, SobolIndex
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -35,45 +36,15 @@ from marsyard.campaigns.studies.runner import (
     check_margin,
     continue_study,
     find_requirement,
-    read_study,
     start_study,
 )
 from marsyard.scenarios.error_sources import ScenarioSource, error_sources
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the parameters of this study.
-KIND = "budget"
 #: Name of the variable of the random streams among Sobol's indices.
 STREAMS = "random streams"
 #: Number of base cases that are evaluated together.
 _BATCH = 8
-
-
-@dataclass(frozen=True)
-class BudgetParameters:
-    """Parameters of the study.
-
-    - requirement: id of the requirement whose metric is the error; without a bound, its margin is used
-    - cases: number of base cases; each runs once per variant
-    - sobol: base samples of Saltelli's design, a power of 2; 0: no indices
-    - confidence: two-sided confidence of the intervals
-    """
-
-    requirement: str
-    cases: int = 100
-    sobol: int = 0
-    confidence: float = 0.9
-
-    def __post_init__(self) -> None:
-        is_power = self.sobol == 0 or (self.sobol >= 16 and self.sobol & (self.sobol - 1) == 0)
-        problems = {
-            f"--cases {self.cases}: at least {2 * MIN_COMMON}": self.cases >= 2 * MIN_COMMON,
-            f"--sobol {self.sobol}: allowed: 0, or a power of 2 from 16": is_power,
-            f"--confidence {self.confidence}: allowed: 0.5 to 0.999": 0.5 <= self.confidence <= 0.999,
-        }
-        for message, is_met in problems.items():
-            if not is_met:
-                raise CampaignError(message)
 
 
 @dataclass(frozen=True)
@@ -85,47 +56,6 @@ class Variant:
 
     name: str
     removed: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class SobolIndex:
-    """First-order and total Sobol index of a dispersion or the random streams, with half-widths of their intervals."""
-
-    name: str
-    first: float
-    first_width: float
-    total: float
-    total_width: float
-
-
-@dataclass(frozen=True)
-class BudgetResult:
-    """Result of the study.
-
-    - quantity: metric or margin that is the error; centred: whether its mean square is taken about the mean
-    - inactive: titles of the sources that act in no case of the campaign
-    - budget: error budget; None for a campaign without sources, or with too few common cases
-    - cases, violations: number of base cases, and of violations of the requirement among them with all sources
-    - indices: Sobol indices, the largest total index first; index_samples: complete base samples
-    - evaluated: number of cases in all
-    - reason: why the result is incomplete; empty if it is complete
-    """
-
-    quantity: str
-    centred: bool
-    inactive: tuple[str, ...]
-    budget: Budget | None
-    cases: int
-    violations: int
-    indices: tuple[SobolIndex, ...]
-    index_samples: int
-    evaluated: int
-    reason: str = ""
-
-    @property
-    def exit_code(self) -> int:
-        """Exit status of the command."""
-        return 0 if not self.reason else 3
 
 
 def start_budget(
@@ -151,22 +81,15 @@ def start_budget(
     # Saltelli's design has d + 2 cases per base sample for d variables: the dispersions and the random streams
     n_cases = parameters.cases * len(list_variants(sources)) if sources else 0
     n_cases += parameters.sobol * (len(campaign.drawn_paths) + 3) if parameters.sobol else 0
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, parameters, runner).run(observer)
-    )
-    return start_study(campaign, n_cases, directory, session, {"kind": KIND, **asdict(parameters)})
+    session = StudySession(BUDGET, parameters, _BudgetStudy, executor, observer)
+    return start_study(campaign, n_cases, directory, session)
 
 
 def continue_budget(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> BudgetResult:
     """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
-    study = read_study(directory) or {}
-    if study.get("kind") != KIND:
-        raise CampaignError(f"{directory} does not contain an error budget (marsyard budget)")
-    parameters = BudgetParameters(**{name: study[name] for name in BudgetParameters.__dataclass_fields__})
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _BudgetStudy(campaign, parameters, runner).run(observer)
-    )
-    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)})
+    parameters = BUDGET.read_parameters(directory)
+    session = StudySession(BUDGET, parameters, _BudgetStudy, executor, observer)
+    return continue_study(directory, session)
 
 
 def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from marsyard.campaigns.studies.bootstrap import studentized_intervals
+from marsyard.campaigns.studies.study_record import Number
 from marsyard.sim.error_sources import ErrorSource
 
 #: Minimum number of base cases whose error has a value in all variants.
@@ -33,8 +34,8 @@ class Contribution:
     alone: float
     removed: float
     mean: float
-    lower: float
-    upper: float
+    lower: Number
+    upper: Number
     answered: tuple[int, int]
 
 
@@ -51,12 +52,12 @@ class Budget:
 
     contributions: tuple[Contribution, ...]
     total: float
-    total_lower: float
-    total_upper: float
+    total_lower: Number
+    total_upper: Number
     remaining: float
-    closure: float
-    closure_lower: float
-    closure_upper: float
+    closure: Number
+    closure_lower: Number
+    closure_upper: Number
     common: int
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student_t
 
+from marsyard.campaigns.studies.study_record import Number
+
 
 @dataclass(frozen=True)
 class ProbabilityInterval:
@@ -19,11 +21,11 @@ class ProbabilityInterval:
     - log_sd: standard deviation of the logarithm of one replicate's estimate
     """
 
-    estimate: float
+    estimate: Number
     lower: float
     upper: float
     confidence: float
-    log_sd: float
+    log_sd: Number
 
 
 def unknown_interval(confidence: float) -> ProbabilityInterval:

@@ -1,10 +1,25 @@
-"""Study `rare`: probability that a case violates a requirement, with an interval and a verdict on its limit."""
+"""Study `rare`: probability that a case violates a requirement, with an interval and a verdict on its limit.
+
+The margin g of a case is its signed distance from the bound of the requirement; a violation is g < 0. Random cases of
+the nominal distribution give the exact bounds of Clopper and Pearson (`studies.counting`): PASS rests on them alone.
+
+Subset simulation (`studies.subset`; Au & Beck 2001) computes the probability as a product of conditional probabilities,
+P(g < 0) = P(g <= b1) P(g <= b2 | g <= b1) ... P(g < 0 | g <= bm). Each threshold b is the quantile `LEVEL_FRACTION` of
+the margins of a level; Markov chains draw the next level from the cases below it. A simulation is a coroutine: it
+yields `Proposals`, receives their margins as `Evaluated`, and returns its estimate. This study runs several independent
+simulations (replicates) at once; their spread gives Cox's interval (`studies.interval`). Importance sampling
+(`studies.importance`; Melchers 1989) can refine the estimate with cases drawn around the violations that were found.
+
+A case is a point: a standard normal number per dispersion, and a blend, a weighted sum of numbered random streams that
+give the noise of the instruments. `NEW_STREAM` is the stream that the case creates; its number is that of the case.
+`studies.rare_decision` derives the verdict from all cases.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +28,11 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
+from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult, Replicate
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -25,7 +41,6 @@ from marsyard.campaigns.studies.runner import (
     check_margin,
     continue_study,
     find_requirement,
-    read_study,
     start_study,
 )
 from marsyard.campaigns.studies.subset import (
@@ -39,84 +54,10 @@ from marsyard.campaigns.studies.subset import (
 )
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the parameters of this study.
-KIND = "rare"
-#: Subset simulation alone, or with importance sampling around the violations that it found.
-METHODS = ("subset", "importance")
 #: Subset simulation stops at levels less likely than this fraction of the limit, which cannot change the verdict.
 MIN_PROBABILITY_FRACTION = 0.01
 #: Number of importance samples, and of random cases, that are evaluated together.
 _IMPORTANCE_BATCH, _RANDOM_BATCH = 100, 1000
-
-
-@dataclass(frozen=True)
-class RareParameters:
-    """Parameters of the study.
-
-    - requirement: id of the requirement; max_probability: limit of the probability that a case violates it
-    - method: see `METHODS`
-    - samples: cases per level of one subset simulation
-    - replicates, random_cases: numbers of replicates, and of random cases, of the first run and of each continuation.
-      Random cases are drawn independently for the counting bound, as is the first level of each replicate
-    - importance_cases: cases of importance sampling
-    - confidence: two-sided confidence; each bound alone holds at (1 + confidence) / 2
-    """
-
-    requirement: str
-    max_probability: float
-    method: str = "subset"
-    samples: int = 200
-    replicates: tuple[int, ...] = (6,)
-    random_cases: tuple[int, ...] = (600,)
-    importance_cases: int = 600
-    confidence: float = 0.9
-
-    def __post_init__(self) -> None:
-        problems = {
-            f"--max-probability {self.max_probability}: allowed: above 0 and below 1": 0.0 < self.max_probability < 1.0,
-            f"--method {self.method}: allowed: {', '.join(METHODS)}": self.method in METHODS,
-            f"--samples {self.samples}: at least 50": self.samples >= 50,
-            f"--replicates {self.replicates[0]}: at least 2": self.replicates[0] >= 2,
-            f"--random-cases {self.random_cases[0]}: at least 0": self.random_cases[0] >= 0,
-            f"--importance-cases {self.importance_cases}: at least 50": self.importance_cases >= 50,
-            f"--confidence {self.confidence}: allowed: 0.5 to 0.999": 0.5 <= self.confidence <= 0.999,
-        }
-        for message, is_met in problems.items():
-            if not is_met:
-                raise CampaignError(message)
-
-
-@dataclass(frozen=True)
-class Replicate:
-    """One subset simulation: estimated probability, whether it is an estimate, reason of its end, level thresholds."""
-
-    probability: float
-    reached: bool
-    end: str
-    thresholds: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class RareResult:
-    """Result of the study.
-
-    - verdict, decision: verdict, and its evidence
-    - cases, violations: numbers of evaluated cases, and of those that violate the requirement
-    - replicates: subset simulations
-    - margin_text: definition of the margin
-    """
-
-    verdict: RareVerdict
-    decision: Decision
-    cases: int
-    violations: int
-    replicates: tuple[Replicate, ...]
-    margin_text: str
-
-    @property
-    def exit_code(self) -> int:
-        """Exit status of the verdict."""
-        return {RareVerdict.PASS: 0, RareVerdict.FAIL: 1, RareVerdict.INSUFFICIENT: 3}[self.verdict]
 
 
 def start_rare(
@@ -133,11 +74,9 @@ def start_rare(
     stored, and `continue_rare` continues.
     """
     check_margin(find_requirement(campaign, parameters.requirement))
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
-    )
+    session = StudySession(RARE, parameters, _RareStudy, executor, observer)
     total_cases = max_cases + sum(parameters.random_cases)
-    return start_study(campaign, total_cases, directory, session, {"kind": KIND, **asdict(parameters)})
+    return start_study(campaign, total_cases, directory, session)
 
 
 def continue_rare(
@@ -148,12 +87,7 @@ def continue_rare(
     replicates, random_cases: numbers to add; the result is evaluated again if one of them is not 0
     Raises CampaignError if the folder contains no such study, or the program has changed.
     """
-    study = read_study(directory) or {}
-    if study.get("kind") != KIND:
-        raise CampaignError(f"{directory} does not contain a study of rare violations (marsyard rare)")
-    values = {name: study[name] for name in RareParameters.__dataclass_fields__}
-    blocks = {name: tuple(values[name]) for name in ("replicates", "random_cases")}
-    parameters = RareParameters(**{**values, **blocks})
+    parameters = RARE.read_parameters(directory)
     if replicates and parameters.method == "importance":
         raise CampaignError(
             f"{directory}: no replicates can be added to a study with importance sampling; start a new study with more"
@@ -164,14 +98,17 @@ def continue_rare(
             replicates=(*parameters.replicates, replicates),
             random_cases=(*parameters.random_cases, random_cases),
         )
-    session = StudySession(
-        executor, observer, lambda campaign, runner: _RareStudy(campaign, parameters, runner).run(observer)
-    )
-    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)}, random_cases)
+    session = StudySession(RARE, parameters, _RareStudy, executor, observer)
+    return continue_study(directory, session, random_cases)
 
 
 class _RareStudy:
-    """State of a running study: number of violations, independent cases, and random cases that are not yet run."""
+    """A running study.
+
+    - violations: number of violations among all cases
+    - is_violation, terrains: violation and terrain of each independent case of the nominal distribution
+    - reserved_cases: number of random cases, out of the limit of cases, that are not yet run
+    """
 
     def __init__(self, campaign: Campaign, parameters: RareParameters, runner: PointRunner) -> None:
         self._campaign, self._parameters, self._runner = campaign, parameters, runner
@@ -202,15 +139,7 @@ class _RareStudy:
                         shortfall = "The replicates found too few violations to fit a density for importance sampling."
             except CaseLimitError as error:
                 shortfall = f"The limit of cases was reached: {error}."
-        sample = RareSample(
-            results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
-        )
-        evaluations = len(parameters.replicates)
-        decision = decide_rare(sample, parameters.max_probability, parameters.confidence, evaluations)
-        evidence = self._runner.evidence
-        if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
-            reason = f"The verdict would be PASS. {evidence.text}"
-            decision = replace(decision, verdict=RareVerdict.INSUFFICIENT, basis=Basis.NONE, reason=reason)
+        decision = self._decide(results, violation_weights, shortfall)
         replicates_run = tuple(
             Replicate(item.probability, item.reached, item.end.value, item.thresholds) for item in results
         )
@@ -228,10 +157,6 @@ class _RareStudy:
         min_probability = MIN_PROBABILITY_FRACTION * self._parameters.max_probability
         levels = math.ceil(math.log(min_probability) / math.log(LEVEL_FRACTION))
         return math.ceil(replicates * self._parameters.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
-
-    def _generator(self, name: str) -> np.random.Generator:
-        """Create a random generator of the study, which does not depend on the cases."""
-        return Streams(self._campaign.definition.seed, self._campaign.definition.name, 0).generator(name)
 
     def _run_random(self, block: int, count: int) -> None:
         """Run independent cases of the nominal distribution."""
@@ -265,32 +190,6 @@ class _RareStudy:
             pending = next_pending
         return [results[number] for number in numbers]
 
-    def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
-        """Evaluate several groups of proposed cases together."""
-        coordinates = np.concatenate([group.coordinates for group in proposals])
-        blends = [blend for group in proposals for blend in group.blends]
-        first = self._runner.n_cases
-        candidates = [
-            Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
-            for point, blend in zip(coordinates, blends, strict=True)
-        ]
-        rows = self._runner.run(candidates, self._reserved_cases)
-        margins = np.array([compute_margin(row, self._requirement) for row in rows])
-        self._violations += int(np.sum(margins < 0.0))
-        is_independent = [group.is_independent for group in proposals for _ in group.blends]
-        for row, margin, is_counted in zip(rows, margins, is_independent, strict=True):
-            if is_counted:
-                terrain = row.get("terrain")
-                self._is_violation.append(bool(margin < 0.0))
-                self._terrains.append(None if terrain is None else str(terrain))
-        numbered = [
-            tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
-            for case, blend in enumerate(blends, start=first)
-        ]
-        ends = np.cumsum([len(group.blends) for group in proposals])
-        for start, end in zip([0, *ends[:-1]], ends, strict=True):
-            yield Evaluated(numbered[start:end], margins[start:end])
-
     def _run_importance(self, results: Sequence[SubsetResult]) -> list[float]:
         """Sample cases around the violations of the replicates, from a fitted density.
 
@@ -310,3 +209,47 @@ class _RareStudy:
             (evaluated,) = self._evaluate([proposal])
             violation_weights += (weights[batch] * (evaluated.margins < 0.0)).tolist()
         return violation_weights
+
+    def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
+        """Evaluate several groups of proposed cases together; yield the margins of each group."""
+        coordinates = np.concatenate([group.coordinates for group in proposals])
+        blends = [blend for group in proposals for blend in group.blends]
+        first = self._runner.n_cases
+        candidates = [
+            Candidate(tuple(point.tolist()), blend=blend if len(blend) > 1 else ())
+            for point, blend in zip(coordinates, blends, strict=True)
+        ]
+        rows = self._runner.run(candidates, self._reserved_cases)
+        margins = np.array([compute_margin(row, self._requirement) for row in rows])
+        self._violations += int(np.sum(margins < 0.0))
+        numbered = [
+            tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
+            for case, blend in enumerate(blends, start=first)
+        ]
+        ends = np.cumsum([len(group.blends) for group in proposals])
+        for group, start, end in zip(proposals, [0, *ends[:-1]], ends, strict=True):
+            if group.is_independent:
+                self._is_violation += (margins[start:end] < 0.0).tolist()
+                self._terrains += [
+                    None if (name := row.get("terrain")) is None else str(name) for row in rows[start:end]
+                ]
+            yield Evaluated(numbered[start:end], margins[start:end])
+
+    def _generator(self, name: str) -> np.random.Generator:
+        """Create a random generator of the study, which does not depend on the cases."""
+        return Streams(self._campaign.definition.seed, self._campaign.definition.name, 0).generator(name)
+
+    def _decide(
+        self, results: Sequence[SubsetResult], violation_weights: Sequence[float] | None, shortfall: str
+    ) -> Decision:
+        """Decide the verdict; a PASS becomes INSUFFICIENT on a seed from which the algorithm's options were set."""
+        parameters, evidence = self._parameters, self._runner.evidence
+        sample = RareSample(
+            results, np.array(self._is_violation, dtype=bool), self._terrains, violation_weights, shortfall
+        )
+        evaluations = len(parameters.replicates)
+        decision = decide_rare(sample, parameters.max_probability, parameters.confidence, evaluations)
+        if decision.verdict is RareVerdict.PASS and evidence.excludes_pass:
+            reason = f"The verdict would be PASS. {evidence.text}"
+            decision = replace(decision, verdict=RareVerdict.INSUFFICIENT, basis=Basis.NONE, reason=reason)
+        return decision

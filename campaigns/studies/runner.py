@@ -1,6 +1,6 @@
 """Run and continue studies (`rare`, `search`, `budget`), which choose the points of their cases.
 
-A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.points`).
+A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.study_points`).
 
 A study is a deterministic function of its parameters and of the rows of its cases. To continue an interrupted study, it
 is run again from its start. Cases with a stored row are not run again: their rows are read.
@@ -8,11 +8,10 @@ is run again from its start. Cases with a stored row are not run again: their ro
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.campaign_file import Requirement
@@ -20,15 +19,16 @@ from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.executors import create_executor
+from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
 from marsyard.campaigns.execution.worker_process import Executor
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver, check_metrics, prepare_inputs
-from marsyard.campaigns.running.preparation import compile_kernels
+from marsyard.campaigns.running.compilation import compile_kernels
+from marsyard.campaigns.running.engine import check_metrics
+from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.replay import load_stored_campaign
+from marsyard.campaigns.running.shared_inputs import prepare_inputs
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion
-from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.lock import folder_lock
@@ -36,35 +36,33 @@ from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
+from marsyard.campaigns.studies.results import BudgetResult, RareResult, SearchResult
+from marsyard.campaigns.studies.study_record import STUDY_KEY, StudyKind, convert_to_json
 from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.sim.streams import Blend
 
 #: A study is stopped with an error if none of this number of first cases has finished.
 _MAX_FIRST_CRASHES = 20
-#: Key of a study's parameters and results in the record of its folder.
-STUDY_KEY = "study"
 
 
-class StudyResult(Protocol):
-    """Result of a study: a dataclass of JSON types with an exit status."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    @property
-    def exit_code(self) -> int:
-        """Exit status of the command."""
-
-
-Result = TypeVar("Result", bound=StudyResult)
+Parameters = TypeVar("Parameters")
+Result = TypeVar("Result", bound=RareResult | SearchResult | BudgetResult)
 
 
 @dataclass(frozen=True)
-class StudySession(Generic[Result]):
-    """Parameters of the workers, receiver of progress reports, and the function that runs the study."""
+class StudySession(Generic[Parameters, Result]):
+    """Start or continuation of a study.
 
+    - kind, parameters: kind and parameters of the study
+    - study: class of the running study, whose method `run` receives the observer and returns the result
+    - executor, observer: parameters of the workers, and receiver of progress reports
+    """
+
+    kind: StudyKind[Parameters, Result]
+    parameters: Parameters
+    study: Callable[[Campaign, Parameters, PointRunner], Any]
     executor: ExecutorConfig
     observer: ProgressObserver
-    execute: Callable[[Campaign, PointRunner], Result]
 
 
 class CaseLimitError(Exception):
@@ -73,7 +71,7 @@ class CaseLimitError(Exception):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.points.StudyPoint`).
+    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.study_points.StudyPoint`).
 
     - coordinates: standard normal numbers of the random dispersions
     - stream: number of the case's random streams; None for new streams
@@ -199,7 +197,7 @@ def check_margin(requirement: Requirement) -> None:
         )
 
 
-def create_study(campaign: Campaign, directory: Path, executor: str, parameters: dict[str, Any]) -> None:
+def create_study(campaign: Campaign, directory: Path, session: StudySession[Any, Any]) -> None:
     """Create the folder of a study with its parameters in the record. Raises StoreError as for a campaign's folder."""
     identity = create_identity(campaign.definition)
     evidence = classify_run(campaign)
@@ -208,34 +206,27 @@ def create_study(campaign: Campaign, directory: Path, executor: str, parameters:
         directory,
         campaign.definition,
         identity,
-        executor,
+        session.executor.describe(),
         algorithms=describe_algorithms(campaign),
         evidence=evidence.to_table(),
         origin=describe_origin(campaign.definition),
     )
-    record.update(directory, {STUDY_KEY: parameters})
+    record.update(directory, {STUDY_KEY: session.kind.encode(session.parameters)})
 
 
-def start_study(
-    campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Result], parameters: Mapping[str, Any]
-) -> Result:
-    """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder.
-
-    `parameters` are the parameters of the study with its `kind`, as JSON types.
-    """
+def start_study(campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Any, Result]) -> Result:
+    """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder."""
     study_campaign = prepare_campaign(campaign, max_cases)
     record.claim_folder(directory)
     with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock
         record.claim_folder(directory)
-        create_study(study_campaign, directory, session.executor.describe(), dict(parameters))
-        return _run_study(study_campaign, directory, session, parameters)
+        create_study(study_campaign, directory, session)
+        return _run_study(study_campaign, directory, session)
 
 
-def continue_study(
-    directory: Path, session: StudySession[Result], parameters: Mapping[str, Any], additional_cases: int = 0
-) -> Result:
-    """Continue a stored study; `parameters` replace the stored ones, and its limit of cases increases.
+def continue_study(directory: Path, session: StudySession[Any, Result], additional_cases: int = 0) -> Result:
+    """Continue a stored study; the session's parameters replace the stored ones, and the limit of cases increases.
 
     Raises CampaignError if the program has changed.
     """
@@ -252,13 +243,11 @@ def continue_study(
         changes: dict[str, Any] = {"state": "running", "finished_utc": None}
         changes["sessions"] = [*stored["sessions"], description]
         changes.update(cases=definition.total_cases, definition=definition.model_dump(mode="json"))
-        record.update(directory, {**changes, STUDY_KEY: dict(parameters)})
-        return _run_study(campaign, directory, session, parameters)
+        record.update(directory, {**changes, STUDY_KEY: session.kind.encode(session.parameters)})
+        return _run_study(campaign, directory, session)
 
 
-def _run_study(
-    campaign: Campaign, directory: Path, session: StudySession[Result], parameters: Mapping[str, Any]
-) -> Result:
+def _run_study(campaign: Campaign, directory: Path, session: StudySession[Any, Result]) -> Result:
     """Run a study from its start; stored rows are not run again. Store its result and the table of its cases."""
     observer = session.observer
     with RowStore(directory / ROWS_FILE, thorough=True) as store:
@@ -267,24 +256,14 @@ def _run_study(
                 compile_kernels(executor, campaign.definition.scenario, observer.note)
                 prepare_inputs(campaign, executor, observer, None)
                 runner = PointRunner(campaign, directory, store, executor, observer)
-                result = session.execute(campaign, runner)
+                result: Result = session.study(campaign, session.parameters, runner).run(observer)
         finally:
             counts = {"cases_finished": store.count(), "cases_crashed": store.count_unfinished()}
             record.update(directory, {"state": "interrupted", "finished_utc": record.utc_now(), **counts})
         write_table(directory / TABLE_FILE, store, numeric_metrics(campaign.definition.requirements))
-    stored_result = convert_to_json(asdict(result))
-    changes = {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: {**parameters, "result": stored_result}}
-    record.update(directory, changes)
+    study = {**session.kind.encode(session.parameters), "result": convert_to_json(asdict(result))}
+    record.update(directory, {"state": "finished", "exit_code": result.exit_code, STUDY_KEY: study})
     return result
-
-
-def convert_to_json(value: Any) -> Any:
-    """Convert nested tables and lists to JSON types; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {name: convert_to_json(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [convert_to_json(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def check_identity(campaign: Campaign, directory: Path) -> None:
@@ -294,9 +273,3 @@ def check_identity(campaign: Campaign, directory: Path) -> None:
         text = "\n  ".join(changes)
         reason = "was run with another program, definition or input files; its rows would not be comparable"
         raise CampaignError(f"{directory} {reason}. Changed:\n  {text}\nStart a new study in another folder")
-
-
-def read_study(directory: Path) -> dict[str, Any] | None:
-    """Read the parameters and results of a study from the record of its folder; None for an ordinary campaign."""
-    study = record.read(directory).get(STUDY_KEY)
-    return study if isinstance(study, dict) else None

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,11 @@ from scipy.stats import qmc
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
-from marsyard.campaigns.errors import CampaignError, report_write_errors
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running.engine import ProgressObserver
-from marsyard.campaigns.sampling.points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.errors import report_write_errors
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.progress import ProgressObserver
+from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
+from marsyard.campaigns.studies.results import SEARCH, FoundFailure, SearchParameters, SearchResult
 from marsyard.campaigns.studies.runner import (
     Candidate,
     CaseLimitError,
@@ -38,13 +39,10 @@ from marsyard.campaigns.studies.runner import (
     StudySession,
     continue_study,
     find_requirement,
-    read_study,
     start_study,
 )
 from marsyard.sim.streams import Streams
 
-#: Value of the key `kind` in the parameters of this study.
-KIND = "search"
 #: Fraction of the cases that are used for exploration.
 _EXPLORATION_FRACTION = 0.5
 #: Initial step of an evolution strategy, and limit of its coordinates, standard deviations.
@@ -57,82 +55,6 @@ _MAX_CAUSE_DISTANCE = 1.5
 _REDUCTION_CASES = 25
 #: Steps of the bisection of a coordinate.
 _BISECTION_STEPS = 4
-
-
-@dataclass(frozen=True)
-class SearchParameters:
-    """Parameters of the study.
-
-    - requirement: id of the requirement
-    - cases: number of cases of exploration and evolution strategies
-    - restarts: number of evolution strategies
-    - max_failures: maximum number of reduced violations
-    - repetitions: number of new random streams with which each reduced violation runs again
-    """
-
-    requirement: str
-    cases: int = 300
-    restarts: int = 3
-    max_failures: int = 5
-    repetitions: int = 4
-
-    def __post_init__(self) -> None:
-        problems = {
-            f"--cases {self.cases}: at least 20": self.cases >= 20,
-            f"--restarts {self.restarts}: at least 1": self.restarts >= 1,
-            f"--failures {self.max_failures}: at least 1": self.max_failures >= 1,
-        }
-        for message, is_met in problems.items():
-            if not is_met:
-                raise CampaignError(message)
-
-
-@dataclass(frozen=True)
-class FoundFailure:
-    """A reduced violation.
-
-    - case: number of the reduced case; original_case: number of the case before the reduction
-    - margin: margin of the reduced case
-    - values: values of the dispersions that differ from the campaign's parameters, and of numbers `in-turn`, by path
-    - distance: distance of these values from the medians, standard deviations; small distances are more likely
-    - similar: number of violations with the same cause
-    - repeated, repetitions: number of violations among the repetitions with new random streams and numbers `in-turn`
-    - outcome: outcome of the reduced case
-    """
-
-    case: int
-    original_case: int
-    margin: float
-    values: dict[str, Any]
-    distance: float
-    similar: int
-    repeated: int
-    repetitions: int
-    outcome: str
-
-
-@dataclass(frozen=True)
-class SearchResult:
-    """Result of the study: reduced violations, the most likely one first, and numbers of cases.
-
-    - search_cases, cases: numbers of cases before the reduction, and in all
-    - violations: number of violations among the cases before the reduction; min_margin: their smallest margin
-    - first_violation: number of cases up to the first violation; None without a violation
-    """
-
-    failures: tuple[FoundFailure, ...]
-    search_cases: int
-    cases: int
-    violations: int
-    min_margin: float
-    first_violation: int | None
-    margin_text: str
-    reason: str = ""
-
-    @property
-    def exit_code(self) -> int:
-        """Exit status of the command: 1 if violations were found."""
-        return int(bool(self.violations))
 
 
 @dataclass
@@ -159,22 +81,15 @@ def start_search(
     stored, and `continue_search` continues.
     """
     find_requirement(campaign, parameters.requirement)
-    session = StudySession(
-        executor, observer, lambda campaign, runner: SearchStudy(campaign, parameters, runner).run(observer)
-    )
-    return start_study(campaign, max_cases, directory, session, {"kind": KIND, **asdict(parameters)})
+    session = StudySession(SEARCH, parameters, SearchStudy, executor, observer)
+    return start_study(campaign, max_cases, directory, session)
 
 
 def continue_search(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> SearchResult:
     """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
-    study = read_study(directory) or {}
-    if study.get("kind") != KIND:
-        raise CampaignError(f"{directory} does not contain a search for violations (marsyard search)")
-    parameters = SearchParameters(**{name: study[name] for name in SearchParameters.__dataclass_fields__})
-    session = StudySession(
-        executor, observer, lambda campaign, runner: SearchStudy(campaign, parameters, runner).run(observer)
-    )
-    return continue_study(directory, session, {"kind": KIND, **asdict(parameters)})
+    parameters = SEARCH.read_parameters(directory)
+    session = StudySession(SEARCH, parameters, SearchStudy, executor, observer)
+    return continue_study(directory, session)
 
 
 class SearchStudy:
@@ -394,7 +309,7 @@ def write_regression_campaigns(campaign: Campaign, result: SearchResult, directo
     """
     folder, paths = directory / "failures", list[Path]()
     definition = campaign.definition
-    requirement = find_requirement(campaign, str((read_study(directory) or {})["requirement"]))
+    requirement = find_requirement(campaign, SEARCH.read_parameters(directory).requirement)
     with report_write_errors(folder):
         folder.mkdir(exist_ok=True)
         for number, failure in enumerate(result.failures, start=1):

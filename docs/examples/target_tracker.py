@@ -169,10 +169,10 @@ def main() -> None:
     """Answer the requests on standard input, one per line, until the input ends."""
     tracker = WholePixelTracker()
     # "exchange" is the version of the exchange format (docs/custom-algorithms.md)
-    print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+    print(json.dumps({"exchange": 3, "ready": True}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
-        print(json.dumps({"exchange": 2, "id": request["id"], **tracker.answer(request)}), flush=True)
+        print(json.dumps({"exchange": 3, "id": request["id"], **tracker.answer(request)}), flush=True)
 
 
 if __name__ == "__main__":

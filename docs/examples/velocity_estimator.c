@@ -1,4 +1,4 @@
-/* A velocity estimator in C for Marsyard's exchange, version 2 (docs/custom-algorithms.md).
+/* A velocity estimator in C for Marsyard's exchange, version 3 (docs/custom-algorithms.md).
  *
  *   cc -O2 -std=c11 -o velocity_estimator docs/examples/velocity_estimator.c -lm
  *   marsyard run dimes-gusev --algorithm "exec:./velocity_estimator"            one process a case
@@ -181,7 +181,7 @@ static void estimate(const char *folder, char *answer, size_t room)
     double q[2][4], altitudes[2], times[2], inertial[6], version[1];
     snprintf(path, sizeof path, "%s/case.json", folder);
     char *text = contents(path, &size);
-    int fine = text && read_numbers(text, "exchange", 1, 1, version) && version[0] == 1.0;
+    int fine = text && read_numbers(text, "exchange", 1, 1, version) && version[0] == 3.0;
     for (int k = 0; fine && k < 2; k++) /* of the three images the second and the third */
         fine = read_numbers(text, "world_from_body_xyzw", k + 2, 4, q[k]) && read_numbers(text, "altitude_m", k + 2, 1, &altitudes[k]) &&
                read_numbers(strstr(text, "\"images\":"), "time_s", k + 2, 1, &times[k]) && read_camera(folder, k + 2, &cameras[k]);
@@ -217,7 +217,7 @@ static void estimate(const char *folder, char *answer, size_t room)
     free(text);
 }
 
-/* The number and the folder in a line {"exchange": 2, "id": 7, "case": "/tmp/..."}; Marsyard's folders need no escapes. */
+/* The number and the folder in a line {"exchange": 3, "id": 7, "case": "/tmp/..."}; Marsyard's folders need no escapes. */
 static int read_request(char *line, long *id, char **folder)
 {
     char *number = strstr(line, "\"id\": "), *at = strstr(line, "\"case\": \""), *end;
@@ -232,18 +232,18 @@ int main(int count, char **words)
     char answer[512], line[8192], *folder;
     long id;
     if (count == 2 && strcmp(words[1], "--serve") == 0) {
-        printf("{\"exchange\": 2, \"ready\": true}\n");
+        printf("{\"exchange\": 3, \"ready\": true}\n");
         fflush(stdout);
         while (fgets(line, sizeof line, stdin)) {
             if (!read_request(line, &id, &folder)) { complain("no case in", line); return 1; }
             estimate(folder, answer, sizeof answer);
-            printf("{\"exchange\": 2, \"id\": %ld, %s}\n", id, answer);
+            printf("{\"exchange\": 3, \"id\": %ld, %s}\n", id, answer);
             fflush(stdout);
         }
         return 0;
     }
     if (count != 2) { fprintf(stderr, "usage: velocity_estimator CASE | velocity_estimator --serve\n"); return 2; }
     estimate(words[1], answer, sizeof answer);
-    printf("{\"exchange\": 2, %s}\n", answer);
+    printf("{\"exchange\": 3, %s}\n", answer);
     return 0;
 }

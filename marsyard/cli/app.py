@@ -19,9 +19,10 @@ from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.campaign import append, merge, resume, run
+from marsyard.cli.conformance import conformance
+from marsyard.cli.export import dataset, export, score
 from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
-from marsyard.cli.offline import conformance, dataset, export, score
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
 from marsyard.cli.replay import replay
 from marsyard.cli.report import compare, confirmations, dashboard, nightly, report

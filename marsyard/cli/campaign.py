@@ -14,8 +14,8 @@ from marsyard.cli.execution import default_directory, make_executor, run_and_eva
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.campaigns.execution.workers import ExecutorConfig
-    from marsyard.campaigns.running.engine import ProgressObserver
+    from marsyard.campaigns.execution.executors import ExecutorConfig
+    from marsyard.campaigns.running.progress import ProgressObserver
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,19 @@ def run(arguments: RunOptions) -> None:
         campaign = select_confirmation_seed(campaign)
     # imported after loading, so that an error in the file is reported without delay
     from marsyard.campaigns.running.engine import run_campaign
-    from marsyard.cli import outcome
+    from marsyard.cli.estimate import print_estimate, print_limits
+    from marsyard.cli.until_decided import run_until_decided
 
     executor = make_executor(arguments.jobs, arguments.cluster)
     if arguments.dry_run:
-        outcome.print_estimate(campaign, executor)
-        outcome.print_limits(campaign)
+        print_estimate(campaign, executor)
+        print_limits(campaign)
         return
     directory = arguments.out if arguments.out is not None else default_directory(campaign.definition.name)
     if arguments.shard is not None:
         run_shard(campaign, arguments.shard, directory, executor)
         return
-    run_cases = outcome.run_until_decided if arguments.until_decided else run_campaign
+    run_cases = run_until_decided if arguments.until_decided else run_campaign
     run_and_evaluate(directory, lambda observer: run_cases(campaign, directory, executor, observer))
 
 
@@ -145,8 +146,8 @@ def resume(
     from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.cli.outcome import continue_until_decided
     from marsyard.cli.studies import contains_study, continue_study
+    from marsyard.cli.until_decided import continue_until_decided
 
     if trust:
         adopt(directory)
@@ -187,7 +188,7 @@ def append(
     from marsyard.campaigns.running.engine import append_cases, campaign_with_block
     from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.record import stored_definition
-    from marsyard.cli import outcome
+    from marsyard.cli.estimate import print_limits
     from marsyard.cli.studies import contains_study, continue_study
 
     if trust:
@@ -198,6 +199,6 @@ def append(
         raise CampaignError(f"--random is for studies of `marsyard rare`; {directory} contains a campaign")
     if stored_definition(directory).max_cases is not None:
         raise CampaignError(f"{directory} was run with --until-decided: cases added afterwards would bias the verdict")
-    outcome.print_limits(campaign_with_block(directory, cases))
+    print_limits(campaign_with_block(directory, cases))
     executor = make_executor(jobs, cluster)
     run_and_evaluate(directory, lambda log: append_cases(directory, cases, executor, log, allow_changed=allow_changed))

@@ -15,9 +15,9 @@ import numpy as np
 import typer
 from jaxtyping import Bool, Float64, UInt8
 
-from marsyard.cli.images import ImageRequest, render_images
 from marsyard.reports.campaign import page_environment
 from marsyard.scenarios.terrain_files import SUFFIXES, is_terrain_file, load_site
+from marsyard.site_images import ImageRequest, render_images
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 

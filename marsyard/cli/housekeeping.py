@@ -102,7 +102,7 @@ def compile_kernels() -> None:
     """
     from joblib import Parallel, delayed
 
-    from marsyard.campaigns.running.preparation import list_compilations
+    from marsyard.campaigns.running.compilation import list_compilations
     from marsyard.sim.kernel_cache import kernels_are_ready
 
     missing = []
@@ -122,7 +122,7 @@ def compile_kernels() -> None:
 def _compile_scenario(scenario: str, name: str, overrides: Sequence[str]) -> str:
     """Compile the kernels of a scenario; return a line of text."""
     from marsyard.campaigns.execution.worker_process import limit_threads
-    from marsyard.campaigns.running.preparation import compile_campaign
+    from marsyard.campaigns.running.compilation import compile_campaign
 
     limit_threads()
     start_s = time.monotonic()

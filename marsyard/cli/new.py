@@ -65,7 +65,7 @@ class NewOptions:
 def new(arguments: NewOptions) -> None:
     """Write a campaign file with comments; ask for missing options when run interactively."""
     from marsyard.campaigns.errors import CampaignError, unknown_name_message
-    from marsyard.cli.outcome import evidence_limits
+    from marsyard.cli.estimate import evidence_limits
     from marsyard.reports.wording import count
     from marsyard.scenarios.systems import templates
     from marsyard.scenarios.template import Choices

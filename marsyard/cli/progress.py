@@ -23,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.text import Text
 
 if TYPE_CHECKING:
-    from marsyard.campaigns.running.engine import ProgressObserver
+    from marsyard.campaigns.running.progress import ProgressObserver
 
 LOG_FILE = "run.log"
 #: Time between two progress lines of a stage, on the console and in the log, seconds.

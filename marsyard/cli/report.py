@@ -78,7 +78,7 @@ def confirmations(
     """List confirmations: evaluations of frozen algorithms on unseen seeds (`run --confirm`), with their results."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.confirmations import create_record, read_confirmations
-    from marsyard.campaigns.store.registration import find_registration_problem
+    from marsyard.campaigns.store.git_registration import find_registration_problem
     from marsyard.reports.tables import confirmations_table
 
     if create:
@@ -191,32 +191,33 @@ def nightly(
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.lock import folder_lock
     from marsyard.campaigns.store.record import git_commit
-    from marsyard.cli import nightly_plan as plans
+    from marsyard.cli import nightly_run
+    from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
     from marsyard.cli.progress import campaign_progress
     from marsyard.reports.history import FINISHED, INTERRUPTED, History, find_changes, list_comparisons
 
-    path = plan or plans.PLAN_FILE
-    plan_definition, executor = plans.read_plan(path), make_executor(jobs, None)
+    path = plan or PLAN_FILE
+    plan_definition, executor = read_plan(path), make_executor(jobs, None)
     with report_write_errors(out):
-        (out / plans.RUNS).mkdir(parents=True, exist_ok=True)
-    with folder_lock(out), History(out / plans.HISTORY_FILE) as history:
+        (out / nightly_run.RUNS).mkdir(parents=True, exist_ok=True)
+    with folder_lock(out), History(out / nightly_run.HISTORY_FILE) as history:
         night = history.begin(git_commit())
         # write a first page in case this run is killed
-        plans.write_page(history, night, out, ())
+        nightly_run.write_page(history, night, out, ())
         try:
             with stop_on_signals(), campaign_progress(console(stderr=True)) as observer:
-                run = plans.NightlyRun(history, night, out, executor, plan_definition)
+                run = nightly_run.NightlyRun(history, night, out, executor, plan_definition)
                 for entry in plan_definition.campaigns:
-                    plans.run_scheduled_campaign(run, entry, path.parent, observer)
+                    nightly_run.run_scheduled_campaign(run, entry, path.parent, observer)
                 for check in plan_definition.checks:
-                    plans.run_check(run, check, path.parent)
+                    nightly_run.run_check(run, check, path.parent)
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
-            plans.publish_page(history, night, out, ())
+            nightly_run.publish_page(history, night, out, ())
             raise typer.Exit(Exit.INTERRUPTED) from None
         changes = find_changes(list_comparisons(history, night))
         history.finish(night, FINISHED, changes)
-        plans.publish_page(history, night, out, changes)
+        nightly_run.publish_page(history, night, out, changes)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}
     statuses |= {int(Exit.FAILED) for change in changes if change.is_regression}
     raise typer.Exit(next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET))

@@ -15,10 +15,8 @@ from marsyard.cli.execution import default_directory, make_executor, show_progre
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.campaigns.execution.workers import ExecutorConfig
-    from marsyard.campaigns.studies.budget import BudgetResult
-    from marsyard.campaigns.studies.rare import RareResult
-    from marsyard.campaigns.studies.search import SearchResult
+    from marsyard.campaigns.execution.executors import ExecutorConfig
+    from marsyard.campaigns.studies.results import BudgetResult, RareResult, SearchResult
 
 MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
 
@@ -96,7 +94,8 @@ def rare(arguments: RareOptions) -> None:
 
     Exit status: 0 if the probability is below the limit by counting, 1 if it is above, 3 if undecided.
     """
-    from marsyard.campaigns.studies.rare import RareParameters, start_rare
+    from marsyard.campaigns.studies.rare import start_rare
+    from marsyard.campaigns.studies.results import RareParameters
 
     parameters = RareParameters(
         arguments.requirement,
@@ -143,7 +142,8 @@ def search(arguments: SearchOptions) -> None:
 
     Exit status: 1 if violations are found, otherwise 0.
     """
-    from marsyard.campaigns.studies.search import SearchParameters, start_search
+    from marsyard.campaigns.studies.results import SearchParameters
+    from marsyard.campaigns.studies.search import start_search
 
     parameters = SearchParameters(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
     campaign, executor, directory = prepare_study(arguments, "search")
@@ -177,7 +177,8 @@ def budget(arguments: BudgetOptions) -> None:
 
     Sources of error are those of the scenario, such as attitude, altitude or detector noise (docs/error-budget.md).
     """
-    from marsyard.campaigns.studies.budget import BudgetParameters, start_budget
+    from marsyard.campaigns.studies.budget import start_budget
+    from marsyard.campaigns.studies.results import BudgetParameters
 
     parameters = BudgetParameters(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
     campaign, executor, directory = prepare_study(arguments, "budget")
@@ -188,7 +189,7 @@ def budget(arguments: BudgetOptions) -> None:
 
 def contains_study(directory: Path) -> bool:
     """Whether the folder contains a study, not an ordinary campaign."""
-    from marsyard.campaigns.studies.runner import read_study
+    from marsyard.campaigns.studies.study_record import read_study
 
     return read_study(directory) is not None
 
@@ -204,17 +205,18 @@ def continue_study(
     from marsyard.campaigns.studies import budget as budget_study
     from marsyard.campaigns.studies import rare as rare_study
     from marsyard.campaigns.studies import search as search_study
-    from marsyard.campaigns.studies.runner import read_study
+    from marsyard.campaigns.studies.results import BUDGET, SEARCH
+    from marsyard.campaigns.studies.study_record import read_study
 
     study = read_study(directory) or {}
     executor, next_command = make_executor(jobs, cluster), f"marsyard resume {directory}"
-    if study.get("kind") == search_study.KIND:
+    if study.get("kind") == SEARCH.name:
         if additional:
             raise CampaignError(f"{directory} contains a search, which cannot be extended; start a new one")
         with show_progress(directory, next_command) as progress:
             search_result = search_study.continue_search(directory, executor, progress)
         finish_search(directory, search_result)
-    if study.get("kind") == budget_study.KIND:
+    if study.get("kind") == BUDGET.name:
         if additional:
             raise CampaignError(f"{directory} contains an error budget, which cannot be extended; start a new one")
         with show_progress(directory, next_command) as progress:

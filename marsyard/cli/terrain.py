@@ -265,8 +265,8 @@ def render(arguments: RenderOptions) -> None:
 
     A stereo camera adds -left and -right to PREFIX.
     """
-    from marsyard.cli.images import ImageRequest, check_files, render_images, write_image
     from marsyard.sim.kernel_cache import mark_ready
+    from marsyard.site_images import ImageRequest, check_files, render_images, write_image
 
     with report_image_errors(arguments.out):
         values = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
@@ -293,7 +293,7 @@ def _print_progress(text: str) -> None:
 
 def _note_compilation() -> None:
     """Print that the kernels are compiled first, unless this machine has rendered an image or a scenario before."""
-    from marsyard.campaigns.running.preparation import COMPILATION_NOTE
+    from marsyard.campaigns.running.compilation import COMPILATION_NOTE
     from marsyard.scenarios.systems import scenario_paths
     from marsyard.sim.kernel_cache import kernels_are_ready
 

@@ -20,7 +20,7 @@ from marsyard.reports.campaign import PAGE_FILE, REPORT_JSON, VERIFICATION_FILE,
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
 from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.sections import embed_json, script_hash
+from marsyard.reports.page import embed_json, script_hash
 from marsyard.reports.stored import read_cases
 from marsyard.reports.traceability import requirement_evidence, verification_csv
 from marsyard.reports.wording import NOTHING, percent

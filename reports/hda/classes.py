@@ -22,7 +22,7 @@ from marsyard.reports.hda.sections import PAPER, drop_empty_columns, landing_row
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
 from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, numbers, percent
-from marsyard.scenarios.landing.images import CLASS_BOUNDS, CLASS_NAMES
+from marsyard.scenarios.landing.map_errors import CLASS_BOUNDS, CLASS_NAMES
 
 
 @dataclass(frozen=True)

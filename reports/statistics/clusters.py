@@ -36,7 +36,7 @@ Pair = tuple[float, float]
 
 #: Fraction of the risk of a wrong bound that the bound of the rate of members uses.
 _MEMBER_RISK_FRACTION = 0.1
-#: Minimum rate of members for the number of further cases, which would otherwise be infinite.
+#: Minimum rate of members for the number of additional cases, which would otherwise be infinite.
 _MIN_MEMBER_RATE = 0.01
 #: Maximum number of values of one batch of distributions, and limits of the number of support points per axis.
 _MAX_BATCH, _MIN_GRID, _MAX_GRID = 2**16, 8, 18
@@ -375,8 +375,8 @@ class ClusteredCases:
         min_member_rate, other_risk = self._min_member_rate(risk)
         return min(1.0, self.failures.p_value(max_failure_rate * min_member_rate) + risk - other_risk)
 
-    def further_cases_needed(self, max_failure_rate: float, risk: float) -> int:
-        """Find the minimum number of further cases, each on a new terrain and without a failure, for a failure rate.
+    def additional_cases_needed(self, max_failure_rate: float, risk: float) -> int:
+        """Find the minimum number of additional cases, each on a new terrain and without a failure, for a failure rate.
 
         The upper bound of the failure rate is then at most `max_failure_rate`. The rate of members is not increased, so
         slightly fewer cases can be sufficient.

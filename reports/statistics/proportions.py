@@ -85,7 +85,7 @@ def minimum_sample_size(reliability: float, confidence: float, failures: int = 0
     return cases.start + bisect.bisect_left(cases, True, key=is_sufficient)
 
 
-def further_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:
+def additional_cases_needed(n: int, failures: int, reliability: float, confidence: float) -> int:
     """Return the number of additional cases without failure that demonstrate the reliability; 0 if already shown."""
     return max(0, minimum_sample_size(reliability, confidence, failures) - n)
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.algorithms.vtt.accuracy import HandOffOutcome
+from marsyard.algorithms.vtt.arm_target import HandOffOutcome
 from marsyard.reports.presentation import (
     CaseFigure,
     CaseKind,
@@ -103,7 +103,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
         errors = f"{1e3 * range_m:.0f} mm along and {1e3 * cross_m:.0f} mm across the line of sight"
         detail = f"{errors}, drift {number(to_float(row.get('drift_px')))} px"
         return Cause("range" if range_m > cross_m else "direction", detail)
-    if metric not in ("answered", "tracked", "no_false_track", "handed_over"):
+    if metric not in ("answered", "tracked", "no_false_track", "handed_off"):
         return None
     obliquity_deg, slip = to_float(row.get("obliquity_max_deg")), to_float(row.get("slip_max"))
     causes = {

@@ -2,7 +2,7 @@
 
 `inputs` synthesizes measurements without terrain or renderer; `checks` contains the checks common to all suites;
 `estimators`, `trackers` and `parts` add the checks of their protocols. The tasks of further systems define their own
-suites (`marsyard.scenarios.estimators.Task.suite`). This module selects the suite, and runs its checks one by one.
+suites (`marsyard.scenarios.tasks.Task.suite`). This module selects the suite, and runs its checks one by one.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits
 from marsyard.scenarios.conformance import estimators, parts, trackers
 from marsyard.scenarios.conformance.checks import Finding as Finding
 from marsyard.scenarios.conformance.checks import Suite
-from marsyard.scenarios.estimators import Task, list_installed
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.landing_site import LANDING
-from marsyard.scenarios.offline import is_offline
+from marsyard.scenarios.offline_algorithms import is_offline
 from marsyard.scenarios.parts.named import KINDS
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.systems import systems
+from marsyard.scenarios.tasks import Task, list_installed
 from marsyard.scenarios.velocity import VELOCITY
 
 
@@ -49,7 +49,7 @@ def subject_kinds() -> tuple[str, ...]:
 class CandidateAlgorithm:
     """An algorithm or a user-defined part under test.
 
-    - spec: name of the algorithm (`marsyard.scenarios.estimators`) or part (`marsyard.scenarios.parts`)
+    - spec: name of the algorithm (`marsyard.scenarios.tasks`) or part (`marsyard.scenarios.parts`)
     - task: name of the algorithm's task, or of the kind of part
     - limit_s: maximum computation time of an answer
     """

@@ -11,9 +11,9 @@ import numpy as np
 
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteOutcome, VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.algorithm_run import copy_inputs
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint, measure_time_s
+from marsyard.scenarios.input_copies import copy_inputs
 from marsyard.scenarios.streamed import is_image
 from marsyard.scenarios.velocity import check_velocity_answer
 from marsyard.sim.measurements import DescentMeasurements

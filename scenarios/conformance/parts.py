@@ -25,7 +25,7 @@ from marsyard.algorithms.interface import (
 from marsyard.scenarios.conformance import inputs, trackers
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, fingerprint
 from marsyard.scenarios.imports import import_object
-from marsyard.scenarios.landing.images import GroundTruth
+from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.parts import scores
 from marsyard.scenarios.parts.instruments import InstrumentTruth, check_readings

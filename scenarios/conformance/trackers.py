@@ -13,9 +13,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
-from marsyard.scenarios.algorithm_run import copy_inputs, hash_inputs
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, measure_time_s
 from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
+from marsyard.scenarios.input_copies import copy_inputs, hash_inputs
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastImage, PixelTarget, RoverMeasurements

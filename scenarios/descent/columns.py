@@ -33,12 +33,14 @@ COLUMNS = Columns(
             "diameter of the largest circle of level ground in both images of the second pair",
             "width of the ground in both images of the second pair",
         ),
-        flag(
+        Column(
             "feasible_overlap",
+            Kind.TRUTH,
             "in both image pairs, the ground that both images show outside of the bright spot opposite the sun is at "
             "least 110 m across",
-            "with feasible overlap",
-            Kind.TRUTH,
+            population="with feasible overlap",
+            type=bool,
+            enables_answer=True,
         ),
         instrument_error(
             "attitude_error_common_deg",

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics
 from marsyard.scenarios.descent.flight import IMU_MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
+from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_altitude_faults, add_attitude_faults
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
     CustomAltimeter,

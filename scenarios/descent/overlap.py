@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.scenarios.descent.exposure import DescentWorld
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State

@@ -10,17 +10,15 @@ from pydantic import Field, Tag, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.dimes.binning import check_binning
-from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.conditions import SizedFaults
+from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
-from marsyard.scenarios.exposure import SHIELD_FALL_M_S
+from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.instruments import CustomAltimeter, CustomAttitudeSource
 from marsyard.scenarios.parts.motions import CustomMotion
 from marsyard.scenarios.parts.named import default_or_custom
 from marsyard.scenarios.parts.scores import CustomScores, ScoredDescent
-from marsyard.scenarios.place import (
+from marsyard.scenarios.site_parameters import (
     DustOpacity,
     Location,
     RenderParameters,
@@ -28,9 +26,10 @@ from marsyard.scenarios.place import (
     complete_terrain,
     preset_terrain,
 )
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain, site_validator
-from marsyard.scenarios.velocity import VELOCITY
-from marsyard.sim.dynamics.swing import SwingParameters
+from marsyard.scenarios.velocity import VELOCITY, check_image_size
+from marsyard.sim.dynamics.pendulum import SwingParameters
 from marsyard.sim.error_sources import CALIBRATION, CLOUDS, DETECTOR, SHADOW
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
@@ -305,8 +304,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     def _check_consistency(self) -> DescentScenarioParameters:
         """Check terrain, binning, selected images and flight.
 
-        Terrain and light must come from the same site. Images must be divisible into DIMES' bins because each case
-        reports DIMES' feasible overlap.
+        Terrain and light must come from the same site.
         """
         if self.dust_opacity is not None and self.site is None:
             raise ValueError("dust_opacity needs a site; the air of a generic terrain is clear")
@@ -316,7 +314,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         columns, rows = camera.columns, camera.rows
         if rows % self.detector.rows_summed:
             raise ValueError(f"detector.rows_summed {self.detector.rows_summed} does not divide the {rows} camera rows")
-        check_binning(self.dimes.binned_size, (columns, rows // self.detector.rows_summed))
+        check_image_size(self, (columns, rows // self.detector.rows_summed))
         if self.triple is not None and not 1 <= self.triple[0] < self.triple[1] < self.triple[2] <= self.images:
             raise ValueError(f"triple is {list(self.triple)}; allowed: three in ascending order, 1 to {self.images}")
         if self.images < TRIPLE_SIZE:

@@ -14,14 +14,10 @@ from marsyard.algorithms.dimes import DimesDetails
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun
 from marsyard.scenarios.base import TerrainScenario
-from marsyard.scenarios.conditions import (
-    add_detector_faults,
-    contrast_columns,
-    corrupt_images,
-    hash_images,
-    image_columns,
-)
-from marsyard.scenarios.descent.exposure import DescentWorld, camera_optics, take_exposures
+from marsyard.scenarios.cameras import Optics
+from marsyard.scenarios.case_evaluation import Score, evaluate_case
+from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
+from marsyard.scenarios.condition_columns import contrast_columns, hash_images, image_columns
 from marsyard.scenarios.descent.flight import (
     DescentFlight,
     create_flight,
@@ -29,6 +25,7 @@ from marsyard.scenarios.descent.flight import (
     states_at_images,
     true_velocity,
 )
+from marsyard.scenarios.descent.images import camera_optics, take_exposures
 from marsyard.scenarios.descent.measurement import DescentInstruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
@@ -40,8 +37,8 @@ from marsyard.scenarios.descent.score import (
     propagate_to_firing,
 )
 from marsyard.scenarios.descent.timeline import descent_timeline
-from marsyard.scenarios.evaluation import Score, evaluate_case
-from marsyard.scenarios.exposure import ImageSample, Optics, pixel_sample
+from marsyard.scenarios.descent.world import DescentWorld
+from marsyard.scenarios.image_samples import ImageSample, pixel_sample
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.dimes import propagate_velocity
 from marsyard.algorithms.dimes.binning import altitudes_at_images
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.conditions import attitude_rate_deg_s, off_nadir_deg, sun_columns
-from marsyard.scenarios.descent.exposure import DescentWorld
+from marsyard.scenarios.condition_columns import attitude_rate_deg_s, off_nadir_deg, sun_columns
 from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.measurement import DescentInstruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, LandingParameters
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.velocity import Horizontal
 from marsyard.sim.dynamics import State

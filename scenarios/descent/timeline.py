@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.descent.exposure import camera_optics, draw_mounting
+from marsyard.scenarios.descent.images import camera_optics, draw_mounting
 from marsyard.scenarios.timeline import Timeline, surface_from_above
 from marsyard.scenarios.velocity_timeline import STEP_S, VelocityCase
 

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.exposure import add_haze, camera_optics, draw_calibrated, render_state, sunlight_ratio
+from marsyard.scenarios.cameras import camera_optics, draw_calibrated
 from marsyard.scenarios.fieldtest.parameters import CAMERA, FieldTestParameters, RunParameters
+from marsyard.scenarios.radiance import add_haze, render_state, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
@@ -68,7 +69,7 @@ class RunKey:
 
 
 @dataclass(frozen=True)
-class UnprocessedRun:
+class FlownRun:
     """Flight and clouds of a run, before its data are processed.
 
     - clouds: clouds that drift with the flight's time; None for a clear sky
@@ -132,12 +133,7 @@ def field_camera() -> CameraModel:
 
 
 def take_image(
-    run: UnprocessedRun,
-    start_scene: Scene,
-    ground: SiteGround,
-    state: State,
-    detector: Detector,
-    rng: np.random.Generator,
+    run: FlownRun, start_scene: Scene, ground: SiteGround, state: State, detector: Detector, rng: np.random.Generator
 ) -> tuple[UInt16[np.ndarray, "rows columns"], Frame]:
     """Render and expose an image; return its counts and the rendered frame."""
     p, scene = run.key.field_test, scene_at(run, start_scene, ground, state.time_s)
@@ -149,12 +145,12 @@ def take_image(
     return detector.expose(radiance * np.float32(brightness), rng, motion), frame
 
 
-def sun_at(run: UnprocessedRun, time_s: float) -> Sun:
+def sun_at(run: FlownRun, time_s: float) -> Sun:
     """Return the sun at a run's site at a time of the flight."""
     return Sun(run.sun(time_s), site(run.parameters.site).environment.sun_radius_rad)
 
 
-def scene_at(run: UnprocessedRun, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
+def scene_at(run: FlownRun, start_scene: Scene, ground: SiteGround, time_s: float) -> Scene:
     """Return the run's scene with the sun at a given time.
 
     The sun is updated for every image: its motion moves the shadows of clouds at 2.5 km height by 0.3 m/s.
@@ -170,7 +166,7 @@ def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> S
     return load_ground(site(name), p.terrain(name), p.bank_seed, 0)
 
 
-def build_start_scene(run: UnprocessedRun, ground: SiteGround, height_m: float | None = None) -> Scene:
+def build_start_scene(run: FlownRun, ground: SiteGround, height_m: float | None = None) -> Scene:
     """Build a run's scene with the sun at its start; later images use the same objects with a new sun.
 
     The scene contains the rocks that are resolved from a height above the ground, by default the lowest of the passes.

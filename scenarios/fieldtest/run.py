@@ -6,10 +6,9 @@ The paper is Johnson et al., "Field Testing of the MER DIMES".
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import StrEnum
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -17,15 +16,16 @@ from scipy.spatial.transform import Rotation
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory, add_thermal_drift, solve_attitude
 from marsyard.scenarios.fieldtest.imaging import (
+    FlownRun,
     RunKey,
-    UnprocessedRun,
     build_start_scene,
     field_camera,
     run_ground,
     take_image,
 )
-from marsyard.scenarios.fieldtest.parameters import ElevationParameters, RunParameters, TripleParameters
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters
 from marsyard.scenarios.fieldtest.targets import Sightings, Targets, detect_targets, project_targets
+from marsyard.scenarios.fieldtest.triples import ImageMeasurements, Triple, draw_triples
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Motion
 from marsyard.sim.dynamics.helicopter import draw_helicopter_flight
@@ -48,104 +48,18 @@ _MIN_SIGHTINGS = 3
 _MESH_SAMPLES = 0.67
 
 
-class Category(StrEnum):
-    """The paper's categories of triples."""
-
-    SHORT_TIME = "short time"
-    SAME_DIRECTION = "same direction"
-    OPPOSITE_DIRECTION = "opposite direction"
-
-
 @dataclass(frozen=True)
-class ImageMeasurements:
-    """Measurements at a run's images, one row per image in the order taken.
-
-    - pass_number: number of the pass
-    - direction: direction of flight along the line, +1 or -1
-    - position_m: GPS position, world axes
-    - altitude_m: measured altitude above the ground
-    - centre_m: intersection (east, north) of the optical axis with level ground, from the measured attitude
-    """
-
-    pass_number: Int64[np.ndarray, "n"]
-    direction: Int64[np.ndarray, "n"]
-    position_m: Float64[np.ndarray, "n 3"]
-    altitude_m: Float64[np.ndarray, "n"]
-    centre_m: Float64[np.ndarray, "n 2"]
-
-
-@dataclass(frozen=True)
-class Triple:
-    """Category of three images, and their indices among the run's images in the input order of DIMES."""
-
-    category: Category
-    image_indices: tuple[int, int, int]
-
-
-def find_triples(images: ImageMeasurements, parameters: TripleParameters) -> dict[Category, Int64[np.ndarray, "n 3"]]:
-    """Find all triples of a run's images: for each category the indices of the images, one row per triple.
-
-    A short-time triple consists of consecutive images of one pass. Triples of the other categories have decreasing
-    altitudes, as in a landing.
-    """
-    # pairs that overlap and whose distance DIMES can measure over the virtual interval
-    min_altitude = np.minimum(images.altitude_m[:, None], images.altitude_m)
-    is_pair = _pairwise_distances(images.centre_m) <= parameters.overlap_fraction * min_altitude
-    is_pair &= _pairwise_distances(images.position_m[:, :2]) <= parameters.max_speed_m_s * parameters.virtual_interval_s
-    start = np.arange(len(images.pass_number) - 2)
-    in_one_pass = images.pass_number[start] == images.pass_number[start + 2]
-    consecutive = start[in_one_pass & is_pair[start, start + 1] & is_pair[start + 1, start + 2]]
-    # all triples whose GPS height decreases by a permitted step from image to image
-    step = images.position_m[:, 2][:, None] - images.position_m[:, 2]
-    is_step = is_pair & (step >= parameters.min_step_m) & (step <= parameters.max_step_m)
-    descending = np.array(
-        [
-            (upper, centre, lower)
-            for centre in range(len(step))
-            for upper in np.flatnonzero(is_step[:, centre])
-            for lower in np.flatnonzero(is_step[centre])
-        ],
-        dtype=np.int64,
-    ).reshape(-1, 3)
-    same_direction = (np.diff(images.direction[descending], axis=1) == 0).all(axis=1)
-    return {
-        Category.SHORT_TIME: consecutive[:, None] + np.arange(3),
-        Category.SAME_DIRECTION: descending[same_direction],
-        Category.OPPOSITE_DIRECTION: descending[~same_direction],
-    }
-
-
-def draw_triples(
-    run: RunParameters, images: ImageMeasurements, parameters: TripleParameters, rng: np.random.Generator
-) -> tuple[Triple, ...]:
-    """Draw the triples of a run: for each category the specified number out of all of its triples.
-
-    Raises ValueError if there are too few.
-    """
-    counts = (run.short_time, run.same_direction, run.opposite_direction)
-    triples = []
-    for (category, indices), count in zip(find_triples(images, parameters).items(), counts, strict=True):
-        if len(indices) < count:
-            raise ValueError(f"{run.name}: {count} triples '{category}' are requested, but only {len(indices)} exist")
-        for first, second, third in indices[rng.choice(len(indices), count, replace=False)].tolist():
-            triples.append(Triple(category, (first, second, third)))
-    return tuple(triples)
-
-
-def _pairwise_distances(points: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n n"]:
-    return np.asarray(np.linalg.norm(points[:, None] - points, axis=-1))
-
-
-@dataclass(frozen=True)
-class FieldRun(UnprocessedRun):
+class FieldRun:
     """A simulated and processed run.
 
+    - flown: flight and clouds of the run
     - truth: true motion at the images of the passes
     - images: measurements at the images
     - attitudes: estimated attitudes at the images' time tags
     - triples: triples of the run, one per case
     """
 
+    flown: FlownRun
     truth: Motion
     images: ImageMeasurements
     attitudes: Rotation
@@ -187,7 +101,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clouds = None
     if run.clouds is not None:
         clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
-    unprocessed_run = UnprocessedRun(key, clouds, flight)
+    flown = FlownRun(key, clouds, flight)
     interval = p.images.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
@@ -195,7 +109,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clock = Clock.draw(p.images.clock, generator("camera clock"))
     gps = Gps.draw(p.gps, flight.span_s, generator("gps"))
     position = gps.measure(flight, times, generator("gps noise")).values
-    solution = _estimate_attitudes(unprocessed_run, ground, clock, gps)
+    solution = _estimate_attitudes(flown, ground, clock, gps)
     # another name of a random stream would change the random values
     attitudes = solution.attitude(clock.tags(times, generator("picture tags")))
     horizontal = np.ascontiguousarray(position[:, :2])
@@ -211,9 +125,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
         centre_m=horizontal + (altitude / -down[:, 2])[:, None] * down[:, :2],
     )
     return FieldRun(
-        key=key,
-        clouds=clouds,
-        flight=flight,
+        flown=flown,
         truth=flight.motion(times),
         images=images,
         attitudes=attitudes,
@@ -221,7 +133,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     )
 
 
-def _estimate_attitudes(run: UnprocessedRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
+def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
     p, flight, generator = run.key.field_test, run.flight, run.key.generator
     targets = Targets.draw(p.targets, ground.surface, flight.origin_m[:2], generator("targets"))
@@ -252,7 +164,7 @@ def _estimate_attitudes(run: UnprocessedRun, ground: SiteGround, clock: Clock, g
 
 
 def render_and_detect_targets(
-    run: UnprocessedRun,
+    run: FlownRun,
     ground: SiteGround,
     targets: Targets,
     times_s: Float64[np.ndarray, "images"],

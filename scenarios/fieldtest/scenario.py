@@ -17,12 +17,19 @@ from pydantic import BaseModel
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
-from marsyard.scenarios.conditions import attitude_rate_deg_s, hash_images, image_columns, off_nadir_deg, sun_columns
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.fieldtest.imaging import RunKey, build_start_scene, run_ground, sun_at, take_image
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.condition_columns import (
+    attitude_rate_deg_s,
+    hash_images,
+    image_columns,
+    off_nadir_deg,
+    sun_columns,
+)
+from marsyard.scenarios.fieldtest.imaging import FlownRun, RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.fieldtest.run import Category, FieldRun, Triple, simulate_run
+from marsyard.scenarios.fieldtest.run import FieldRun, simulate_run
 from marsyard.scenarios.fieldtest.timeline import triple_timeline
+from marsyard.scenarios.fieldtest.triples import Category, Triple
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredFlight
 from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
@@ -60,7 +67,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         super().__init__(_CACHED_GROUNDS)
         self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(lambda key: simulate_run(key, self.load_ground))
         self._start_scene = lru_cache(maxsize=_CACHED_SCENES)(
-            lambda key: build_start_scene(self._simulate_run(key), run_ground(key, self.load_ground))
+            lambda key: build_start_scene(self._simulate_run(key).flown, run_ground(key, self.load_ground))
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
@@ -84,18 +91,19 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         key = RunKey(p, number, streams.seed, streams.campaign)
         run, ground = self._simulate_run(key), run_ground(key, self.load_ground)
         triple = run.triples[index]
-        first, second, third = (run.flight.state(float(time)) for time in run.truth.times_s[list(triple.image_indices)])
+        times_s = run.truth.times_s[list(triple.image_indices)].tolist()
+        first, second, third = map(run.flown.flight.state, times_s)
         case = TripleCase(run, triple, (first, second, third))
         detector = key.detector()
         noise, scene = streams.generator("detector noise"), self._start_scene(key)
-        exposures = [take_image(run, scene, ground, state, detector, noise) for state in case.states]
+        exposures = [take_image(run.flown, scene, ground, state, detector, noise) for state in case.states]
         images = [counts for counts, _ in exposures]
         ground_points = exposures[1][1].points_world(np.s_[::CLOUD_GRID_PX, ::CLOUD_GRID_PX])
         truth = truth_velocities(p, case)[1, :2]
         inertial = streams.generator("inertial velocity")
         measurements = measure(p, case, images, detector, key.calibrated_camera(), inertial)
         # cloud transmittance on the ground of the second image, at the time of each image, and its changes
-        transmittances = cloud_transmittances(run, ground_points, [state.time_s for state in case.states])
+        transmittances = cloud_transmittances(run.flown, ground_points, [state.time_s for state in case.states])
         changes = np.abs(np.diff(transmittances, axis=0))
         conditions = {
             **_conditions(p, case, measurements, ground.surface),
@@ -114,7 +122,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             row = {**velocity_row("velocity", velocity, truth), **consistency_row(estimate, truth)}
             scored = None
             if estimate is not None:
-                truths: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flight}
+                truths: dict[str, Any] = {"true_velocity_m_s": truth, "states": case.states, "motion": run.flown.flight}
                 scored = ScoredFlight(measurements=measurements, answer=estimate, **truths)
             timeline = partial(triple_timeline, run, ground, case.states, images, estimate)
             return Score(velocity is not None, row, velocity_products(images, estimate, truth), scored, timeline)
@@ -180,7 +188,7 @@ def measure(
         attitudes=tuple(AttitudeMeasurement(case.run.attitudes[index], tag) for index, tag in indices_and_tags),
         altitudes=tuple(AltitudeMeasurement(float(altitudes[index]), tag) for index, tag in indices_and_tags),
         interval_velocities_m_s=truth_velocities(p, case) + bias,
-        sun_direction=case.run.sun(case.states[1].time_s),
+        sun_direction=case.run.flown.sun(case.states[1].time_s),
     )
 
 
@@ -191,14 +199,14 @@ def _conditions(
     run, indices = case.run, list(case.triple.image_indices)
     true_altitudes = height_above_ground(surface, np.stack([state.position_m for state in case.states]))
     row: dict[str, Scalar] = {
-        "run": run.parameters.name,
+        "run": run.flown.parameters.name,
         "category": str(case.triple.category),
         "one_direction": case.triple.category is not Category.OPPOSITE_DIRECTION,
-        "clear_sky": run.clouds is None,
-        "intact_cable": run.parameters.cable_bursts == 0.0,
-        "noisy_cable": run.parameters.cable_bursts > 0.0,
-        "site": run.parameters.site,
-        "terrain": p.site_names.index(run.parameters.site),
+        "clear_sky": run.flown.clouds is None,
+        "intact_cable": run.flown.parameters.cable_bursts == 0.0,
+        "noisy_cable": run.flown.parameters.cable_bursts > 0.0,
+        "site": run.flown.parameters.site,
+        "terrain": p.site_names.index(run.flown.parameters.site),
         "location_east_m": float(case.states[1].position_m[0]),
         "location_north_m": float(case.states[1].position_m[1]),
         **sun_columns(measurements.sun_direction),
@@ -224,9 +232,9 @@ def _conditions(
 
 
 def cloud_transmittances(
-    run: FieldRun, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
+    flown: FlownRun, ground_m: Float64[np.ndarray, "m n 3"], times_s: Sequence[float]
 ) -> Float64[np.ndarray, "times m n"]:
     """Compute the fraction of direct sunlight that clouds transmit to points on the ground."""
-    if run.clouds is None:
+    if flown.clouds is None:
         return np.ones((len(times_s), *ground_m.shape[:2]))
-    return np.stack([run.clouds.transmittance(ground_m, sun_at(run, time), time) for time in times_s])
+    return np.stack([flown.clouds.transmittance(ground_m, sun_at(flown, time), time) for time in times_s])

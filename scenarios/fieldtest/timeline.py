@@ -9,7 +9,7 @@ from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.exposure import camera_optics
+from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.fieldtest.imaging import field_camera, sun_at
 from marsyard.scenarios.fieldtest.run import FieldRun
 from marsyard.scenarios.timeline import Timeline, surface_from_above
@@ -42,7 +42,7 @@ def triple_timeline(
     low, high = positions.min(axis=0), positions.max(axis=0)
     east, north = (float(value) for value in 0.5 * (low + high)[:2])
     altitude_m = float(high[2] - ground.surface.height(east, north))
-    sun, field_test = sun_at(run, times_s[1]), run.key.field_test
+    sun, field_test = sun_at(run.flown, times_s[1]), run.flown.key.field_test
 
     def create_scene(east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
         return site_scene(ground, Viewpoint(east_m, north_m, height_m, pixel_rad), sun)
@@ -51,7 +51,7 @@ def triple_timeline(
     case = VelocityCase(
         patch=surface_from_above(create_scene, (east, north), half_width_m, field_test.backend),
         surface=ground.surface,
-        motion=run.flight.motion(np.append(np.arange(start_s, end_s, step_s), end_s)),
+        motion=run.flown.flight.motion(np.append(np.arange(start_s, end_s, step_s), end_s)),
         states=states,
         images=images,
         bits=field_test.detector.bits,

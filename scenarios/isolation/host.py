@@ -22,7 +22,7 @@ from marsyard.algorithms.faults import Fault, describe_error
 from marsyard.algorithms.processes import adopt_orphans, descendants, end_with_parent, kill
 
 #: Version of the request lines, see `marsyard.algorithms.exchange.files`.
-VERSION = 2
+VERSION = 3
 
 
 def main(inputs: int) -> None:

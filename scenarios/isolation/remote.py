@@ -25,7 +25,7 @@ from marsyard.algorithms.processes import children, processor_time_s
 from marsyard.scenarios.imports import source_root
 from marsyard.scenarios.isolation.plain import decode
 from marsyard.scenarios.isolation.transport import Sender
-from marsyard.scenarios.objects import SUFFIX
+from marsyard.scenarios.stored_objects import SUFFIX
 
 #: Maximum characters of the traceback of an algorithm.
 _MAX_TRACE = 8000

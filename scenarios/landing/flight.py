@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.exposure import draw_calibrated
+from marsyard.scenarios.cameras import draw_calibrated
 from marsyard.scenarios.landing.helicopter import Transit
 from marsyard.scenarios.landing.parameters import (
     LandingScenarioParameters,

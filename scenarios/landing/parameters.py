@@ -10,15 +10,14 @@ from jaxtyping import Float64, Int64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions
-from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.conditions import SizedFaults
-from marsyard.scenarios.exposure import CalibrationParameters
+from marsyard.scenarios.cameras import CalibrationParameters
+from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredLanding
-from marsyard.scenarios.place import (
+from marsyard.scenarios.site_parameters import (
     DustOpacity,
     Location,
     RenderParameters,
@@ -26,6 +25,7 @@ from marsyard.scenarios.place import (
     complete_terrain,
     preset_terrain,
 )
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR, ErrorSource

@@ -12,11 +12,12 @@ from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
-from marsyard.scenarios.conditions import hash_images, image_columns
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.exposure import ImageSample, pixel_sample, select_middle_rows
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.condition_columns import hash_images, image_columns
+from marsyard.scenarios.image_samples import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.landing.images import MAX_GROUNDS, RenderedFlight, measure
+from marsyard.scenarios.landing.ground_truth import RenderedFlight
+from marsyard.scenarios.landing.images import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import (
     conditions,
@@ -30,6 +31,7 @@ from marsyard.scenarios.landing.score import (
     times_row,
 )
 from marsyard.scenarios.landing.timeline import landing_timeline
+from marsyard.scenarios.landing.world import MAX_GROUNDS
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding
 from marsyard.sim.streams import Streams

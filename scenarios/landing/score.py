@@ -12,11 +12,13 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.hda import STAGES, HdaDetails, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.conditions import contrast_columns, sun_columns
+from marsyard.scenarios.condition_columns import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
+from marsyard.scenarios.landing.ground_truth import GroundTruth, RenderedFlight
 from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
-from marsyard.scenarios.landing.images import GroundTruth, Pair, RenderedFlight, SampledMap, count_hazards, map_errors
+from marsyard.scenarios.landing.images import Pair
+from marsyard.scenarios.landing.map_errors import SampledMap, count_hazards, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
 from marsyard.scenarios.landing_site import motion_errors, stage_row
 from marsyard.sim.camera import camera_pose

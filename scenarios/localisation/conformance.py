@@ -1,4 +1,11 @@
-"""Conformance suite of position estimators: synthetic descents over level, textured ground."""
+"""Conformance suite of position estimators: the rules for the answers to synthetic descents.
+
+A position estimator follows the interface `marsyard.algorithms.localisation.interface.PositionEstimator`: it receives
+the measurements of a descent one by one, and answers each image, and the end of the descent, with a position.
+`StreamSuite` runs the checks that all streams have in common; the `Protocol` of this module gives it the descents
+(`conformance_inputs`: level, textured ground, without a renderer), and the check of their answers.
+`position_suite(...)` creates the suite for one estimator (`marsyard conformance`).
+"""
 
 from __future__ import annotations
 
@@ -11,15 +18,18 @@ from marsyard.algorithms.localisation.interface import PositionEstimate, Positio
 from marsyard.scenarios.conformance.checks import BreachError
 from marsyard.scenarios.conformance.estimators import Protocol, StreamSuite, Unusual, unusual_images
 from marsyard.scenarios.localisation import conformance_inputs as inputs
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.streamed import StreamAnswers
 
-#: Largest difference between the time of an answer and that of its image or of the last increment, s.
+#: Maximum difference between the time of an answer and the time tag of its image, or of the last increment, s.
 _TIME_TOLERANCE_S = 1e-6
 
 
 def check_answers(answer: Any, measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:
-    """Return the answers to a descent if they are valid. Raises AlgorithmError or BreachError."""
+    """Return the answers to a descent if they are valid, and have the time tags of their images.
+
+    Raises AlgorithmError for an invalid answer, and BreachError for another time.
+    """
     answers = measurements.check(answer)
     tags_s = [*sorted(image.time_s for image in measurements.images), float(measurements.increments.times_s[-1])]
     for number, (estimate, tag_s) in enumerate(zip(answers.estimates, tags_s, strict=True), start=1):
@@ -29,7 +39,7 @@ def check_answers(answer: Any, measurements: LocalisationMeasurements) -> Stream
     return answers
 
 
-def describe(answers: StreamAnswers[PositionEstimate]) -> str:
+def describe_answers(answers: StreamAnswers[PositionEstimate]) -> str:
     """Return the number of positions, and the outcome or the horizontal error at the end."""
     valid = sum(estimate.outcome is PositionOutcome.VALID for estimate in answers.after_images)
     final = answers.final
@@ -40,14 +50,15 @@ def describe(answers: StreamAnswers[PositionEstimate]) -> str:
     return f"{valid} of {len(answers.after_images)} images {PositionOutcome.VALID.name}; {end}"
 
 
+#: The descents of the suite, and the rules for their answers.
 POSITION = Protocol(
     measurements=inputs.ordinary_descent,
     check=check_answers,
     is_valid=lambda answers: answers.outcome is PositionOutcome.VALID,
-    describe=describe,
+    describe=describe_answers,
     failures=", ".join(outcome.name for outcome in PositionOutcome if outcome is not PositionOutcome.VALID),
     unusual={
-        # inertial navigation has a position without images
+        # no reason excludes a position: inertial navigation has one without images
         **unusual_images(inputs.ordinary_descent, inputs.BLANK_COUNTS, ""),
         "repeated": Unusual(
             "images that repeat the first, each delivered twice", (inputs.descent_with_repeated_images,)

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct
 from marsyard.scenarios.conformance.inputs import BLANKS, MEAN, Blank, TexturedPlane, texture
 from marsyard.scenarios.localisation.instruments import LanderCameraParameters, true_camera
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.sim.camera import Cahvore
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements

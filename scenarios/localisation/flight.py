@@ -32,8 +32,9 @@ from pydantic import Field, model_validator
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
+from marsyard.sim.dynamics.pendulum import SwingParameters
 from marsyard.sim.dynamics.recorded import RecordedMotion
-from marsyard.sim.dynamics.swing import SwingDescent, SwingParameters
+from marsyard.sim.dynamics.swing import SwingDescent
 from marsyard.sim.dynamics.trajectory import Motion, Trajectory
 from marsyard.sim.parameters import Parameters, bounded_field
 

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.localisation.interface import InitialState
-from marsyard.scenarios.exposure import CalibrationParameters
+from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.sim.camera import Cahv, Cahvore, CameraModel
 from marsyard.sim.dynamics import State, Trajectory
 from marsyard.sim.error_sources import CALIBRATION, ErrorSource
@@ -24,6 +24,10 @@ from marsyard.sim.measurements import AltitudeMeasurement
 from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, RadarAltimeter, RadarParameters
 from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
+
+#: Margin of the inertial increments before the first and after the last time tag of the other clocks, s: the time tags
+#: of the inertial unit have an offset of 0.2 ms rms.
+INERTIAL_MARGIN_S = 0.05
 
 
 class LanderCameraParameters(Parameters):
@@ -232,3 +236,22 @@ class InitialErrors(Parameters):
         """Compute the mean of an exponential distribution truncated at k, 1 - k / (e^k - 1): variance / sd^2."""
         k = min(self._truncation(), 700.0)
         return float(1.0 - k / np.expm1(k))
+
+
+class ImageSchedule(Parameters):
+    """Times of the images: those of the coarse stage first (0.3 Hz, Mars 2020), then those of the fine stage.
+
+    Mars 2020 took up to one image per second in the fine stage; the default of 0.5 Hz is assumed.
+    """
+
+    first_s: Annotated[float, bounded_field(INERTIAL_MARGIN_S, 60.0, "first image, after the start")] = 0.5
+    coarse_images: Annotated[int, Field(ge=0, le=100, description="images of the coarse stage")] = 3
+    coarse_interval_s: Annotated[float, bounded_field(0.1, 60.0, "time after each image of the coarse stage")] = 3.3
+    interval_s: Annotated[float, bounded_field(0.1, 60.0, "time between images of the fine stage")] = 2.0
+
+    def times(self, start_s: float, end_s: float) -> Float64[np.ndarray, "images"]:
+        """Compute the nominal times of the images from start to end (included)."""
+        first, coarse = start_s + self.first_s, self.coarse_interval_s * np.arange(self.coarse_images + 1)
+        count = max(int((end_s - first - coarse[-1]) / self.interval_s) + 1, 0)
+        times = np.concatenate([first + coarse[:-1], first + coarse[-1] + self.interval_s * np.arange(count)])
+        return np.asarray(times[times <= end_s])

@@ -20,9 +20,9 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import MapProduct
-from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.localisation.fields import SmoothField
-from marsyard.scenarios.localisation.world import LocalisationWorld, sun_at
+from marsyard.scenarios.localisation.world import LocalisationWorld
+from marsyard.scenarios.radiance import add_haze, sun_at
 from marsyard.scenarios.views import SiteGround, micro_relief
 from marsyard.sim.error_sources import ErrorSource
 from marsyard.sim.frames import rigid

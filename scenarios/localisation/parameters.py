@@ -9,22 +9,22 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.algorithm_run import AlgorithmSelection
-from marsyard.scenarios.conditions import SizedFaults
+from marsyard.scenarios.case_faults import SizedFaults
 from marsyard.scenarios.localisation.flight import ProfileParameters
 from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
     LANDER_DETECTOR,
     RADAR,
+    ImageSchedule,
     InitialErrors,
     LanderCameraParameters,
     check_clock,
 )
 from marsyard.scenarios.localisation.map_product import MapParameters
 from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
-from marsyard.scenarios.localisation.stream import ImageSchedule
 from marsyard.scenarios.localisation.task import LOCALISATION
-from marsyard.scenarios.place import DustOpacity, Location, RenderParameters, SunParameters, complete_terrain
+from marsyard.scenarios.site_parameters import DustOpacity, Location, RenderParameters, SunParameters, complete_terrain
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.parameters import NonNegative, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarParameters

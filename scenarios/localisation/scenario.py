@@ -14,20 +14,28 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation.interface import InitialState, PositionEstimate, PositionOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
-from marsyard.scenarios.conditions import add_detector_faults, hash_images, image_columns
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.exposure import HAZE_PATH_M, HeatShield, add_haze, camera_optics, render_state
+from marsyard.scenarios.cameras import camera_optics
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.case_faults import add_detector_faults
+from marsyard.scenarios.condition_columns import hash_images, image_columns
+from marsyard.scenarios.heat_shield import HeatShield
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation import score
 from marsyard.scenarios.localisation.flight import LanderFlight
-from marsyard.scenarios.localisation.instruments import draw_calibrated_camera, measure_altitudes, true_camera
+from marsyard.scenarios.localisation.instruments import (
+    INERTIAL_MARGIN_S,
+    draw_calibrated_camera,
+    measure_altitudes,
+    true_camera,
+)
 from marsyard.scenarios.localisation.map_product import MapTruth, make_map
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.stream import INERTIAL_MARGIN_S, LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.parts.named import PartKind
+from marsyard.scenarios.radiance import HAZE_PATH_M, add_haze, render_state
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements

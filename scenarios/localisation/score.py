@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.scenarios.conditions import attitude_rate_deg_s, contrast_columns, off_nadir_deg, sun_columns
+from marsyard.scenarios.condition_columns import attitude_rate_deg_s, contrast_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.localisation.map_product import MapTruth
-from marsyard.scenarios.localisation.world import sun_at
+from marsyard.scenarios.radiance import sun_at
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 

@@ -10,12 +10,12 @@ from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.exchange import POSITION_STREAM
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionEstimator, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.estimators import Task
-from marsyard.scenarios.localisation.offline import POSITION_FORMAT
+from marsyard.scenarios.localisation.answer_table import POSITION_FORMAT
+from marsyard.scenarios.tasks import Task
 
 LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(
     name="localisation",
-    what="position estimator",
+    noun="position estimator",
     methods=(),
     answers=(PositionEstimate, PositionOutcome),
     shipped={"lvs": MapRelativeEstimator, "sift": FeatureEstimator, "inertial": InertialEstimator},

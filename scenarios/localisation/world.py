@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marsyard.scenarios.exposure import sunlight_ratio
+from marsyard.scenarios.radiance import sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, mesh_size, site_scene
-from marsyard.sim.frames import direction
 from marsyard.sim.render import Scene, Sun
 from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.terrain import Environment, Site, Surface, TerrainParameters
@@ -79,8 +78,3 @@ class LocalisationWorld:
         with a mesh for 2000 m. A mesh that is too fine takes longer.
         """
         return scene.with_mesh((east_m, north_m), *mesh_size(self.surface.spacing_m, height_m))
-
-
-def sun_at(air: Environment, azimuth_deg: float, elevation_deg: float) -> Sun:
-    """Return the sun over a site; azimuth clockwise from north."""
-    return Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), air.sun_radius_rad)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing_site import LANDING, motion_errors, stage_row
 from marsyard.scenarios.measured import store
@@ -23,6 +23,7 @@ from marsyard.scenarios.measured.consistency import agreement_products, agreemen
 from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredSite
+from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.sim.camera import camera_pose
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from pydantic import BaseModel, Field, model_validator
 
 from marsyard.scenarios.base import BaseScenario
-from marsyard.scenarios.conditions import hash_images
+from marsyard.scenarios.condition_columns import hash_images
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images

@@ -12,17 +12,24 @@ from pydantic import BaseModel, Field, model_validator
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
-from marsyard.algorithms.dimes.binning import check_binning
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection, run_on_measurements
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
-from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.tasks import AlgorithmSelection
+from marsyard.scenarios.velocity import (
+    VELOCITY,
+    check_image_size,
+    check_last_interval,
+    consistency_row,
+    velocity_products,
+    velocity_row,
+)
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.streams import Streams
@@ -41,10 +48,9 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
     dimes: Annotated[DimesOptions, Field(description="options of DIMES")] = DimesOptions()
 
     @model_validator(mode="after")
-    def _check_binning(self) -> MeasuredVelocityParameters:
-        if any(name.startswith("dimes") for name in self.algorithms):
-            for image in self.case.images:
-                check_binning(self.dimes.binned_size, image.size)
+    def _check_image_sizes(self) -> MeasuredVelocityParameters:
+        for image in self.case.images:
+            check_image_size(self, image.size)
         return self
 
 

@@ -79,7 +79,7 @@ _TARGET = (
     flag("stuck", "the rover hardly moves over several steps", "with a stuck rover", Kind.TRUTH),
     flag("mobile", "the rover is not stuck", "with a rover that is not stuck", Kind.TRUTH),
     flag("no_false_track", "there is no false track"),
-    flag("handed_over", "the target is handed over to the arm"),
+    flag("handed_off", "the target is handed off to the arm"),
     outcome("updates", "updates of the tracker"),
     outcome("lost_updates", "updates without a tracked target"),
     error("false_updates", "updates more than 10 px from the true projection"),

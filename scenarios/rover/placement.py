@@ -18,8 +18,8 @@ from marsyard.algorithms.vtt.placement import (
     tool_overlap_m,
 )
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.rover.closed_loop import RoverRun
 from marsyard.scenarios.rover.points import Vector, enclosing_spheres, ray_distances, sight_axes, spheres_near_line
-from marsyard.scenarios.rover.run import RoverRun
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements
 
 NAN = float("nan")
@@ -52,7 +52,7 @@ def sample_surface(run: RoverRun, viewpoint: Vector) -> Points3:
     grid = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     rays = point - viewpoint + grid @ np.stack([right, up])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    triangles = run.world.target_triangles
+    triangles = run.setup.world.target_triangles
     half_angle = float(np.arctan(np.sqrt(2.0) * _HALF_WIDTH_M / np.linalg.norm(point - viewpoint)))
     nearby = triangles[spheres_near_line(enclosing_spheres(triangles), viewpoint, point, half_angle)]
     distances = ray_distances(nearby, viewpoint, rays)
@@ -62,8 +62,8 @@ def sample_surface(run: RoverRun, viewpoint: Vector) -> Points3:
 
 def placement_truth(run: RoverRun) -> dict[str, Scalar]:
     """Compute whether a position near the designated point is free of collisions; for a run at its start."""
-    mast, stance = run.rig.calibrated, run.vehicle.stance
-    position = camera_position(mast, mast.geometry.rover_from_head(*run.rig.state.readings_rad))
+    mast, stance = run.setup.rig.calibrated, run.setup.vehicle.stance
+    position = camera_position(mast, mast.geometry.rover_from_head(*run.setup.rig.state.readings_rad))
     viewpoint = np.asarray(stance.world_from_rover.apply(position))
     placement = place_instrument(sample_surface(run, viewpoint), run.target.point_world, viewpoint)
     return {"placeable": placement.outcome in _PLACED}
@@ -86,7 +86,7 @@ def placement_row(run: RoverRun) -> dict[str, Scalar]:
     target, world_from_rover = stop.update.position_rover, stop.stance.world_from_rover
     position = np.asarray(world_from_rover.apply(placement.position_rover.copy()))
     normal = np.asarray(world_from_rover.rotation.apply(placement.normal_rover.copy()))
-    viewpoint = run.rig.camera_positions(stop.world_from_head)[0]
+    viewpoint = run.setup.rig.camera_positions(stop.world_from_head)[0]
     overlap_m = tool_overlap_m(sample_surface(run, viewpoint), position, normal, Instrument())
     error_m = float(np.linalg.norm(position - run.target.point_world))
     return {

@@ -28,13 +28,12 @@ from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
 from marsyard.scenarios.base import LoadGround, TerrainScenario
-from marsyard.scenarios.conditions import image_columns
-from marsyard.scenarios.evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.condition_columns import image_columns
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.rover import placement, score
-from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
-from marsyard.scenarios.rover.run import (
+from marsyard.scenarios.rover.closed_loop import (
     DesignationGuide,
     RoverRun,
     Setup,
@@ -43,6 +42,7 @@ from marsyard.scenarios.rover.run import (
     prepare_run,
     track_target,
 )
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.stops import RunOutcome, StopView, Visibility, designate_point, evaluate_visibility
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.timeline import run_timeline
@@ -186,9 +186,7 @@ def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) 
 
     mast = setup.vehicle.stance.world_from_rover * rig.calibrated.geometry.rover_from_head(0.0, 0.0)
     position = p.target.across, p.target.up
-    run = RoverRun.from_setup(
-        setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast))
-    )
+    run = RoverRun(setup, designate_point(world, rig, mast, (0.0, 0.0), position, p.vtt, compute_viewpoint(mast)))
     guide = DesignationGuide.designate(run, key.margin_px, key.steering == "oracle-target")
     drive_legs(p, run, guide)
     if not guide.views:
@@ -200,8 +198,10 @@ def prepare_shared_run(p: SharedDriveParameters, drive: SharedDrive) -> RoverRun
     """Create a run over the drive's images and designate its target; the tracker is not called."""
     first, run, point = drive.views[0], drive.run, p.targets[p.target]
     position, head = (point.across, point.up), first.world_from_head
-    target = designate_point(run.world, run.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint)
-    return RoverRun.from_setup(run, target)
+    target = designate_point(
+        run.setup.world, run.setup.rig, head, first.angles_rad, position, p.drive.vtt, drive.viewpoint
+    )
+    return RoverRun(run.setup, target)
 
 
 def track_views(p: SharedDriveParameters, drive: SharedDrive, algorithm: str | None = None) -> RoverRun:
@@ -224,12 +224,12 @@ def evaluate_drive_visibility(
     p: RoverScenarioParameters, drive: SharedDrive, point: PointParameters, options: VttOptions
 ) -> tuple[Visibility, dict[str, Scalar]]:
     """Evaluate the visibility of a target along a drive, and the columns of the rover's shadow on it, at all stops."""
-    world, rig, first = drive.run.world, drive.run.rig, drive.views[0]
+    world, rig, first = drive.run.setup.world, drive.run.setup.rig, drive.views[0]
     position = point.across, point.up
     target = designate_point(world, rig, first.world_from_head, first.angles_rad, position, options, drive.viewpoint)
     heads = [view.world_from_head for view in drive.views]
     visibility = evaluate_visibility(world, rig, target.point_world, heads, options)
-    run = RoverRun.from_setup(drive.run, target)
+    run = RoverRun(drive.run.setup, target)
     return visibility, score.shadow_columns(p.model_copy(update={"vtt": options}), run, drive.views)
 
 
@@ -339,10 +339,10 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
 
 
 def place_target(run: RoverRun) -> RoverRun:
-    """Place the instrument on a target that was handed over to the arm; return the run."""
-    target = run.stops[-1].update.position_rover if run.handed_over else None
+    """Place the instrument on a target that was handed off to the arm; return the run."""
+    target = run.stops[-1].update.position_rover if run.handed_off else None
     if target is not None:
-        measurements = run.stops[-1].measurements(run.rig.calibrated)
+        measurements = run.stops[-1].measurements(run.setup.rig.calibrated)
         run.placement = placement.auto_place(measurements, np.asarray(target))
     return run
 

@@ -13,12 +13,12 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
-from marsyard.scenarios.conditions import sun_columns
+from marsyard.scenarios.condition_columns import sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
+from marsyard.scenarios.rover.closed_loop import RoverRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
-from marsyard.scenarios.rover.run import RoverRun
 from marsyard.scenarios.rover.stops import RunOutcome, StopView, evaluate_visibility
 
 NAN = float("nan")
@@ -41,7 +41,7 @@ REDUCTIONS: dict[str, tuple[str, Callable[[np.ndarray], float]]] = {
 
 def errors_px(run: RoverRun) -> Float64[np.ndarray, "stops 2"]:
     """Compute tracked minus true pixels (u, v) of the designated point at all stops; NaN if it was not tracked."""
-    errors = [stop.reported_px(run.rig.calibrated) - stop.point_px for stop in run.stops]
+    errors = [stop.reported_px(run.setup.rig.calibrated) - stop.point_px for stop in run.stops]
     return np.stack(errors) if errors else np.empty((0, 2))
 
 
@@ -64,7 +64,7 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
         # components along the line of sight (positive: too far) and perpendicular to it
         stop, last_error_px = run.stops[-1], errors[-1]
         error_m = stop.error_m()
-        viewpoint = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.rig.left.c.copy()))
+        viewpoint = stop.stance.world_from_rover.inv().apply(stop.world_from_head.apply(run.setup.rig.left.c.copy()))
         line_of_sight = stop.point_rover - viewpoint
         range_error = float(error_m @ line_of_sight / np.linalg.norm(line_of_sight))
         cross_error = float(np.sqrt(np.maximum(float(error_m @ error_m) - range_error * range_error, 0.0)))
@@ -91,7 +91,7 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
         "track_margin_px": p.score.false_track_px - _finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
         "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), NAN),
-        "handed_over": run.handed_over,
+        "handed_off": run.handed_off,
     }
 
 
@@ -112,7 +112,7 @@ def tracking_row(run: RoverRun) -> dict[str, Scalar]:
         )
         drift_m = float(np.linalg.norm(last_m - first_m))
         designation_error = float(np.linalg.norm(first_stop.error_m()))
-        scale = disparity_px_m(run.rig.calibrated.left, run.rig.calibrated.right)
+        scale = disparity_px_m(run.setup.rig.calibrated.left, run.setup.rig.calibrated.right)
         # for a 3-sigma disparity error of 1 px (paper); `scale` contains the baseline, so the third argument is 1
         designation_3_sigma = stereo_range_error_m(first_stop.range_m, scale, 1.0)
     return {
@@ -175,8 +175,8 @@ def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
 
 def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of conditions that do not depend on the tracker, from the simulated objects."""
-    target, rocks, number = run.target, run.world.rocks, run.world.target_number
-    azimuth_error, elevation_error = np.degrees(run.rig.mast.zeros_rad)
+    target, rocks, number = run.target, run.setup.world.rocks, run.setup.world.target_number
+    azimuth_error, elevation_error = np.degrees(run.setup.rig.mast.zeros_rad)
     return {
         "site": p.world.site,
         "terrain": p.world.terrain,
@@ -196,8 +196,8 @@ def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Sca
         "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
         "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
         "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
-        "disparity_error_start_px": run.rig.head.disparity_error_px(START_M),
-        "disparity_error_goal_px": run.rig.head.disparity_error_px(GOAL_M),
+        "disparity_error_start_px": run.setup.rig.head.disparity_error_px(START_M),
+        "disparity_error_goal_px": run.setup.rig.head.disparity_error_px(GOAL_M),
         "mast_azimuth_error_deg": float(azimuth_error),
         "mast_elevation_error_deg": float(elevation_error),
     }
@@ -205,7 +205,7 @@ def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Sca
 
 def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of conditions that depend on the tracker's run, from the simulated objects."""
-    stops, world = run.stops, run.world
+    stops, world = run.stops, run.setup.world
     drives = [drive for stop in stops for drive in stop.drives]
     lengths = np.array([drive.command.length_m for drive in drives])
     is_moving = lengths > 0.0
@@ -247,7 +247,7 @@ def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, S
         obliquity = {"obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
         return {"point_in_view": True, **obliquity, **shadow_columns(p, run, [])}
     heads = [stop.world_from_head for stop in run.stops]
-    columns = asdict(evaluate_visibility(run.world, run.rig, run.target.point_world, heads, p.vtt))
+    columns = asdict(evaluate_visibility(run.setup.world, run.setup.rig, run.target.point_world, heads, p.vtt))
     # NaN (not tracked) is an error, too
     errors = np.nan_to_num(np.hypot(*errors_px(run).T), nan=np.inf) > p.score.false_track_px
     end = int(np.argmax(errors)) + 1 if np.any(errors) else len(run.stops)
@@ -256,13 +256,13 @@ def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, S
 
 def shadow_columns(p: RoverScenarioParameters, run: RoverRun, views: Sequence[StopView]) -> dict[str, Scalar]:
     """Compute the columns of the rover's shadow: whether it is on the template of the designated point in any view."""
-    half_angle, mast = 0.5 * p.vtt.template_px * run.rig.pixel_rad, run.rig.calibrated.geometry
+    half_angle, mast = 0.5 * p.vtt.template_px * run.setup.rig.pixel_rad, run.setup.rig.calibrated.geometry
 
     def is_in_shadow(view: StopView) -> bool:
-        viewpoint = run.rig.camera_positions(view.world_from_head)[0]
+        viewpoint = run.setup.rig.camera_positions(view.world_from_head)[0]
         patch = sample_template(viewpoint, run.target.point_world, half_angle)
-        sun = run.world.sun.direction(view.time_s)
-        return rover_shades_patch(run.vehicle.rover, view.stance, mast, view.angles_rad, patch, sun)
+        sun = run.setup.world.sun.direction(view.time_s)
+        return rover_shades_patch(run.setup.vehicle.rover, view.stance, mast, view.angles_rad, patch, sun)
 
     is_shadowed = p.rover_shadow and any(is_in_shadow(view) for view in views)
     return {"rover_shadow_on_target": is_shadowed, "no_rover_shadow_on_target": not is_shadowed}
@@ -288,14 +288,14 @@ def products(p: RoverScenarioParameters, run: RoverRun) -> dict[str, object]:
     rocks_m            east, north and diameter of the target's rock and the obstacles, (rocks, 3)
     ================== ================================================================================================
     """
-    stops, rocks, rock_indices = run.stops, run.world.rocks, list(run.world.rocks.names.values())
+    stops, rocks, rock_indices = run.stops, run.setup.world.rocks, list(run.setup.world.rocks.names.values())
     arrays: dict[str, object] = {}
     for number, stop in enumerate(stops, start=1):
         left, right, details = stop.images.left, stop.images.right, stop.details
         window, matched_px = np.full(4, np.nan), np.full((2, 2), np.nan)
         if details is not None and details.window is not None and details.window_corner is not None:
             window = np.array([*details.window_corner, *details.window.shape[::-1]], dtype=np.float64)
-        matched_px[0] = stop.reported_px(run.rig.calibrated)
+        matched_px[0] = stop.reported_px(run.setup.rig.calibrated)
         if details is not None and details.stereo is not None and stop.update.tracked:
             matched_px[1] = details.stereo.pixel
         stop_arrays = {
@@ -332,7 +332,7 @@ def products(p: RoverScenarioParameters, run: RoverRun) -> dict[str, object]:
 
 def create_scored_run(run: RoverRun) -> ScoredRun:
     """Create the input of custom scores."""
-    mast = run.rig.calibrated
+    mast = run.setup.rig.calibrated
     return ScoredRun(
         outcome=run.outcome.name,
         target_world=run.target.point_world.copy(),

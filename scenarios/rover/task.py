@@ -8,11 +8,11 @@ from marsyard.algorithms.exchange import ExecutableTargetTracker
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetLoss, TargetTracker, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt import PURE_NCC, VisualTargetTracker, VttOptions, lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import IMPROVEMENTS
-from marsyard.scenarios.estimators import Task, variants
+from marsyard.scenarios.tasks import Task, variants
 
 TRACKING: Task[TargetTracker, VttOptions] = Task(
     name="tracking",
-    what="target tracker",
+    noun="target tracker",
     methods=("designate", "aim", "update", "clear", "state"),
     answers=(MastAim, PixelBox, TargetUpdate, TargetLoss, TrackingState),
     shipped={

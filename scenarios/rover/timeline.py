@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.scenarios.rover.closed_loop import RoverRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import RoverRun
 from marsyard.scenarios.rover.score import update_quantities
 from marsyard.scenarios.rover.stops import Stop
 from marsyard.scenarios.timeline import CameraPose, Path, Points, Series, TimedImage, Timeline, surface_from_above
@@ -28,7 +28,9 @@ def run_timeline(p: RoverScenarioParameters, run: RoverRun) -> Timeline:
     centre, half_width_m = 0.5 * (low + high), 0.5 * float((high - low).max()) + _MARGIN_M
 
     def create_scene(east_m: float, north_m: float, height_m: float, pixel_rad: float) -> Scene:
-        return site_scene(run.world.ground, Viewpoint(east_m, north_m, height_m, pixel_rad), run.world.scene(0.0).sun)
+        return site_scene(
+            run.setup.world.ground, Viewpoint(east_m, north_m, height_m, pixel_rad), run.setup.world.scene(0.0).sun
+        )
 
     tracked = [stop for stop in stops if stop.reported_position_rover is not None]
     quantities = update_quantities(run)
@@ -77,7 +79,7 @@ def _true_path(stops: list[Stop]) -> Path:
 def _images(run: RoverRun, stop: Stop, template_px: float) -> list[TimedImage]:
     """Return the subframes of a stop; the tracked template and the search window are marked in the left one."""
     images = []
-    details, rig = stop.details, run.rig
+    details, rig = stop.details, run.setup.rig
     for name, camera, image in (("left", rig.left, stop.images.left), ("right", rig.right, stop.images.right)):
         corner = np.array(image.corner, dtype=np.float64)
         subframe = camera.crop(*image.corner, image.counts.shape[::-1])
@@ -93,6 +95,6 @@ def _images(run: RoverRun, stop: Stop, template_px: float) -> list[TimedImage]:
                 upper_left = np.asarray(details.window_corner, dtype=np.float64) - corner - 0.5  # of a pixel's centre
                 boxes["search window"] = np.array([[*upper_left, *details.window.shape[::-1]]], dtype=np.float64)
         pose = CameraPose.from_camera(subframe, stop.world_from_head)
-        bits = run.camera.detectors[0].parameters.bits
+        bits = run.setup.camera.detectors[0].parameters.bits
         images.append(TimedImage(f"{name} camera", stop.time_s, image.counts, bits, pose, marks, boxes))
     return images

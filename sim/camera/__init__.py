@@ -7,13 +7,7 @@ column and row, with the centre of the upper left pixel at (0, 0).
 
 from marsyard.sim.camera.base import CameraModel, camera_pose, mount_looking_down
 from marsyard.sim.camera.calibrations import Calibration, read_calibrations
-from marsyard.sim.camera.label_frames import FramedCamera, LabelFrame
-from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
-from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
-from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product
-from marsyard.sim.camera.pds4 import read_pds4
-from marsyard.sim.camera.source import CameraFileError
-from marsyard.sim.camera.text_files import (
+from marsyard.sim.camera.camera_files import (
     BODY_FRAME,
     HEAD_FRAME,
     read_cahvor,
@@ -22,6 +16,12 @@ from marsyard.sim.camera.text_files import (
     read_framed_cameras,
     write_cahvor,
 )
+from marsyard.sim.camera.label_frames import FramedCamera, LabelFrame
+from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
+from marsyard.sim.camera.pds import Pds3Product, read_pds3, read_pds3_product
+from marsyard.sim.camera.pds4 import read_pds4
+from marsyard.sim.camera.source import CameraFileError
 
 __all__ = ["BODY_FRAME", "HEAD_FRAME", "Cahv", "Cahvor", "Cahvore", "Calibration", "CameraFileError", "CameraModel"]
 __all__ += [

@@ -139,14 +139,14 @@ def _iterate_numbers(value: object) -> Iterator[float]:
 def test_other_format_version_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
     write_case(tmp_path, measurements)
     path = tmp_path / "case.json"
-    path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
-    with pytest.raises(ValueError, match="version 2 is not supported; supported: 1"):
+    path.write_text(path.read_text().replace('"exchange": 3', '"exchange": 2'))
+    with pytest.raises(ValueError, match="version 2 is not supported; supported: 3"):
         read_case(tmp_path)
 
 
 #: Python expression of a valid answer in JSON.
 ANSWER = (
-    'json.dumps({"exchange": 1, "outcome": "VALID", "velocity_m_s": [1.5, -2], "covariance_m2_s2": [[1, 0], [0, 4]]})'
+    'json.dumps({"exchange": 3, "outcome": "VALID", "velocity_m_s": [1.5, -2], "covariance_m2_s2": [[1, 0], [0, 4]]})'
 )
 
 
@@ -173,14 +173,14 @@ def test_program_answer_and_stderr_are_stored(measurements: DescentMeasurements,
         ("while True: print('more output')", Fault.TOO_MUCH_OUTPUT, "1 MB"),
         ("", Fault.BAD_ANSWER, "not one JSON object"),
         ("print('[1]')", Fault.BAD_ANSWER, "not one JSON object"),
-        ("print('{}')", Fault.BAD_ANSWER, "exchange is None; allowed: 1"),
+        ("print('{}')", Fault.BAD_ANSWER, "exchange is None; allowed: 3"),
         (f"print({ANSWER}); print({ANSWER})", Fault.BAD_ANSWER, "not one JSON object"),
         (f"print({ANSWER}.replace('VALID', 'FINE'))", Fault.BAD_ANSWER, "outcome is 'FINE'; allowed: VALID, NO_TEMP"),
         (f"print({ANSWER}.replace('1.5', 'NaN'))", Fault.BAD_ANSWER, "velocity_m_s"),
         (f"print({ANSWER}.replace('1.5', '[1.5]'))", Fault.BAD_ANSWER, "velocity_m_s"),
         (f"print({ANSWER}.replace('4]', '-4]'))", Fault.BAD_ANSWER, "not positive definite"),
         (f"print({ANSWER}.replace('covariance', 'kovariance'))", Fault.BAD_ANSWER, "unknown key 'kovariance_m2_s2'"),
-        ('print(\'{"exchange": 1, "outcome": "VALID"}\')', Fault.BAD_ANSWER, "velocity_m_s is missing"),
+        ('print(\'{"exchange": 3, "outcome": "VALID"}\')', Fault.BAD_ANSWER, "velocity_m_s is missing"),
     ],
 )
 def test_program_errors_are_reported_as_faults(
@@ -204,11 +204,13 @@ def test_program_errors_are_reported_as_faults(
 
 #: A persistent program that answers its first two cases with the number of the case as velocity, and then aborts.
 SERVER = f"""
-print(json.dumps({{"exchange": 1, "ready": True}}), flush=True)
+print(json.dumps({{"exchange": 3, "ready": True}}), flush=True)
 for number, line in enumerate(sys.stdin):
-    assert json.load(open(json.loads(line)["case"] + "/case.json"))["exchange"] == 1
+    request = json.loads(line)
+    assert json.load(open(request["case"] + "/case.json"))["exchange"] == 3
     if number == 2: os.abort()
-    print({ANSWER}.replace("1.5", str(number)), flush=True)
+    answer = json.loads({ANSWER}.replace("1.5", str(number)))
+    print(json.dumps(answer | {{"id": request["id"]}}), flush=True)
 """
 
 
@@ -224,29 +226,21 @@ def test_persistent_program_restarts_after_a_crash(measurements: DescentMeasurem
     end_idle_programs()
 
 
-#: A program that answers each case twice: `{pause_s}` after the request, and again after the same time.
+#: A program that answers each case twice: `PAUSE_S` after the request, and again after the same time.
 DOUBLE_ANSWERS = """
-print(json.dumps({"exchange": {version}, "ready": True}), flush=True)
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 for number, line in enumerate(sys.stdin):
     request = json.loads(line)
-    time.sleep({pause_s})
-    answer = {"exchange": {version}, {identity}"outcome": "VALID", "velocity_m_s": [number, 0]}
+    time.sleep(PAUSE_S)
+    answer = {"exchange": 3, "id": request["id"], "outcome": "VALID", "velocity_m_s": [number, 0]}
     print(json.dumps(answer), flush=True)
-    time.sleep({pause_s})
+    time.sleep(PAUSE_S)
     print(json.dumps(answer), flush=True)
 """
 
 
-def format_double_answers(version: int, pause_s: float = 0.05) -> str:
-    """Fill in `DOUBLE_ANSWERS` for a version of the exchange format; version 1 has no request ids."""
-    identity = '"id": request["id"], ' if version > 1 else ""
-    text = DOUBLE_ANSWERS.replace("{version}", str(version)).replace("{identity}", identity)
-    return text.replace("{pause_s}", str(pause_s))
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements, tmp_path: Path, version: int) -> None:
-    spec = f"serve:{write_program(tmp_path, format_double_answers(version))}"
+def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements, tmp_path: Path) -> None:
+    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS.replace('PAUSE_S', '0.05'))}"
     first = run_program(spec, measurements).velocity_m_s
     assert first is not None
     time.sleep(0.5)  # the second line is in the pipe
@@ -262,7 +256,7 @@ def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements,
 
 def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
     # The second line follows the next request: only its id shows that it answers the previous request.
-    spec = f"serve:{write_program(tmp_path, format_double_answers(2, pause_s=1.0))}"
+    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS.replace('PAUSE_S', '1.0'))}"
     run_program(spec, measurements)
     with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as error:
         run_program(spec, measurements)
@@ -273,26 +267,30 @@ def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements
 @pytest.mark.parametrize(
     ("reply", "message"),
     [
-        ('{"exchange": 1, "outcome": "NO_VALID_TRACK"}', "the answer's exchange is 1; allowed: 2"),
-        ('{"exchange": 2, "outcome": "NO_VALID_TRACK"}', "the answer's id is None; allowed: 1"),
-        ('{"exchange": 2, "id": true, "outcome": "NO_VALID_TRACK"}', "the answer's id is True; allowed: 1"),
-        ('{"exchange": 2, "id": "1", "outcome": "NO_VALID_TRACK"}', "the answer's id is '1'; allowed: 1"),
+        ('{"exchange": 2, "outcome": "NO_VALID_TRACK"}', "the answer's exchange is 2; allowed: 3"),
+        ('{"exchange": 3, "outcome": "NO_VALID_TRACK"}', "the answer's id is None; allowed: 1"),
+        ('{"exchange": 3, "id": true, "outcome": "NO_VALID_TRACK"}', "the answer's id is True; allowed: 1"),
+        ('{"exchange": 3, "id": "1", "outcome": "NO_VALID_TRACK"}', "the answer's id is '1'; allowed: 1"),
     ],
 )
 def test_answer_needs_the_request_id(
     measurements: DescentMeasurements, tmp_path: Path, reply: str, message: str
 ) -> None:
     body = (
-        f"""print('{{"exchange": 2, "ready": true}}', flush=True)\nsys.stdin.readline()\nprint('{reply}', flush=True)"""
+        f"""print('{{"exchange": 3, "ready": true}}', flush=True)\nsys.stdin.readline()\nprint('{reply}', flush=True)"""
     )
     with pytest.raises(AlgorithmError, match=message) as error:
         run_program(f"serve:{write_program(tmp_path, body)}", measurements)
     assert error.value.fault is Fault.BAD_ANSWER
 
 
-def test_persistent_program_must_report_ready(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    with pytest.raises(AlgorithmError, match="its first line is") as error:
-        run_program(f"serve:{write_program(tmp_path, 'print({}, flush=True); time.sleep(60)')}", measurements)
+@pytest.mark.parametrize("line", [{}, {"exchange": 2, "ready": True}])
+def test_first_line_must_report_ready_and_the_version(
+    measurements: DescentMeasurements, tmp_path: Path, line: dict[str, object]
+) -> None:
+    program = write_program(tmp_path, f"print(json.dumps({line}), flush=True); time.sleep(60)")
+    with pytest.raises(AlgorithmError, match=r'its first line is .*; expected {"exchange": 3, "ready": true}') as error:
+        run_program(f"serve:{program}", measurements)
     assert error.value.fault is Fault.BAD_ANSWER
 
 

@@ -41,7 +41,7 @@ def mast(request):
     return masts.setdefault(request["mast"], read_mast(Path(request["mast"])))
 def encode_box(box):
     return {"corner": box.corner, "size": box.size}
-print(json.dumps({"exchange": 1, "ready": True}), flush=True)
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 for line in sys.stdin:
     request = json.loads(line)
     if request["do"] == "designate":
@@ -60,7 +60,7 @@ for line in sys.stdin:
         position = update.position_rover
         answer = {"state": update.state.name, "losses": [loss.name for loss in update.losses],
                   "position_rover": None if position is None else position.tolist()}
-    print(json.dumps({"exchange": 1, **answer}), flush=True)
+    print(json.dumps({"exchange": 3, "id": request["id"], **answer}), flush=True)
 """
 
 
@@ -148,19 +148,19 @@ def test_example_tracks_the_target() -> None:
 
 
 #: Start of a program: imports, and the line that reports that it is ready.
-READY = 'import json, sys\nprint(json.dumps({"exchange": 1, "ready": True}), flush=True)\n'
+READY = 'import json, sys\nprint(json.dumps({"exchange": 3, "ready": True}), flush=True)\n'
 #: A program that prints fixed answers without evaluating the requests.
 ANSWERING_PROGRAM = (
     READY
     + """
-OK = '{"exchange": 1, "state": "NORMAL"}'
-AIM = '{"exchange": 1, "aim": {"azimuth_rad": 0, "elevation_rad": 0, "left": BOX, "right": BOX}}'
+OK = '{"exchange": 3, "state": "NORMAL"}'
+AIM = '{"exchange": 3, "aim": {"azimuth_rad": 0, "elevation_rad": 0, "left": BOX, "right": BOX}}'
 WIDE, SMALL = '{"corner": [0, 0], "size": [9999, 64]}', '{"corner": [0, 0], "size": [64, 64]}'
 VALID_AIM = AIM.replace("BOX", SMALL)
 for answer in ANSWERS:
-    sys.stdin.readline()
+    identity = '"exchange": 3, "id": %d' % json.loads(sys.stdin.readline())["id"]
     print("hm", file=sys.stderr, flush=True)
-    print(answer.replace("BOX", SMALL), flush=True)
+    print(answer.replace("BOX", SMALL).replace('"exchange": 3', identity), flush=True)
 """
 )
 
@@ -168,23 +168,23 @@ for answer in ANSWERS:
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
-        ("['{}']", "exchange is None; allowed: 1"),
-        ("['{\"exchange\": 1}']", "state is None; allowed: NO_TARGET, NORMAL"),
+        ("['{}']", "exchange is None; allowed: 3"),
+        ("['{\"exchange\": 3}']", "state is None; allowed: NO_TARGET, NORMAL"),
         # the reported fault depends on how soon the process ends
         ("[]", "its output ended without an answer|it closed its input"),
-        ('[OK, \'{"exchange": 1, "aim": 3}\']', "aim is 3; allowed: null"),
-        ('[OK, \'{"exchange": 1, "aim": {"azimuth_rad": 0}}\']', "an angle of aim is missing"),
+        ('[OK, \'{"exchange": 3, "aim": 3}\']', "aim is 3; allowed: null"),
+        ('[OK, \'{"exchange": 3, "aim": {"azimuth_rad": 0}}\']', "an angle of aim is missing"),
         ("[OK, AIM.replace('BOX', '[0, 0, 1024, 1024]')]", r"left is \[0, 0, 1024, 1024\]; allowed"),
         ("[OK, AIM.replace('_rad\": 0', '_rad\": 9')]", "azimuth_rad is 9.0; allowed"),
         ("[OK, AIM.replace('BOX', WIDE)]", "allowed: whole pixels inside the frame"),
-        ('[OK, VALID_AIM, \'{"exchange": 1, "state": "FOUND"}\']', "state is 'FOUND'"),
-        ('[OK, VALID_AIM, \'{"exchange": 1, "state": "NORMAL"}\']', "position_rover is None"),
+        ('[OK, VALID_AIM, \'{"exchange": 3, "state": "FOUND"}\']', "state is 'FOUND'"),
+        ('[OK, VALID_AIM, \'{"exchange": 3, "state": "NORMAL"}\']', "position_rover is None"),
         (
-            '[OK, VALID_AIM, \'{"exchange": 1, "state": "LOST", "losses": ["TIRED"]}\']',
+            '[OK, VALID_AIM, \'{"exchange": 3, "state": "LOST", "losses": ["TIRED"]}\']',
             "a loss is 'TIRED'; allowed: LOW_MATCH_SCORE",
         ),
         (
-            '[OK, VALID_AIM, \'{"exchange": 1, "state": "NORMAL", "position_rover": [1, 2]}\']',
+            '[OK, VALID_AIM, \'{"exchange": 3, "state": "NORMAL", "position_rover": [1, 2]}\']',
             r"position_rover is '\[1, 2\]'",
         ),
     ],

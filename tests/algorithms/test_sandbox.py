@@ -40,8 +40,8 @@ ATTEMPTS = """
 PROGRAM = (
     ATTEMPTS
     + """
-    assert json.loads(Path(sys.argv[-1], "case.json").read_text())["exchange"] == 1
-    print(attempts() or json.dumps({"exchange": 1, "outcome": "NO_VALID_TRACK"}))
+    assert json.loads(Path(sys.argv[-1], "case.json").read_text())["exchange"] == 3
+    print(attempts() or json.dumps({"exchange": 3, "outcome": "NO_VALID_TRACK"}))
 """
 )
 MODULE = (

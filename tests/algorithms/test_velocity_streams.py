@@ -26,8 +26,8 @@ from marsyard.algorithms.exchange import (
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
-from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.input_copies import hash_inputs
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.velocity import check_velocity_answer
 from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, DescentMeasurements, ImuIncrements
@@ -36,7 +36,7 @@ from marsyard.sim.sensor import InertialSolution
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 NO_VELOCITY = VelocityEstimate(VelocityOutcome.NO_VALID_TRACK, None)
 #: Start of a program: imports, and the line that reports that it is ready.
-READY = "import json, os, sys, time\nprint(json.dumps({'exchange': 1, 'ready': True}), flush=True)\n"
+READY = "import json, os, sys, time\nprint(json.dumps({'exchange': 3, 'ready': True}), flush=True)\n"
 
 
 def make_estimate(*span_s: float) -> VelocityEstimate:
@@ -229,8 +229,8 @@ def test_frame_files_round_trip(tmp_path: Path, altitude_m: float) -> None:
     assert restored_frame.gravity_m_s2 == frame.gravity_m_s2 == 3.71
     assert (restored_frame.attitude.world_from_body.inv() * frame.attitude.world_from_body).magnitude() < 1e-14
     path = tmp_path / "image.json"
-    path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 2'))
-    with pytest.raises(ValueError, match="is not a valid descent image file: exchange format version 2"):
+    path.write_text(path.read_text().replace('"exchange": 3', '"exchange": 2'))
+    with pytest.raises(ValueError, match="is not a valid descent image file: exchange version 2"):
         read_frame(tmp_path)
 
 
@@ -312,12 +312,12 @@ def test_example_integrates_increments_in_python_and_as_program(monkeypatch: pyt
 #: A program that writes the names of its requests to stderr.
 RECORDING_PROGRAM = """
 import json, sys
-print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 seen = []
 for line in sys.stdin:
     request = json.loads(line)
     seen.append(request["do"])
-    answer = {"exchange": 2, "id": request["id"], "outcome": None}
+    answer = {"exchange": 3, "id": request["id"], "outcome": None}
     if request["do"] == "finish":
         print(json.dumps(seen), file=sys.stderr, flush=True)
         answer["outcome"] = "NO_VALID_TRACK"
@@ -339,31 +339,37 @@ def test_programs_receive_the_calls_of_a_stream(tmp_path: Path) -> None:
 
 def format_server(answers: list[str]) -> str:
     """Return a program that sends fixed answers without evaluating its requests."""
-    return f"{READY}for answer in {answers}:\n    sys.stdin.readline()\n    print(answer, flush=True)\n"
+    return (
+        f"{READY}for answer in {answers}:"
+        + """
+    identity = '"exchange": 3, "id": %d' % json.loads(sys.stdin.readline())["id"]
+    print(answer.replace('"exchange": 3', identity), flush=True)
+"""
+    )
 
 
 #: Answer to an image, before the first velocity.
-NO_VELOCITY_YET = '{"exchange": 1, "outcome": null}'
+NO_VELOCITY_YET = '{"exchange": 3, "outcome": null}'
 
 
 @pytest.mark.parametrize(
     ("answers", "message"),
     [
         (
-            ['{"exchange": 1, "outcome": "NO_VALID_TRACK"}'],
+            ['{"exchange": 3, "outcome": "NO_VALID_TRACK"}'],
             "outcome is 'NO_VALID_TRACK'; only process_image and finish",
         ),
-        (['{"exchange": 1, "outcome": null, "inertial": 1}'], "unknown key 'inertial'; allowed: exchange, outcome"),
+        (['{"exchange": 3, "outcome": null, "inertial": 1}'], "unknown key 'inertial'; allowed: exchange, outcome"),
         ([NO_VELOCITY_YET, "3"], "not one JSON object"),
-        ([NO_VELOCITY_YET, '{"exchange": 1}'], "outcome is None; allowed: VALID"),
-        ([NO_VELOCITY_YET, '{"exchange": 1, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
+        ([NO_VELOCITY_YET, '{"exchange": 3}'], "outcome is None; allowed: VALID"),
+        ([NO_VELOCITY_YET, '{"exchange": 3, "outcome": null, "span_s": [1, 2]}'], "unknown key 'span_s'"),
         (
             [
                 NO_VELOCITY_YET,
                 NO_VELOCITY_YET,
-                '{"exchange": 1, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}',
+                '{"exchange": 3, "outcome": "VALID", "velocity_m_s": [1, 2], "span_s": [0, 1]}',
                 NO_VELOCITY_YET,
-                '{"exchange": 1, "outcome": "NO_VALID_TRACK"}',
+                '{"exchange": 3, "outcome": "NO_VALID_TRACK"}',
             ],
             r"span_s is \(0.0, 1.0\); allowed: within",
         ),

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign, run_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import describe_origin

@@ -5,11 +5,12 @@ from typing import ClassVar
 
 from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.algorithm_run import AlgorithmSelection, run_algorithm
+from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import Task
-from marsyard.scenarios.evaluation import case_result
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.tasks import AlgorithmSelection, Task
 from marsyard.scenarios.velocity import VELOCITY, velocity_row
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs
@@ -32,20 +33,19 @@ class FakeVelocityScenario(ScenarioWithoutInputs):
         descent = inputs.descent()
         measurements = replace(descent, interval_velocities_m_s=descent.interval_velocities_m_s + inertial_error_m_s)
 
-        def evaluate(algorithm: str) -> CaseResult:
-            executable, case = parameters.executable, streams.case
-            run_result = run_algorithm(
-                lambda: VELOCITY.make(algorithm, DimesOptions(), executable, case).estimate(measurements),
+        def run_estimator(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
+            return run_algorithm(
+                lambda: VELOCITY.make(algorithm, DimesOptions(), parameters.executable, streams.case).estimate(
+                    measurements
+                ),
                 check_velocity,
             )
-            velocity = None if run_result.answer is None else run_result.answer.velocity_m_s
-            return CaseResult(
-                outcome=run_result.outcome_name,
-                answered=velocity is not None,
-                row={**velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]), **run_result.row},
-                failure=run_result.failure,
-            )
+
+        def score(algorithm: str, runs: Runs[VelocityEstimate]) -> Score:
+            answer = runs[algorithm].answer
+            velocity = None if answer is None else answer.velocity_m_s
+            return Score(velocity is not None, velocity_row("velocity", velocity, inputs.DESCENT_VELOCITY_M_S[:2]))
 
         # the inputs of the cases differ only in their inertial velocities
         input_text = f"{measurements.interval_velocities_m_s.tolist()}"
-        return case_result(parameters.algorithms, evaluate, {"image_hash": input_text})
+        return evaluate_case(parameters, {"image_hash": input_text}, run_estimator, score)

@@ -14,7 +14,7 @@ from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.confirmations import create_record, read_confirmations, read_record
-from marsyard.campaigns.store.registration import find_registration_problem
+from marsyard.campaigns.store.git_registration import find_registration_problem
 from marsyard.sim.terrain.bank import TerrainBank
 from tests.marsyard.confirmation_project import (
     BAD_LUCK,

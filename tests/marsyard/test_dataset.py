@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.dataset import _prepare_terrains
-from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.sim.camera import read_cahvor
 from tests.command import run_command
 

@@ -19,9 +19,9 @@ from marsyard.cli.gallery import (
     map_to_grey,
     write_gallery,
 )
-from marsyard.cli.images import ImageRequest
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
+from marsyard.site_images import ImageRequest
 from tests.command import marsyard
 
 

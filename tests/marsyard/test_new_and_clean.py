@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
-from marsyard.cli.outcome import evidence_limits
+from marsyard.cli.estimate import evidence_limits
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.verdicts import Status

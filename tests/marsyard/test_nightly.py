@@ -10,7 +10,7 @@ import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
-from marsyard.cli import nightly_plan
+from marsyard.cli import nightly_run
 from marsyard.cli.nightly_plan import PLAN_FILE, hash_definition, night_seed, read_plan
 from tests.campaigns.fake_campaign import DISPERSIONS, REQUIREMENT, write_campaign
 from tests.command import marsyard
@@ -100,7 +100,7 @@ def test_killed_run_is_shown_and_not_compared(
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(nightly_plan, "run_scheduled_campaign", kill)
+        patch.setattr(nightly_run, "run_scheduled_campaign", kill)
         with pytest.raises(Killed):
             nightly()
     assert (tmp_path / "out" / "nightly.md").read_text().startswith("# Night 1: RUNNING")
@@ -114,7 +114,7 @@ def test_killed_run_is_shown_and_not_compared(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(nightly_plan, "run_scheduled_campaign", interrupt)
+        patch.setattr(nightly_run, "run_scheduled_campaign", interrupt)
         status, report = nightly()
     assert (status, report.splitlines()[0]) == (130, "# Night 3: INTERRUPTED")
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.cli import images
-from marsyard.cli.images import SUFFIXES
+from marsyard import site_images
 from marsyard.sim.camera import read_cahvor
 from marsyard.sim.kernel_cache import mark_ready
 from marsyard.sim.render import Objects, Sun, scene
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.kernels.casters import Casters
 from marsyard.sim.render.scene import casters_towards
+from marsyard.site_images import SUFFIXES
 from tests.command import marsyard
 
 
@@ -168,7 +168,7 @@ def test_first_compilation_is_noted(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         raise RenderingError("stopped")
 
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kernels"))
-    monkeypatch.setattr(images, "render_images", fail)
+    monkeypatch.setattr(site_images, "render_images", fail)
     if compiled_by is not None:
         mark_ready(compiled_by)
     status, _, message = marsyard("render", "heli-benign", "--camera", "xc-55", "--out", tmp_path / "x")

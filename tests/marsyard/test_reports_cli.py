@@ -15,10 +15,10 @@ import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.store import record
-from marsyard.cli.outcome import run_until_decided
+from marsyard.cli.until_decided import run_until_decided
 from marsyard.reports.dashboard.server import create_server
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import next_look

@@ -14,7 +14,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.result import Result, open_result
 from marsyard.scenarios.imports import import_object, source_files
-from marsyard.scenarios.objects import name_object
+from marsyard.scenarios.stored_objects import name_object
 from tests.reports.synthetic_run import VELOCITY, make_rows, write_run
 
 SCENARIO = "tests.campaigns.fake_velocity:FakeVelocityScenario"

@@ -44,7 +44,7 @@ from marsyard.scenarios.measured.image_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.layout import VELOCITY as TASK
 from marsyard.scenarios.measured.layout import IngestError, read_ingest_file, read_table
 from marsyard.scenarios.meshes import MeshFileError, read_mesh
-from marsyard.scenarios.offline import VELOCITY_FORMAT, read_answers
+from marsyard.scenarios.offline_algorithms import VELOCITY_FORMAT, read_answers
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.sim.camera import CameraFileError, read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, TrajectoryFileError, read_poses

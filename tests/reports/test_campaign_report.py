@@ -14,11 +14,11 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.store.record import describe_machine
 from marsyard.reports.campaign import write_report
-from marsyard.reports.record import SCHEMA
-from marsyard.reports.sections import script_hash
+from marsyard.reports.page import script_hash
+from marsyard.reports.report_file import SCHEMA
 from marsyard.sim.cache import hide_folders
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from marsyard.reports.explorer import MAX_POINTS, ExploredRequirement, choose_points, explorer_data
+from marsyard.reports.page import embed_json
 from marsyard.reports.presentation import gallery_cases, notable_cases
-from marsyard.reports.sections import embed_json
 from marsyard.reports.stored import read_run
 from tests.reports.synthetic_run import make_rows
 

@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pytest
 
+from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.studies.rare_decision import RareSample, decide_rare
-from marsyard.campaigns.studies.runner import convert_to_json
+from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult
+from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
 from marsyard.reports.rare import rare_sentences
-from marsyard.reports.stored import read_study
 
 
 def create_study(limit: float, violations: int, cases: int, terrains: int = 0, probability: float = 1e-4) -> Any:
-    """Create the stored parameters and the result of a study with four replicates around a probability."""
+    """Create the record of a study with four replicates around a probability."""
     replicates = [
         SubsetResult(factor * probability, SubsetEnd.VIOLATION, (2.0, 1.0), (Level(1.0, 50, 0),), np.zeros((1, 2)))
         for factor in (0.8, 1.0, 1.3, 0.9)
     ]
     names = [f"terrain {case % terrains}" if terrains else None for case in range(cases)]
     decision = decide_rare(RareSample(replicates, np.arange(cases) < violations, names), limit, 0.9)
-    result = {"verdict": decision.verdict, "decision": asdict(decision), "cases": 3000, "violations": 40}
-    result |= {"replicates": [], "margin_text": "The margin is 5 - |error|."}
-    return {
-        "kind": "rare", "requirement": "VEL", "method": "subset", "max_probability": limit,
-        "result": convert_to_json(result),
-    }  # fmt: skip
+    result = RareResult(decision.verdict, decision, 3000, 40, (), "The margin is 5 - |error|.")
+    study = RARE.encode(RareParameters("VEL", limit)) | {"result": convert_to_json(asdict(result))}
+    return {"study": json.loads(json.dumps(study))}
 
 
 def test_pass_states_the_counting_bound() -> None:
@@ -70,4 +69,11 @@ def test_shared_terrains_are_stated() -> None:
 
 @pytest.mark.parametrize("study", [{}, {"kind": "search", "result": {"violations": 1}}])
 def test_other_studies_have_no_sentences(study: dict[str, Any]) -> None:
-    assert rare_sentences(read_study({"study": study}, "rare")) == []
+    assert rare_sentences({"study": study}) == []
+
+
+def test_damaged_result_is_reported() -> None:
+    record = create_study(1e-2, 0, 1000)
+    record["study"]["result"]["decision"]["counting"]["units"] = "many"
+    with pytest.raises(StoreError, match=r"the study in campaign.json is damaged: .*integer"):
+        rare_sentences(record)

@@ -9,7 +9,7 @@ import pytest
 
 from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.record import read_report
+from marsyard.reports.report_file import read_report
 from tests.reports.synthetic_run import MakeRun, make_rows
 
 

@@ -46,7 +46,7 @@ def test_designs_without_independent_draws_have_no_confidence(definition: dict[s
         assert (verdict.n, verdict.failures, verdict.estimate) == (reference.n, reference.failures, reference.estimate)
         assert math.isnan(verdict.lower)
         assert math.isnan(verdict.upper)
-        assert verdict.further_cases is None
+        assert verdict.additional_cases is None
         assert message in verdict.note
     verdicts = evaluate_requirements(frame, requirements, design)
     summary = combine_verdicts(verdicts, frame, design)

@@ -21,8 +21,8 @@ from marsyard.reports.blocks import correlation_text, estimate_effects
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.hda.sections import MAP_CONDITIONS, MAP_ERRORS, distance_grid
 from marsyard.reports.overall import combine_verdicts
+from marsyard.reports.page import driver_figures, outcome_grid
 from marsyard.reports.rates import fraction_of
-from marsyard.reports.sections import driver_figures, outcome_grid
 from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_table
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import (
@@ -235,7 +235,7 @@ def test_rank_correlations_of_maps_have_intervals(maps: int, has_interval: bool)
     texture = rng.uniform(0.1, 1.0, maps)
     frame = pd.DataFrame({"texture": texture, "rms_fraction": rng.uniform(0.0, 0.1, maps) / texture})
     effect = estimate_effects(frame, MAP_CONDITIONS, MAP_ERRORS)[0]
-    assert effect["error"].startswith("elevation error")
+    assert effect.response.startswith("elevation error")
     assert (" to " in correlation_text(effect)) == has_interval
     assert has_interval or correlation_text(effect) == NOTHING
 

@@ -26,13 +26,13 @@ def test_verdict_passes_at_the_minimum_number_of_cases() -> None:
     assert evaluate(make_cases(388, 1), VELOCITY).status is Status.PASS
     undecided = evaluate(make_cases(229, 0), VELOCITY)
     # After a first look that cannot pass, the second look needs 297 cases without failure at the corrected risk.
-    assert (undecided.status, undecided.further_cases) == (Status.INSUFFICIENT, 297 - 229)
+    assert (undecided.status, undecided.additional_cases) == (Status.INSUFFICIENT, 297 - 229)
 
 
 def test_24_cases_without_failure_are_insufficient() -> None:
     verdict = evaluate(make_cases(24, 0), VELOCITY)
     assert (verdict.status, verdict.n, verdict.failures) == (Status.INSUFFICIENT, 24, 0)
-    assert verdict.further_cases == 297 - 24
+    assert verdict.additional_cases == 297 - 24
     # Clopper-Pearson bound without failure in 24 cases at 90 % confidence
     assert verdict.lower == pytest.approx(0.1 ** (1 / 24))
     assert (verdict.estimate, verdict.upper) == (1.0, 1.0)
@@ -41,7 +41,7 @@ def test_24_cases_without_failure_are_insufficient() -> None:
 def test_verdict_fails_if_all_cases_fail() -> None:
     verdict = evaluate(make_cases(24, 24), VELOCITY)
     assert (verdict.status, verdict.estimate, verdict.lower) == (Status.FAIL, 0.0, 0.0)
-    assert verdict.further_cases is None
+    assert verdict.additional_cases is None
 
 
 @given(
@@ -59,8 +59,8 @@ def test_status_follows_from_the_bounds(counts: tuple[int, int], probability: fl
     assert (verdict.status is Status.PASS) == (lower >= probability)
     assert (verdict.status is Status.FAIL) == (upper < probability)
     if verdict.status is Status.INSUFFICIENT:
-        assert verdict.further_cases
-        extended_rows = pd.concat([make_cases(n, failures), make_cases(verdict.further_cases, 0)], ignore_index=True)
+        assert verdict.additional_cases
+        extended_rows = pd.concat([make_cases(n, failures), make_cases(verdict.additional_cases, 0)], ignore_index=True)
         extended_rows = extended_rows.drop(columns="terrain").assign(case=np.arange(len(extended_rows)))
         (later,) = evaluate_requirements(extended_rows, [requirement], SamplingDesign(first_look=n))
         assert later.status is Status.PASS
@@ -95,7 +95,7 @@ def test_populations_select_cases() -> None:
 
 def test_empty_population_is_insufficient() -> None:
     verdict = evaluate(make_rows(24, answer_rate=0.0), VELOCITY)
-    assert (verdict.status, verdict.n, verdict.further_cases) == (Status.INSUFFICIENT, 0, 297)
+    assert (verdict.status, verdict.n, verdict.additional_cases) == (Status.INSUFFICIENT, 0, 297)
     assert math.isnan(verdict.estimate)
     assert "No case" in verdict.note
 
@@ -221,7 +221,7 @@ def test_verdict_by_rate_is_not_pass() -> None:
     requirement_99_7 = {**VELOCITY, "probability": 0.997, "decide_by": "estimate"}
     eight_cases = evaluate(make_cases(8, 0), requirement_99_7)
     # a failure rate of 0.003 allows one failure in 1 / 0.003 = 334 cases
-    assert (eight_cases.status, eight_cases.further_cases) == (Status.INSUFFICIENT, 334 - 8)
+    assert (eight_cases.status, eight_cases.additional_cases) == (Status.INSUFFICIENT, 334 - 8)
     assert "needs at least 334 cases" in eight_cases.note
     assert evaluate(make_cases(333, 0), requirement_99_7).status is Status.INSUFFICIENT
     assert evaluate(make_cases(334, 1), requirement_99_7).status is Status.MET_BY_RATE
@@ -255,7 +255,7 @@ def test_appended_cases_share_the_risk_of_two_evaluations() -> None:
     assert (later.status, later.bounds_confidence > 0.99) == (Status.INSUFFICIENT, True)
     assert "evaluated more than once" in later.note
     # with one failure, the second look needs 1049 cases at the corrected risk
-    assert first.further_cases == 1049 - 230
+    assert first.additional_cases == 1049 - 230
     (sufficient,) = evaluate_requirements(make_cases(1049, 1), [VELOCITY], design)
     assert (sufficient.status, sufficient.n) == (Status.PASS, 1049)
     # 388 cases with 60 failures fail also in the second evaluation
@@ -270,8 +270,8 @@ def test_appended_terrains_share_the_risk_of_two_evaluations() -> None:
     (later,) = evaluate_requirements(frame, [VELOCITY], design)
     # the first look at 230 terrains can use a risk of 9.9 %; little is left for later looks
     assert first.status is Status.INSUFFICIENT
-    assert first.further_cases is not None
-    assert first.further_cases > 800
+    assert first.additional_cases is not None
+    assert first.additional_cases > 800
     assert evaluate(frame, VELOCITY).status is Status.PASS
     assert later.status is Status.INSUFFICIENT
 

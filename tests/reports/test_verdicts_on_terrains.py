@@ -23,7 +23,7 @@ def test_shared_terrains_count_as_single_cases() -> None:
     assert (verdict.status, verdict.terrains, verdict.plain_status) == (Status.INSUFFICIENT, 8, Status.PASS)
     assert verdict.lower == proportion_lower(8, 8, 0.9)
     assert verdict.plain_lower == proportion_lower(400, 400, 0.9)
-    assert verdict.further_cases == 297 - 8
+    assert verdict.additional_cases == 297 - 8
     for message in ("8 terrains", "every distribution of failure rates", "289 additional cases", "PASS"):
         assert message in verdict.note
     many_terrains = evaluate(make_cases(460, 0).assign(terrain=np.arange(460) % 230), VELOCITY)
@@ -38,9 +38,9 @@ def test_additional_cases_lead_to_pass_on_new_terrains() -> None:
     assert verdict.status is Status.INSUFFICIENT
     assert verdict.clustered is not None
     assert (verdict.clustered.failed_terrains, verdict.clustered.failure_pairs) == (6, 0)
-    assert verdict.further_cases
+    assert verdict.additional_cases
     extended_rows = pd.concat(
-        [frame, make_cases(verdict.further_cases, 0).assign(terrain=lambda rows: 60 + rows.index)]
+        [frame, make_cases(verdict.additional_cases, 0).assign(terrain=lambda rows: 60 + rows.index)]
     )
     extended_rows["case"] = np.arange(len(extended_rows))
     requirements, design = [{**VELOCITY, "probability": 0.95}], SamplingDesign(first_look=250)
@@ -81,7 +81,7 @@ def test_advice_contains_the_necessary_number_of_terrains() -> None:
     frame = make_cases(400, 0).assign(terrain=np.arange(400) % 8)
     design = _make_terrain_design(8, distribution="integer", low=0, high="location.bank - 1")
     (verdict,) = evaluate_requirements(frame, [VELOCITY], design)
-    assert (verdict.status, verdict.further_cases) == (Status.INSUFFICIENT, None)
+    assert (verdict.status, verdict.additional_cases) == (Status.INSUFFICIENT, None)
     message = (
         "To show a success rate of 99 % at 90 % confidence, the cases must include at least 230 different terrains. "
         "The campaign has only 8 terrains (location.bank = 8). Run the campaign again with 230 cases, each on a "
@@ -98,7 +98,7 @@ def test_advice_contains_the_necessary_number_of_terrains() -> None:
     narrow_dispersion = _make_terrain_design(100, distribution="integer", low=0, high=7)
     assert 'dispersions."location.terrain"' in evaluate_requirements(frame, [VELOCITY], narrow_dispersion)[0].note
     large_bank = _make_terrain_design(1000, distribution="integer", low=0, high="location.bank - 1")
-    assert evaluate_requirements(frame, [VELOCITY], large_bank)[0].further_cases == 289
+    assert evaluate_requirements(frame, [VELOCITY], large_bank)[0].additional_cases == 289
 
 
 def test_evaluations_of_an_adaptive_campaign_share_the_risk() -> None:

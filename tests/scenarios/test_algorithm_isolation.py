@@ -18,8 +18,8 @@ from marsyard.algorithms.interface import (
 )
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.verdicts import Status
-from marsyard.scenarios.algorithm_run import InputCopy
 from marsyard.scenarios.conformance.inputs import descent
+from marsyard.scenarios.input_copies import InputCopy
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import scenario
 from marsyard.scenarios.velocity import run_estimator
@@ -148,17 +148,17 @@ def test_answers_are_converted_to_numpy_arrays_and_floats() -> None:
 
 
 def test_runs_with_a_tracker_exception_count_as_failures() -> None:
-    """The tracker raises an exception in 5 of 20 runs. Their rows have no column of the metric, `handed_over`."""
+    """The tracker raises an exception in 5 of 20 runs. Their rows have no column of the metric, `handed_off`."""
     crashed_case, complete_case = (run_small_case("rover", spy, case=4) for spy in ("RaisingTracker", "TrackerSpy"))
     assert crashed_case.outcome == "CRASHED"
     assert crashed_case.row["selectable"] is complete_case.row["selectable"] is True
     crashed_row, complete_row = (
-        {"outcome": case.outcome, "answered": case.answered, **case.row, "handed_over": True}
+        {"outcome": case.outcome, "answered": case.answered, **case.row, "handed_off": True}
         for case in (crashed_case, complete_case)
     )
-    crashed_row.pop("handed_over")
+    crashed_row.pop("handed_off")
     frame = pd.DataFrame([crashed_row] * 5 + [complete_row] * 15)
-    requirement = {"id": "VTT-HANDED", "metric": "handed_over", "probability": 0.9, "confidence": 0.9}
+    requirement = {"id": "VTT-HANDED", "metric": "handed_off", "probability": 0.9, "confidence": 0.9}
     (result,) = evaluate_requirements(frame, [{**requirement, "population": "selectable", "decide_by": "estimate"}])
     assert (result.status, result.n, result.failures) == (Status.FAIL, 20, 5)
 

@@ -73,7 +73,7 @@ def test_requirements_use_columns_of_their_scenario(scenario: str) -> None:
 
 #: Columns that are true only for an answer, or that contain a number only for one.
 AVAILABILITY = {
-    "answered", "tracked", "handed_over", "site_reported", "answer_correct", "fixed_in_time", "coarse_error_m",
+    "answered", "tracked", "handed_off", "site_reported", "answer_correct", "fixed_in_time", "coarse_error_m",
     "relief_error_fraction", "tracked_well",
 }  # fmt: skip
 #: Columns that depend on the answer of an algorithm, and therefore also on its refusals.

@@ -6,7 +6,7 @@ An algorithm `x` has the published options, `x-plus` has improved ones, and `x-c
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -18,15 +18,15 @@ from marsyard.algorithms.exchange import ExecutableAlgorithm, ExecutableLimits, 
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.reports.comparison import select_algorithm
-from marsyard.scenarios import estimators
-from marsyard.scenarios.algorithm_run import run_algorithm
+from marsyard.scenarios import tasks
+from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
+from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.estimators import Task, check_algorithms, labels
-from marsyard.scenarios.evaluation import case_result
-from marsyard.scenarios.interface import CaseResult, Failure
+from marsyard.scenarios.interface import CaseResult, Failure, Scalar
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.streamed import StreamedEstimator
+from marsyard.scenarios.tasks import AlgorithmSelection, Task, check_algorithms, labels
 from marsyard.scenarios.velocity import VELOCITY, consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
@@ -49,13 +49,13 @@ def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    group = estimators.GROUP
+    group = tasks.GROUP
     entry_points = [
         EntryPoint(name, "marsyard.algorithms.dimes.baselines:HomographyEstimator", group)
         for name in ("installed", "dimes")
     ]
     installed_entry_points = {entry_point.name: entry_point for entry_point in entry_points}
-    monkeypatch.setattr(estimators, "list_installed", lambda: installed_entry_points)
+    monkeypatch.setattr(tasks, "list_installed", lambda: installed_entry_points)
     assert isinstance(VELOCITY.make("installed", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
     with pytest.raises(ValueError, match=r"did you mean 'installed'.*dimes-plus.*homography, installed"):
@@ -112,27 +112,30 @@ def test_duplicate_algorithm_is_rejected() -> None:
         DescentScenarioParameters.model_validate({"compared": ["dimes"]})
 
 
+def select(algorithm: str, compared: str) -> AlgorithmSelection:
+    """Select two algorithms by names that no task checks."""
+    return AlgorithmSelection.model_construct(algorithm=algorithm, compared=(compared,))
+
+
 def test_failing_algorithm_does_not_affect_others() -> None:
-    def run_with(spec: str) -> CaseResult:
-        def compute_answer() -> float:
-            return 1.0 / float(spec)
+    def evaluate(first: str, second: str) -> CaseResult:
+        def divide(spec: str) -> AlgorithmRun[float]:
+            return run_algorithm(lambda: 1.0 / float(spec), lambda answer: cast(float, answer))
 
-        result = run_algorithm(compute_answer, lambda answer: answer)
-        return CaseResult(
-            "VALID" if result.failure is None else result.failure.outcome,
-            result.answer is not None,
-            {"error_m": 0.5},
-            failure=result.failure,
-        )
+        def score(spec: str, runs: Runs[float]) -> Score:
+            answered = runs[spec].answer is not None
+            return Score(answered, {"error_m": 0.5}, outcome="VALID" if answered else "")
 
-    case = case_result(["2", "0"], run_with, {"altitude_m": 7.0})
+        return evaluate_case(select(first, second), {"altitude_m": 7.0}, divide, score)
+
+    case = evaluate("2", "0")
     assert (case.outcome, case.answered, case.failure) == ("VALID", True, None)
     assert case.row["algorithm"] == "a_2"
     assert case.row["a_0.outcome"] == "CRASHED"
     assert case.row["a_0.answered"] is False
     assert case.row["a_0.error"] == "ZeroDivisionError: float division by zero"
     assert "a_0.altitude_m" not in case.row
-    swapped_case = case_result(["0", "2"], run_with, {"altitude_m": 7.0})
+    swapped_case = evaluate("0", "2")
     assert swapped_case.failure is not None
     assert swapped_case.outcome == swapped_case.failure.outcome == "CRASHED"
     assert swapped_case.row["altitude_m"] == 7.0
@@ -142,12 +145,15 @@ def test_failing_algorithm_does_not_affect_others() -> None:
 def test_failed_algorithm_has_its_own_empty_columns() -> None:
     """Without them, a comparison would show the columns of the algorithm under test as those of the failed one."""
 
-    def evaluate(spec: str) -> CaseResult:
-        if spec == "tested":
-            return CaseResult("VALID", True, {"error_m": 0.5, "in_time": True, "note": "text"})
-        return CaseResult("CRASHED", False, {"time_s": 2.0}, failure=Failure("CRASHED", "it crashed", ""))
+    def run(spec: str) -> AlgorithmRun[float]:
+        return AlgorithmRun(0.0, None, {}) if spec == "tested" else AlgorithmRun(None, failure, {"time_s": 2.0})
 
-    row = case_result(["tested", "other"], evaluate, {"altitude_m": 7.0}).row
+    def score(spec: str, runs: Runs[float]) -> Score:
+        return Score(True, answered_row, outcome="VALID") if spec == "tested" else Score(False, {})
+
+    failure = Failure("CRASHED", "it crashed", "")
+    answered_row: dict[str, Scalar] = {"error_m": 0.5, "in_time": True, "note": "text"}
+    row = evaluate_case(select("tested", "other"), {"altitude_m": 7.0}, run, score).row
     assert np.isnan(row["other.error_m"])
     assert (row["other.in_time"], row["other.time_s"]) == (False, 2.0)
     assert "other.note" not in row
@@ -175,8 +181,8 @@ def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, mon
     (tmp_path / "stream_module.py").write_text(f"{STREAM_CLASS}{finish}\ndef make():\n    return Mine()\n")
     (tmp_path / "incomplete_stream.py").write_text(STREAM_CLASS)
     monkeypatch.chdir(tmp_path)
-    entry_point = EntryPoint("installed", "stream_module:Mine", estimators.GROUP)
-    monkeypatch.setattr(estimators, "list_installed", lambda: {"installed": entry_point})
+    entry_point = EntryPoint("installed", "stream_module:Mine", tasks.GROUP)
+    monkeypatch.setattr(tasks, "list_installed", lambda: {"installed": entry_point})
     for spec in ("stream_module:Mine", "stream_module:make", "installed", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)

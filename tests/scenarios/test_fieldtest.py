@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.scenarios import fieldtest
-from marsyard.scenarios.exposure import camera_optics
+from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.fieldtest import run as run_module
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory
 from marsyard.scenarios.fieldtest.imaging import (
@@ -27,9 +27,10 @@ from marsyard.scenarios.fieldtest.imaging import (
     take_image,
 )
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, ImageTargetParameters
-from marsyard.scenarios.fieldtest.run import Category, FieldRun, find_triples, simulate_elevation_model, simulate_run
+from marsyard.scenarios.fieldtest.run import FieldRun, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario, case_order
 from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
+from marsyard.scenarios.fieldtest.triples import Category, find_triples
 from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.dynamics import Resting
@@ -160,7 +161,7 @@ def test_attitude_fit_removes_a_constant_bias() -> None:
 def test_attitude_fit_does_not_remove_a_drift_about_the_flight_line() -> None:
     """The gyro bias about the flight line drifts: the tilt about this axis changes by tenths of a degree."""
     run = make_ivanpah_run()
-    azimuth = run.flight.azimuth_rad
+    azimuth = run.flown.flight.azimuth_rad
     flight_direction = np.array([np.sin(azimuth), np.cos(azimuth), 0.0])
     tilt = compute_attitude_errors_deg(run) @ flight_direction
     assert np.ptp(tilt) > 0.6
@@ -210,7 +211,7 @@ def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatc
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
     camera = field_camera().bin(columns=1, rows=4)
     targets = Targets.draw(
-        parameters.targets, run_ground(key).surface, run.flight.origin_m[:2], key.generator("targets")
+        parameters.targets, run_ground(key).surface, run.flown.flight.origin_m[:2], key.generator("targets")
     )
     true_pixels = [camera.project(state.attitude.inv().apply(targets.true_m - state.position_m))[0] for state in states]
     errors = np.stack(detections) - np.stack(true_pixels)
@@ -328,14 +329,14 @@ def test_sun_moves_while_rocks_are_fixed() -> None:
     key = RunKey(make_parameters(), 0, 5, "test")
     run, time_s = simulate_run(key), 1800.0
     ground = run_ground(key)
-    start_scene = build_start_scene(run, ground)
-    early_scene, late_scene = (scene_at(run, start_scene, ground, time) for time in (0.0, time_s))
+    start_scene = build_start_scene(run.flown, ground)
+    early_scene, late_scene = (scene_at(run.flown, start_scene, ground, time) for time in (0.0, time_s))
     assert len(early_scene.objects) > 0
     assert late_scene.objects is early_scene.objects
-    east, north, _ = run.flight.origin_m.tolist()
+    east, north, _ = run.flown.flight.origin_m.tolist()
     pixel_rad = camera_optics(field_camera()).rays.pixel_rad
     viewpoint = Viewpoint(east, north, key.field_test.helicopter.lowest_m, pixel_rad)
-    single_scene = site_scene(ground, viewpoint, sun_at(run, time_s))
+    single_scene = site_scene(ground, viewpoint, sun_at(run.flown, time_s))
     assert np.array_equal(late_scene.sun.direction, single_scene.sun.direction)
     assert late_scene.photometry == single_scene.photometry
     assert np.array_equal(late_scene.objects.triangles, single_scene.objects.triangles)
@@ -393,12 +394,12 @@ def test_cloud_shadows_move_steadily_between_images() -> None:
     """The sun direction is continuous. Steps of it would move the shadows of high clouds faster than the wind."""
     key = RunKey(make_parameters(), 3, 5, "test")
     run = simulate_run(key)
-    assert run.clouds is not None
+    assert run.flown.clouds is not None
     ground = np.array([[[0.0, 0.0, 0.0]]])
     positions = []
     for time_s in np.arange(1000.0, 1120.0, 3.0).tolist():
-        sun = sun_at(run, time_s)
-        _, height, east, north, _ = run.clouds.coefficients(sun, time_s)
+        sun = sun_at(run.flown, time_s)
+        _, height, east, north, _ = run.flown.clouds.coefficients(sun, time_s)
         slant_factor = (height - ground[0, 0, 2]) / sun.direction[2]
         # Position in the cloud layer between the ground point and the sun.
         positions.append([slant_factor * sun.direction[0] - east, slant_factor * sun.direction[1] - north])

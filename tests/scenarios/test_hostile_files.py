@@ -18,7 +18,7 @@ from marsyard.scenarios.measured.image_files import read_counts, read_flat_field
 from marsyard.scenarios.measured.layout import VELOCITY, IngestError, read_ingest_file, read_table
 from marsyard.scenarios.measured.store import CasesFile
 from marsyard.scenarios.meshes import MAX_BYTES, MeshFileError, read_mesh
-from marsyard.scenarios.offline import VELOCITY_FORMAT, read_answers
+from marsyard.scenarios.offline_algorithms import VELOCITY_FORMAT, read_answers
 from marsyard.scenarios.terrain_files import check_source
 from marsyard.sim.camera import read_cameras
 from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses

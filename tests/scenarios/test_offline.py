@@ -10,12 +10,12 @@ from marsyard.algorithms.exchange import ExecutableLimits, read_case
 from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
-from marsyard.scenarios.algorithm_run import hash_inputs
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.estimators import algorithm_sources, labels
+from marsyard.scenarios.input_copies import hash_inputs
 from marsyard.scenarios.landing_site import LANDING
-from marsyard.scenarios.offline import SITE_FORMAT, VELOCITY_FORMAT, read_answers
+from marsyard.scenarios.offline_algorithms import SITE_FORMAT, VELOCITY_FORMAT, read_answers
 from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.tasks import algorithm_sources, labels
 from marsyard.scenarios.velocity import VELOCITY
 
 LIMITS = ExecutableLimits()

@@ -18,7 +18,6 @@ from marsyard.cli.app import app
 from marsyard.doctor import CheckResult, check_systems
 from marsyard.scenarios import columns as column_declarations
 from marsyard.scenarios.columns import ENGINE, label, row_columns
-from marsyard.scenarios.estimators import shipped_names
 from marsyard.scenarios.systems import (
     SCENARIOS_FOLDER,
     UnknownScenarioError,
@@ -34,6 +33,7 @@ from marsyard.scenarios.systems import (
     systems,
     templates,
 )
+from marsyard.scenarios.tasks import shipped_names
 
 CACHED_FUNCTIONS = (
     registry,
@@ -184,7 +184,7 @@ def test_invalid_system_does_not_affect_others(install: Install, source: str, re
     (message,) = problems()
     assert message.startswith("system 'mine' (mine:SYSTEM) is omitted: ")
     assert reason in message
-    assert [entry.name for entry in systems()[len(own_paths()) :]] == ["valid"]
+    assert [entry.name for entry in registry().plugins] == ["valid"]
     result = CliRunner().invoke(app, ["list"])
     assert (result.exit_code, result.stderr) == (0, f"warning: {message}\n")
     assert "dimes-smoke" in result.stdout

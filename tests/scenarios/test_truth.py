@@ -14,8 +14,8 @@ import pytest
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.descent.exposure import camera_optics
 from marsyard.scenarios.descent.flight import IMU_MARGIN_S, SIMULATED_LEAD_S
+from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.scenarios.fieldtest.imaging import field_camera
@@ -24,8 +24,8 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.scenario import LandingScenario
 from marsyard.scenarios.parts.scores import ScoredDescent, ScoredFlight
+from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import run_case
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, MastCalibration, RoverMeasurements
@@ -208,8 +208,8 @@ def test_rover_inputs_differ_from_truth(case: int) -> None:
     assert_all_fields_are_compared(MastCalibration, {"geometry", "left", "right"})
     for stop, (aim_pose, aim_mast), inputs in zip(run.stops, aim_calls, updates, strict=True):
         for mast in (aim_mast, inputs.mast):
-            assert_cameras_differ("left camera", mast.left, run.rig.left)
-            assert_cameras_differ("right camera", mast.right, run.rig.right)
+            assert_cameras_differ("left camera", mast.left, run.setup.rig.left)
+            assert_cameras_differ("right camera", mast.right, run.setup.rig.right)
         truth = stop.stance.world_from_rover
         head = mast.geometry.rover_from_head(inputs.azimuth_rad, inputs.elevation_rad)
         assert_rotations_differ("mast's angles", head.rotation, (truth.inv() * stop.world_from_head).rotation)

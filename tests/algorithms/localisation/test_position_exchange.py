@@ -21,8 +21,9 @@ from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, POSITION_STREAM, read_map, write_map
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.algorithm_run import hash_inputs, run_algorithm
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.algorithm_run import run_algorithm
+from marsyard.scenarios.input_copies import hash_inputs
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.sim.camera import Cahv, Cahvore
@@ -105,15 +106,15 @@ def test_answers_are_restored_exactly() -> None:
         PositionOutcome.VALID, 0.1, np.ones(3), np.zeros(3), Rotation.identity(), np.eye(9), details="not transmitted"
     )
     for estimate in (valid, PositionEstimate(PositionOutcome.UNCERTAIN, 0.7)):
-        answer = {"exchange": 2, **json.loads(json.dumps(POSITION_FORM.encode(estimate)))}
+        answer = {"exchange": 3, **json.loads(json.dumps(POSITION_FORM.encode(estimate)))}
         assert hash_inputs(POSITION_FORM.read(answer), ("details",)) == hash_inputs(estimate, ("details",))
 
 
 def test_file_of_another_version_is_rejected(tmp_path: Path) -> None:
     write_map(tmp_path, MAP)
     path = tmp_path / "map.json"
-    path.write_text(path.read_text().replace('"exchange": 1', '"exchange": 3'))
-    with pytest.raises(ValueError, match="version 3 is not supported; supported: 1"):
+    path.write_text(path.read_text().replace('"exchange": 3', '"exchange": 2'))
+    with pytest.raises(ValueError, match="version 2 is not supported; supported: 3"):
         read_map(tmp_path)
 
 
@@ -147,7 +148,7 @@ COVARIANCE = [[float(row == column) for column in range(9)] for row in range(9)]
 STATE = {"position_m": [1, 2, 3], "velocity_m_s": [0, 0, 0], "world_from_body_xyzw": [0, 0, 0, 1],
          "covariance": COVARIANCE}
 actions = []
-print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 for line in sys.stdin:
     request = json.loads(line)
     if request["do"] == "start":
@@ -155,7 +156,7 @@ for line in sys.stdin:
     actions.append(request["do"])
     answer = ANSWER if request["do"] in ("process_image", "finish") else {"outcome": None}
     # BODY
-    print(json.dumps({"exchange": 2, "id": request["id"], **answer}), flush=True)
+    print(json.dumps({"exchange": 3, "id": request["id"], **answer}), flush=True)
 """
 
 
@@ -248,5 +249,5 @@ def test_a_failure_in_a_case_is_recorded_as_an_outcome(tmp_path: Path) -> None:
 def test_serve_rejects_an_unknown_request() -> None:
     answers = io.StringIO()
     with pytest.raises(ValueError, match="unknown request 'image'; allowed: start, process_inc"):
-        POSITION_STREAM.serve(InertialEstimator(), ['{"exchange": 2, "id": 1, "do": "image"}\n'], answers)
-    assert json.loads(answers.getvalue()) == {"exchange": 2, "ready": True}
+        POSITION_STREAM.serve(InertialEstimator(), ['{"exchange": 3, "id": 1, "do": "image"}\n'], answers)
+    assert json.loads(answers.getvalue()) == {"exchange": 3, "ready": True}

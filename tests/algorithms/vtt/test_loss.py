@@ -9,17 +9,15 @@ from marsyard.algorithms.interface import TargetLoss, TargetUpdate, TrackingStat
 from marsyard.algorithms.vtt.accuracy import (
     NAVCAM,
     PANCAM,
-    GoalCriterion,
-    HandOffOutcome,
     StereoDesign,
     accuracy_row,
     drift_error_m,
-    hand_off,
     round_half_up,
     stereo_range_error_m,
     table_1,
     tracked_approach_error_m,
 )
+from marsyard.algorithms.vtt.arm_target import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.placement import Instrument, PlacementOutcome, place_instrument, tool_overlap_m
 from marsyard.algorithms.vtt.tracker import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
@@ -126,7 +124,7 @@ def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     target_m, goal = np.array([1.5, 0.0, 0.1]), GoalCriterion(distance_m=1.5, tolerance_m=0.05)
     tracked_target = TargetUpdate(NORMAL, (), target_m)
     at_goal = hand_off(tracked_target, goal, navcam())
-    assert at_goal.outcome is HandOffOutcome.HANDED_OVER
+    assert at_goal.outcome is HandOffOutcome.HANDED_OFF
     assert at_goal.target is not None
     np.testing.assert_array_equal(at_goal.target.position_rover, target_m)
     # Eq. 5 of the tracking paper at 1.735 m from the mast's elevation axis, which is 0.35 m ahead of the rover's origin

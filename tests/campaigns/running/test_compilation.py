@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from marsyard.campaigns.execution.worker_process import TaskResult, Work
-from marsyard.campaigns.running import preparation
-from marsyard.campaigns.running.preparation import compile_kernels, list_compilations
+from marsyard.campaigns.running import compilation
+from marsyard.campaigns.running.compilation import compile_kernels, list_compilations
 from marsyard.sim.kernel_cache import mark_ready
 
 
@@ -32,7 +32,7 @@ def test_missing_kernels_are_compiled_once(tmp_path: Path, monkeypatch: pytest.M
         compiled.append((name, overrides))
         mark_ready("descent")
 
-    monkeypatch.setattr(preparation, "compile_campaign", compile_campaign)
+    monkeypatch.setattr(compilation, "compile_campaign", compile_campaign)
     compile_kernels(InlineExecutor(), "descent", notes.append)
     assert compiled == [("dimes-smoke", ("terrain.samples=512",))]
     assert notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
@@ -50,7 +50,7 @@ def test_failed_compilation_is_reported(tmp_path: Path, monkeypatch: pytest.Monk
     def fail(name: str, overrides: tuple[str, ...]) -> None:
         raise RuntimeError("no renderer")
 
-    monkeypatch.setattr(preparation, "compile_campaign", fail)
+    monkeypatch.setattr(compilation, "compile_campaign", fail)
     notes = list[str]()
     compile_kernels(InlineExecutor(), "descent", notes.append)
     assert notes[-1].startswith("numeric kernels could not be compiled: no renderer")

@@ -13,7 +13,8 @@ import typer
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, DefinitionError, StoreError
-from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record

@@ -11,11 +11,12 @@ import pytest
 from marsyard.campaigns.definition.identity import create_identity
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
-from marsyard.campaigns.running import preparation
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running import estimate
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
-from marsyard.campaigns.running.preparation import estimate_campaign, find_shared_inputs, plan_inputs
+from marsyard.campaigns.running.estimate import estimate_campaign
 from marsyard.campaigns.running.replay import replay
+from marsyard.campaigns.running.shared_inputs import find_shared_inputs, plan_inputs
 from marsyard.campaigns.store import record
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.scenarios.systems import scenario, scenario_names
@@ -249,7 +250,7 @@ def test_estimate_follows_from_trial_cases(campaign_file: CampaignFile) -> None:
 
 def test_time_of_the_first_trial_case_is_left_out(campaign_file: CampaignFile, monkeypatch: pytest.MonkeyPatch) -> None:
     # the first trial case includes the start of the worker and the compilation of kernels
-    monkeypatch.setattr(preparation, "_MAX_TRIAL_TIME_S", 0.0)
+    monkeypatch.setattr(estimate, "_MAX_TRIAL_TIME_S", 0.0)
     cost = estimate_campaign(load_campaign(str(campaign_file("sleep_s = 0.05")), ["cases=1000"]), jobs=1)
     assert cost.trials == 2
     assert cost.case_range_s[0] == cost.case_range_s[1]

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.campaigns.execution.workers import ExecutorConfig, LocalExecutor
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.running.engine import resume_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.store import record

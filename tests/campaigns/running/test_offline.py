@@ -11,9 +11,9 @@ from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, StoreError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
-from marsyard.campaigns.running.offline import (
+from marsyard.campaigns.running.export_scoring import (
     create_scoring_campaign,
     export_campaign,
     find_cases_with_changed_images,

@@ -9,7 +9,7 @@ import pytest
 
 from marsyard.campaigns.definition.identity import read_versions
 from marsyard.campaigns.errors import CampaignError, StoreError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, resume_campaign
 from marsyard.campaigns.running.replay import differing_columns, replay
 from marsyard.campaigns.store import record

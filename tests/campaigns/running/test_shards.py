@@ -11,7 +11,7 @@ import pytest
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import finish_campaign, resume_campaign, run_campaign
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.campaigns.running.shards import Shard, merge_shards

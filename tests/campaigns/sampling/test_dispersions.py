@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.sampling.dispersion import TAIL, Dispersion, scipy_distributions, scipy_parameters
+from marsyard.campaigns.sampling.dispersion_base import TAIL, Dispersion, scipy_distributions, scipy_parameters
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import CampaignFile

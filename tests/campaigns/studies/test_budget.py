@@ -16,16 +16,16 @@ from scipy import stats
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies import budget, runner
-from marsyard.campaigns.studies.budget import STREAMS, BudgetParameters, BudgetResult, active_sources, start_budget
+from marsyard.campaigns.studies.budget import STREAMS, active_sources, start_budget
 from marsyard.campaigns.studies.contributions import compute_budget
+from marsyard.campaigns.studies.results import BudgetParameters, BudgetResult
 from marsyard.reports.budget import budget_sentences
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.stored import read_study
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.systems import scenario_names
 from marsyard.sim.error_sources import ErrorSource
@@ -200,7 +200,7 @@ def test_report_shows_the_budget(campaign_path: Path, tmp_path: Path) -> None:
     index = (tmp_path / "site" / "index.html").read_text()
     assert 'data-requirement="ERROR"' in index
     assert "error-model, budget" in index
-    sentences = budget_sentences(read_study(record.read(tmp_path / "run"), "budget"))
+    sentences = budget_sentences(record.read(tmp_path / "run"))
     assert any("remaining part add up to 100.0 % of the total" in sentence for sentence in sentences)
 
 

@@ -10,11 +10,12 @@ from scipy.stats import norm
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import CampaignError, DefinitionError
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.studies.rare import RareParameters, RareResult, continue_rare, start_rare
+from marsyard.campaigns.studies.rare import continue_rare, start_rare
 from marsyard.campaigns.studies.rare_decision import Basis, RareVerdict
+from marsyard.campaigns.studies.results import RareParameters, RareResult
 from marsyard.reports.evaluation import evaluate_run
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture, continuing_commands, read_case_rows
 from tests.campaigns.studies.killing import kill_and_resume

@@ -27,8 +27,8 @@ from marsyard.reports.dashboard.entries import (
     sparkline,
 )
 from marsyard.reports.dashboard.site import read_excerpts, write_site
+from marsyard.reports.page import script_hash
 from marsyard.reports.requirement_cases import CaseFinder
-from marsyard.reports.sections import script_hash
 from marsyard.reports.verdicts import Status, Verdict
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 

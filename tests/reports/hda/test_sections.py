@@ -238,14 +238,14 @@ def test_map_errors_have_the_expected_rank_correlations() -> None:
     mapped_rows = map_rows(_make_subject(frame))
     assert mapped_rows is not None
     effects = {
-        (effect["driver"], effect["error"]): effect
+        (effect.condition, effect.response): effect
         for effect in estimate_effects(mapped_rows, MAP_CONDITIONS, MAP_ERRORS)
     }
     noise = effects["baseline / height", "elevation noise (% of height)"]
-    assert noise["rank_correlation"] == pytest.approx(-1.0)
-    assert np.all(np.diff(noise["medians"]) < 0.0)
+    assert noise.rank_correlation == pytest.approx(-1.0)
+    assert np.all(np.diff(noise.medians) < 0.0)
     scale_error = effects["|altimeter error| (% of range)", "elevation error (% of height)"]
-    np.testing.assert_allclose(scale_error["centres"], scale_error["medians"])
+    np.testing.assert_allclose(scale_error.centres, scale_error.medians)
 
 
 @pytest.mark.parametrize(("maps", "has_statistics"), [(12, False), (40, True)])

@@ -205,10 +205,10 @@ def test_consumer_risk_decides_like_the_bound() -> None:
             assert (cases.consumer_risk(limit, 0.1) <= 0.1) == (cases.max_failure_rate(0.1) <= limit)
 
 
-def test_further_cases_are_the_minimum() -> None:
+def test_additional_cases_are_the_minimum() -> None:
     index, success = np.repeat(np.arange(100), 2), np.ones(200, dtype=bool)
     success[7] = False
-    needed = ClusteredCases.of(success, index).further_cases_needed(0.01, 0.1)
+    needed = ClusteredCases.of(success, index).additional_cases_needed(0.01, 0.1)
 
     def passes(additional: int) -> bool:
         new_terrains = 100 + np.arange(additional)

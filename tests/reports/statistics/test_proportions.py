@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from marsyard.reports.statistics.proportions import (
+    additional_cases_needed,
     consumer_risk,
-    further_cases_needed,
     minimum_sample_size,
     proportion_interval,
     proportion_lower,
@@ -128,9 +128,9 @@ def test_negative_failures_are_rejected() -> None:
 
 
 def test_additional_cases_complete_the_minimum_sample_size() -> None:
-    assert further_cases_needed(24, 0, 0.99, 0.9) == 230 - 24
-    assert further_cases_needed(24, 1, 0.99, 0.9) == 388 - 24
-    assert further_cases_needed(500, 0, 0.99, 0.9) == 0
+    assert additional_cases_needed(24, 0, 0.99, 0.9) == 230 - 24
+    assert additional_cases_needed(24, 1, 0.99, 0.9) == 388 - 24
+    assert additional_cases_needed(500, 0, 0.99, 0.9) == 0
 
 
 @pytest.mark.parametrize("n", [1, 5, 400])

@@ -9,9 +9,9 @@ import pytest
 from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.conditions import add_detector_faults, corrupt_images
-from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics, take_exposures
+from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
 from marsyard.scenarios.descent.flight import create_flight, states_at_images
+from marsyard.scenarios.descent.images import calibrated_camera, camera_optics, take_exposures
 from marsyard.scenarios.descent.parameters import (
     DescentCameraParameters,
     DescentFaults,
@@ -20,7 +20,9 @@ from marsyard.scenarios.descent.parameters import (
     add_terrain_fault,
     add_time_fault,
 )
-from marsyard.scenarios.exposure import SHIELD_DIAMETER_M, HeatShield, add_haze
+from marsyard.scenarios.descent.world import DescentWorld
+from marsyard.scenarios.heat_shield import SHIELD_DIAMETER_M, HeatShield
+from marsyard.scenarios.radiance import add_haze
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement

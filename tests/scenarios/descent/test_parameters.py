@@ -8,8 +8,9 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.dimes.binning import binned_size_for
-from marsyard.scenarios.descent.exposure import DescentWorld, calibrated_camera, camera_optics
+from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
 from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.sim.sensor import CustomCamera
 from marsyard.sim.terrain import site
 
@@ -134,10 +135,11 @@ def test_custom_camera_distortion_error_applies_at_corner() -> None:
 
 
 def test_indivisible_image_size_is_rejected_with_suggestion() -> None:
+    values = {"camera": {"columns": 752, "rows": 480}, "detector": {"rows_summed": 1}}
     with pytest.raises(ValidationError, match=r"binned_size \[256, 256\] does not divide .* 752 x 480 .*\[376, 240\]"):
-        DescentScenarioParameters.model_validate(
-            {"camera": {"columns": 752, "rows": 480}, "detector": {"rows_summed": 1}}
-        )
+        DescentScenarioParameters.model_validate(values)
+    # only DIMES bins the images
+    DescentScenarioParameters.model_validate({**values, "algorithm": "phase-correlation"})
     assert binned_size_for(1024, 1024) == (256, 256)
     assert binned_size_for(641, 480) == (641, 480)
 

@@ -118,7 +118,7 @@ def _answer_twice() -> None:
 def _write_to_all_files() -> None:
     for descriptor in range(3, 64):
         try:
-            os.write(descriptor, b'{"exchange": 2, "id": 2, "value": null}\n')
+            os.write(descriptor, b'{"exchange": 3, "id": 2, "value": null}\n')
         except OSError:
             continue
 

@@ -22,8 +22,8 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target
 from marsyard.scenarios.isolation.plain import decode, encode
 from marsyard.scenarios.isolation.remote import is_remote
-from marsyard.scenarios.objects import name_object
 from marsyard.scenarios.rover.task import TRACKING
+from marsyard.scenarios.stored_objects import name_object
 from marsyard.scenarios.velocity import VELOCITY, run_estimator
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows, run

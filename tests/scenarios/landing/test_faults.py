@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from marsyard.scenarios.conditions import add_detector_faults
+from marsyard.scenarios.case_faults import add_detector_faults
 from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.parameters import (
     LandingFaults,

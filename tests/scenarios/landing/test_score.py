@@ -16,7 +16,8 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.images import GroundTruth, SampledMap, map_errors
+from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.map_errors import SampledMap, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Footprints, Limits, Relief
 from marsyard.scenarios.landing.score import landing_row, map_row, site_populations, site_row

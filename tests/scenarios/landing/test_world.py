@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing import kernels
 from marsyard.scenarios.landing.flight import choose_pair
-from marsyard.scenarios.landing.images import LandingWorld
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
 from marsyard.scenarios.landing.relief import Limits, Relief
 from marsyard.scenarios.landing.scenario import LandingScenario
+from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.sensor import preset

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from marsyard.scenarios.exposure import CalibrationParameters
+from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.localisation.flight import LanderFlight
 from marsyard.scenarios.localisation.instruments import (
     HALF_WELL_SNR,

@@ -9,11 +9,11 @@ from jaxtyping import Float64
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.localisation.fields import SmoothField
 from marsyard.scenarios.localisation.map_product import MapParameters, blur, make_map, orbital_rays
 from marsyard.scenarios.localisation.sites import localisation_site
-from marsyard.scenarios.localisation.world import LocalisationWorld, sun_at
+from marsyard.scenarios.localisation.world import LocalisationWorld
+from marsyard.scenarios.radiance import add_haze, sun_at
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid

@@ -17,17 +17,21 @@ from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.workers import ExecutorConfig
+from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
-from marsyard.campaigns.running.offline import create_scoring_campaign, export_campaign, find_cases_with_changed_images
+from marsyard.campaigns.running.export_scoring import (
+    create_scoring_campaign,
+    export_campaign,
+    find_cases_with_changed_images,
+)
 from marsyard.campaigns.running.replay import differing_columns
-from marsyard.scenarios.algorithm_run import hash_inputs
-from marsyard.scenarios.localisation.offline import POSITION_FORMAT, read_descent
+from marsyard.scenarios.input_copies import hash_inputs
+from marsyard.scenarios.localisation.answer_table import POSITION_FORMAT, read_descent
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisedDescent
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
 from marsyard.scenarios.localisation.task import LOCALISATION
-from marsyard.scenarios.offline import read_answers
+from marsyard.scenarios.offline_algorithms import read_answers
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows

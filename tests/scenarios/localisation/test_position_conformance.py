@@ -13,7 +13,7 @@ from marsyard.campaigns.running.conformance import create_subject
 from marsyard.scenarios.conformance import CandidateAlgorithm, check_names, determine_task, subject_kinds
 from marsyard.scenarios.conformance.inputs import make_blank
 from marsyard.scenarios.localisation import conformance_inputs as inputs
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from tests.scenarios import suites
 
@@ -163,7 +163,7 @@ def test_slow_estimator_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 #: A program of the file exchange. It executes its argument, Python code, before each answer to `image` and `finish`.
 PROGRAM = """
 import json, sys, time
-print(json.dumps({"exchange": 2, "ready": True}), flush=True)
+print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 time_s, images, body = 0.0, 0, sys.argv[1]
 for line in sys.stdin:
     request = json.loads(line)
@@ -175,7 +175,7 @@ for line in sys.stdin:
         tag = json.load(open(request["image"] + "/image.json"))["image"]["time_s"] if "image" in request else time_s
         answer = {"outcome": "UNCERTAIN", "time_s": tag}
         exec(body)
-    print(json.dumps({"exchange": 2, "id": request["id"], **answer}), flush=True)
+    print(json.dumps({"exchange": 3, "id": request["id"], **answer}), flush=True)
 """
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
-from marsyard.scenarios.conditions import contrast_columns
+from marsyard.scenarios.condition_columns import contrast_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationFaults, LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LEAD_S, LocalisationScenario, LocalisedDescent

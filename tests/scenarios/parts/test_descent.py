@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.descent.exposure import DescentWorld
 from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.measurement import DescentInstruments
+from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.parts import InstrumentReadings, InstrumentTruth, MotionInputs, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import compute_scores
 from marsyard.sim.streams import Streams

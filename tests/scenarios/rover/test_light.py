@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from marsyard.scenarios.rover.closed_loop import RoverRun, run_case
 from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
-from marsyard.scenarios.rover.run import RoverRun, run_case
 from marsyard.sim.dynamics.rover import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST
@@ -36,12 +36,14 @@ def test_images_use_the_sun_direction_of_their_time() -> None:
     moving_sun = {"sun": {**SHORT_RUN["sun"], "update_interval_s": 1.0}, "rover_shadow": False}
     fixed_sun_run, moving_sun_run = make_run(**slow_tracking, **fixed_sun), make_run(**slow_tracking, **moving_sun)
     assert fixed_sun_run.stops[1].time_s - fixed_sun_run.stops[0].time_s >= 3600.0
-    moving_directions = [moving_sun_run.world.scene(stop.time_s).sun.direction for stop in moving_sun_run.stops[:2]]
+    moving_directions = [
+        moving_sun_run.setup.world.scene(stop.time_s).sun.direction for stop in moving_sun_run.stops[:2]
+    ]
     sun_rotation_deg = np.degrees(np.arccos(moving_directions[0] @ moving_directions[1]))
     minutes = (moving_sun_run.stops[1].time_s - moving_sun_run.stops[0].time_s) / 60.0
     # The rotation is less than the hour angle, because the sun is not on the celestial equator.
     assert 10.0 < sun_rotation_deg < 16.0 / 66.0 * minutes + 0.01
-    fixed_directions = [fixed_sun_run.world.scene(stop.time_s).sun.direction for stop in fixed_sun_run.stops[:2]]
+    fixed_directions = [fixed_sun_run.setup.world.scene(stop.time_s).sun.direction for stop in fixed_sun_run.stops[:2]]
     np.testing.assert_allclose(fixed_directions[0], fixed_directions[1], atol=1e-12)
 
 

@@ -8,8 +8,8 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.rover.closed_loop import RoverRun, map_terrain, prepare_run, run_case
 from marsyard.scenarios.rover.parameters import MastCameraParameters, RoverScenarioParameters
-from marsyard.scenarios.rover.run import RoverRun, map_terrain, prepare_run, run_case
 from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid
@@ -35,7 +35,7 @@ def run_slipping_rover(seed: int = 4, **changes: Any) -> RoverRun:
 
 def _position_error_m(run: RoverRun) -> float:
     """Compute the horizontal distance between estimated and true final position."""
-    vehicle = run.vehicle
+    vehicle = run.setup.vehicle
     return float(np.linalg.norm((vehicle.estimated_pose.translation - vehicle.stance.world_from_rover.translation)[:2]))
 
 
@@ -67,7 +67,7 @@ def test_stereo_map_agrees_with_true_heights(map_by: str) -> None:
         changes = {"legs": [leg], "navigation": {"terrain": terrain}, "obstacles": [OBSTACLE]}
         parameters = RoverScenarioParameters.model_validate({**SLIPPING_ROVER, **changes})
         run = prepare_run(parameters, Streams(4, "rover tests", 0))
-        target = run.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy())
+        target = run.setup.vehicle.stance.world_from_rover.inv().apply(run.target.point_world.copy())
         map_terrain(parameters, run, parameters.legs[0], run.create_target_estimate(target))
         assert run.navigator.terrain is not None
         maps[terrain] = run.navigator.terrain
@@ -86,7 +86,7 @@ def test_rover_drives_around_an_obstacle_in_its_images() -> None:
     leg = {"motion": "approach", "goal_m": 2.0, "autonav": True}
     # with most seeds, the holes of the map stop the rover in front of the obstacle (NO_PATH)
     run = run_slipping_rover(9, legs=[leg], obstacles=[OBSTACLE], slip={"flat": 0.01}, start={"distance_m": 6.0})
-    rocks = run.world.rocks
+    rocks = run.setup.world.rocks
     rock_m = rocks.position_m[rocks.names["obstacle-1"], :2]
     path = [stance for stop in run.stops for drive in stop.drives for stance in drive.stances]
     closest_m = min(float(np.hypot(*(stance.world_from_rover.translation[:2] - rock_m))) for stance in path)
@@ -98,7 +98,7 @@ def test_rover_drives_around_an_obstacle_in_its_images() -> None:
 def test_oracles_need_no_navigation_cameras() -> None:
     leg = {"motion": "approach", "goal_m": 4.5, "autonav": True, "visual_odometry": True}
     run = run_slipping_rover(legs=[leg], navigation={"odometry": "oracle-motion", "terrain": "oracle-heights"})
-    assert run.navigation_cameras.mast is run.navigation_cameras.body is None
+    assert run.setup.navigation_cameras.mast is run.setup.navigation_cameras.body is None
     assert _position_error_m(run) < 0.05
 
 

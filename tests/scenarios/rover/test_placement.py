@@ -8,6 +8,7 @@ import trimesh
 
 from marsyard.algorithms.vtt.placement import Placement, PlacementOutcome, measure_surface
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.scenarios.rover.closed_loop import RoverRun, prepare_run, track_target
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.placement import placement_row, placement_truth, sample_surface
 from marsyard.scenarios.rover.points import (
@@ -19,7 +20,6 @@ from marsyard.scenarios.rover.points import (
     ray_distances,
     spheres_near_line,
 )
-from marsyard.scenarios.rover.run import RoverRun, prepare_run, track_target
 from marsyard.scenarios.rover.scenario import RoverScenario, SharedDriveParameters, SharedDriveScenario, place_target
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
@@ -46,7 +46,7 @@ def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, RoverRun]) -
     placeable, run = placed_run
     row = placement_row(run)
     assert placeable
-    assert run.handed_over
+    assert run.handed_off
     assert (row["placed"], row["placement_safe"]) == (True, True)
     assert run.placement is not None
     # along the normal the contact is on the measured surface, within 3 cm; across, within 8 mm
@@ -58,9 +58,9 @@ def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, RoverRun]
     _, run = placed_run
     stop = run.stops[-1]
     target = np.asarray(stop.update.position_rover)
-    measured = measure_surface(stop.measurements(run.rig.calibrated), target)
+    measured = measure_surface(stop.measurements(run.setup.rig.calibrated), target)
     measured = measured[np.linalg.norm(measured - target, axis=1) < 0.05]
-    viewpoint = run.rig.camera_positions(stop.world_from_head)[0]
+    viewpoint = run.setup.rig.camera_positions(stop.world_from_head)[0]
     true_surface = np.asarray(stop.stance.world_from_rover.inv().apply(sample_surface(run, viewpoint)))
     # the surface within 5 cm covers thousands of pixels of 2 mm; half of them have a match
     assert len(measured) > 500
@@ -87,7 +87,7 @@ def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, RoverRu
     assert not row["placement_safe"]
 
 
-def test_run_without_a_hand_over_is_not_placed() -> None:
+def test_run_without_a_hand_off_is_not_placed() -> None:
     parameters = RoverScenarioParameters.model_validate({**SLAB, "legs": [{"motion": "stay", "steps": 1}]})
     run = place_target(track_target(parameters, prepare_run(parameters, Streams(1, "placement tests", 0))))
     assert run.placement is None

@@ -11,7 +11,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.vtt import matching
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.scenarios.rover import run as run_module
+from marsyard.scenarios.rover import closed_loop as closed_loop
+from marsyard.scenarios.rover.closed_loop import Step, is_stuck, run_case
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     TargetEstimate,
@@ -21,7 +22,6 @@ from marsyard.scenarios.rover.flight_software import (
     plan_step,
 )
 from marsyard.scenarios.rover.parameters import LegParameters, MobilityParameters, RoverScenarioParameters
-from marsyard.scenarios.rover.run import Step, is_stuck, run_case
 from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.scenarios.rover.world import Vehicle
 from marsyard.sim.frames import rigid
@@ -218,9 +218,9 @@ def test_each_step_maps_then_drives_then_tracks(monkeypatch: pytest.MonkeyPatch)
 
         monkeypatch.setattr(owner, name, call_and_record)
 
-    record_calls(run_module, "map_terrain", "map")
+    record_calls(closed_loop, "map_terrain", "map")
     record_calls(Vehicle, "drive", "drive with visual odometry")
-    record_calls(run_module, "visit_stop", "track")
+    record_calls(closed_loop, "visit_stop", "track")
     leg = {"motion": "approach", "goal_m": 3.0, "step_fraction": 0.08, "autonav": True, "visual_odometry": True}
     run = run_case(RoverScenarioParameters.model_validate({**SHORT_RUN, "legs": [leg]}), Streams(1, "rover tests", 0))
     # Each activity is represented by its first letter. Consecutive drives count as one drive.

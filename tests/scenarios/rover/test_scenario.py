@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run import run_case
 from marsyard.scenarios.rover.scenario import (
     DriveKey,
     RoverScenario,
@@ -65,9 +65,9 @@ def test_designated_point_agrees_with_rendered_pixels() -> None:
     run = run_case(parameters, make_streams(1))
     stop = run.stops[-1]
     column, row = (round(value) for value in stop.point_px)
-    camera = run.rig.left.crop(column - 4, row - 4, (9, 9))
+    camera = run.setup.rig.left.crop(column - 4, row - 4, (9, 9))
     frame = process_renderer(parameters.backend).render(
-        run.world.base, PixelRays.from_camera(camera), stop.world_from_head
+        run.setup.world.base, PixelRays.from_camera(camera), stop.world_from_head
     )
     surface_points = frame.points_world()[3:6, 3:6].reshape(-1, 3)
     # The central pixel shows an object, not ground or sky.
@@ -82,7 +82,7 @@ def test_start_and_goal_have_the_specified_distance(diameter_m: float) -> None:
     target = {**SHORT_RUN["target"], "diameter_m": diameter_m, "across": 0.3, "up": 0.5}
     run = run_case(make_parameters(target=target), make_streams(4))
     first, last = run.stops[0], run.stops[-1]
-    mast = first.stance.world_from_rover.apply(np.append(run.rig.calibrated.geometry.base_m[:2], 0.0))
+    mast = first.stance.world_from_rover.apply(np.append(run.setup.rig.calibrated.geometry.base_m[:2], 0.0))
     # Tolerance: lateral offset of the point.
     assert np.hypot(*(run.target.point_world - mast)[:2]) == pytest.approx(3.6, abs=0.06)
     assert np.hypot(*(run.target.point_world - last.stance.world_from_rover.translation)[:2]) == pytest.approx(
@@ -127,7 +127,7 @@ def test_targets_can_be_designated_by_position(designation: str) -> None:
     assert run.outcome.name == "COMPLETED"
     # The mast points at the position. The backlash of 0.1 deg causes an error of 2.1 px per axis. Half the epipolar
     # error is 0.2 px.
-    assert np.linalg.norm(run.stops[0].reported_px(run.rig.calibrated) - run.stops[0].point_px) < 3.5
+    assert np.linalg.norm(run.stops[0].reported_px(run.setup.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
 def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:

@@ -11,7 +11,8 @@ from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
 from marsyard.sim.dynamics.kernels.swing import Chain, WindField, compute_aerodynamic_force, compute_derivatives
-from marsyard.sim.dynamics.swing import Modes, SwingDescent, SwingParameters, build_chain
+from marsyard.sim.dynamics.pendulum import Modes, SwingParameters, build_chain
+from marsyard.sim.dynamics.swing import SwingDescent
 
 #: Position of the first image, m; height of the ground, m; gravity, m/s2.
 START = np.array([100.0, -50.0, 2100.0])

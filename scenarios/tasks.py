@@ -1,13 +1,13 @@
-"""Create algorithms by name: algorithms of Marsyard, of installed packages, and of the user.
+"""Tasks of the systems: creation of their algorithms by name, and the parameters that select those of a case.
 
 An algorithm is specified by
 
 - the name of an algorithm of Marsyard (`dimes`), or of an entry point in the group `marsyard.algorithms`;
 - ``module:Class`` or ``module:function``, called without arguments; the module may be in the current folder;
-- ``FILE.pkl:Name``: a stored Python object (`marsyard.scenarios.objects`);
+- ``FILE.pkl:Name``: a stored Python object (`marsyard.scenarios.stored_objects`);
 - ``exec:PROGRAM ARGUMENTS`` or ``serve:PROGRAM ARGUMENTS``: an external program (docs/custom-algorithms.md);
   ``exec-stream:`` or ``serve-stream:``: a program that receives images one by one;
-- ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline`).
+- ``answers:FILE.csv``: answers computed outside of Marsyard (`marsyard.scenarios.offline_algorithms`).
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
+
+from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms import exchange
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.isolation.host import construct, reset
 from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, describe
-from marsyard.scenarios.offline import AnswerFormat, answers_file, create_offline, is_offline, read_answers
+from marsyard.scenarios.offline_algorithms import AnswerFormat, answers_file, create_offline, is_offline, read_answers
 from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
 from marsyard.scenarios.systems import systems
+from marsyard.sim.parameters import Parameters
 
 #: Entry point group of other packages' algorithms.
 GROUP = "marsyard.algorithms"
@@ -67,7 +70,7 @@ class Task(Generic[Algorithm, Options]):
     """A task of a system and its algorithms.
 
     - name: name on the command line and in the exchange with programs
-    - what: noun for an algorithm of the task in messages, such as "velocity estimator"
+    - noun: noun for an algorithm of the task in messages, such as "velocity estimator"
     - methods: required methods of an algorithm that receives all measurements at once; empty if all receive them one by
       one (streams)
     - answers: data classes and enumerations of its answers
@@ -81,7 +84,7 @@ class Task(Generic[Algorithm, Options]):
     """
 
     name: str
-    what: str
+    noun: str
     methods: tuple[str, ...]
     shipped: Mapping[str, Callable[[Options], Algorithm]]
     options: type[Options]
@@ -98,9 +101,9 @@ class Task(Generic[Algorithm, Options]):
         command = exchange.parse_command(spec)
         if command is not None:
             if self.executable is None:
-                raise ValueError(f"'{spec}': a {self.what} cannot be a program; allowed: a name, module:Class")
+                raise ValueError(f"'{spec}': a {self.noun} cannot be a program; allowed: a name, module:Class")
             if command.stream and not self.accepts_streams:
-                raise ValueError(f"'{spec}': a {self.what} does not accept a stream of images; allowed: exec:, serve:")
+                raise ValueError(f"'{spec}': a {self.noun} does not accept a stream of images; allowed: exec:, serve:")
             return
         if is_offline(spec):
             answer_format, file = self._answer_format(spec), answers_file(spec)
@@ -112,9 +115,9 @@ class Task(Generic[Algorithm, Options]):
         methods = STREAM_METHODS if is_stream else self.methods
         missing = [method for method in methods if method not in factory.members]
         if not factory.is_callable:
-            raise ValueError(f"'{spec}' is not a valid {self.what}: {factory.kind}, not a class or function")
+            raise ValueError(f"'{spec}' is not a valid {self.noun}: {factory.kind}, not a class or function")
         if missing and factory.is_class:
-            raise ValueError(f"'{spec}' is not a valid {self.what}: missing members: {', '.join(missing)}")
+            raise ValueError(f"'{spec}' is not a valid {self.noun}: missing members: {', '.join(missing)}")
 
     def make(self, spec: str, options: Options, limits: exchange.ExecutableLimits, case: int = 0) -> Algorithm:
         """Create an algorithm by name. Raises ValueError, and the exceptions of a user's constructor.
@@ -159,7 +162,7 @@ class Task(Generic[Algorithm, Options]):
 
     def _answer_format(self, spec: str) -> AnswerFormat[Any]:
         if self.offline is None:
-            raise ValueError(f"'{spec}': a {self.what} cannot run offline: each answer determines the next image")
+            raise ValueError(f"'{spec}': a {self.noun} cannot run offline: each answer determines the next image")
         return self.offline
 
 
@@ -250,3 +253,57 @@ def labels(specs: Sequence[str]) -> tuple[str, ...]:
         candidates = itertools.chain([label], (f"{label}_{number}" for number in itertools.count(2)))
         unique_labels.append(next(name for name in candidates if name not in unique_labels))
     return tuple(unique_labels)
+
+
+class AlgorithmSelection(Parameters):
+    """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
+
+    task: ClassVar[Task[Any, Any]]
+
+    algorithm: str
+    compared: Annotated[
+        tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
+    ] = ()
+    executable: Annotated[exchange.ExecutableLimits, Field(description="limits and isolation of custom algorithms")] = (
+        exchange.ExecutableLimits()
+    )
+
+    @property
+    def algorithms(self) -> tuple[str, ...]:
+        """All algorithms; the first is the one under test."""
+        return (self.algorithm, *self.compared)
+
+    @property
+    def options(self) -> Any:
+        """Options of the published algorithm, for all algorithms of Marsyard."""
+        return next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
+
+    def make(self, algorithm: str, case: int) -> Any:
+        """Create an algorithm for a case. Raises ValueError, and the exceptions of a user's constructor."""
+        return self.task.make(algorithm, self.options, self.executable, case)
+
+    @field_validator("algorithm")
+    @classmethod
+    def _check_algorithm(cls, name: str) -> str:
+        cls.task.check(name)
+        return name
+
+    @field_validator("compared")
+    @classmethod
+    def _check_compared(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        check_algorithms(cls.task, names)
+        return names
+
+    @model_validator(mode="after")
+    def _check_distinct(self) -> AlgorithmSelection:
+        if self.algorithm in self.compared:
+            raise ValueError(f"the algorithm '{self.algorithm}' is listed twice")
+        return self
+
+    @model_validator(mode="after")
+    def _check_options(self) -> AlgorithmSelection:
+        """Create the algorithms of Marsyard once, which checks their options."""
+        for name in self.algorithms:
+            if name in self.task.shipped:
+                self.task.shipped[name](self.options)
+        return self

@@ -15,7 +15,7 @@ import numpy as np
 
 from marsyard.algorithms.exchange.files import (
     CASE_FILE,
-    FORMAT_VERSION,
+    EXCHANGE_VERSION,
     check_version,
     open_json,
     read_image,
@@ -25,8 +25,8 @@ from marsyard.algorithms.exchange.files import (
 from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
-from marsyard.scenarios.localisation.stream import LocalisationMeasurements
-from marsyard.scenarios.offline import AnswerFormat
+from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
+from marsyard.scenarios.offline_algorithms import AnswerFormat
 from marsyard.scenarios.streamed import StreamAnswers
 
 
@@ -35,7 +35,7 @@ def write_descent(folder: Path, measurements: LocalisationMeasurements) -> None:
     write_map(folder, measurements.map_product)
     images = write_images(folder, measurements.images, "png")
     content = encode(measurements, ["map_product", "images"])
-    write_json(folder / CASE_FILE, {"exchange": FORMAT_VERSION, "task": "localisation", **content, "images": images})
+    write_json(folder / CASE_FILE, {"exchange": EXCHANGE_VERSION, "task": "localisation", **content, "images": images})
 
 
 def read_descent(folder: Path) -> LocalisationMeasurements:

@@ -26,8 +26,8 @@ from marsyard.algorithms.navigation.visual_odometry import VisualOdometry, estim
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.placement import Placement
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
-from marsyard.scenarios.algorithm_run import InputCopy, Inputs
 from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.input_copies import InputCopy, Inputs
 from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
@@ -71,7 +71,7 @@ MAST_SPACING_RAD = np.radians(40.0)
 
 @dataclass
 class Setup:
-    """A rover at its start with its cameras, before the target is designated."""
+    """A rover in its world, with its cameras; its vehicle is at the start until a run moves it."""
 
     world: RunWorld
     rig: Rig
@@ -105,14 +105,15 @@ def is_stuck(steps: Sequence[Step], mobility: MobilityParameters) -> bool:
 
 
 @dataclass
-class RoverRun(Setup):
-    """State of a run in progress or finished."""
+class RoverRun:
+    """State of a run in progress or finished: the rover in its world, its target, and what happened so far."""
 
+    setup: Setup
     target: DesignatedTarget
     stops: list[Stop] = field(default_factory=list)  #: stops with a tracking update, in order
     outcome: RunOutcome = RunOutcome.NOT_AT_GOAL
-    handed_over: bool = False  #: whether the target was handed over to the arm at the end
-    placement: Placement | None = None  #: placement of the instrument; None without a hand-over
+    handed_off: bool = False  #: whether the target was handed off to the arm at the end
+    placement: Placement | None = None  #: placement of the instrument; None without a hand-off
     visual_odometry_updates: int = 0
     visual_odometry_failures: int = 0  #: updates without an estimate; wheel odometry was used
     autonav_updates: int = 0
@@ -122,15 +123,10 @@ class RoverRun(Setup):
     drives_since_stop: list[Drive] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)  #: all steps with a commanded path, in order
 
-    @classmethod
-    def from_setup(cls, setup: Setup, target: DesignatedTarget) -> RoverRun:
-        """Create a run with a target, at its start."""
-        return cls(setup.world, setup.rig, setup.vehicle, setup.camera, setup.navigation_cameras, target)
-
     def create_target_estimate(self, position_rover: Float64[np.ndarray, "3"]) -> TargetEstimate:
         """Create a target estimate from a position in the rover frame; add its range from the camera."""
         position = np.asarray(position_rover)
-        return TargetEstimate(position, self.rig.range_m(position))
+        return TargetEstimate(position, self.setup.rig.range_m(position))
 
 
 class TrackerGuide:
@@ -141,7 +137,7 @@ class TrackerGuide:
         self._tracker: TargetTracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
         # a tracker in a process of its own cannot change its inputs
         self._copies: list[InputCopy[Any]] = []
-        self._mast: MastCalibration = self._input(run.rig.calibrated)
+        self._mast: MastCalibration = self._input(run.setup.rig.calibrated)
         self._tracker.designate(self._input(run.target.designation), estimated_pose)
 
     def _input(self, value: Inputs) -> Inputs:
@@ -163,9 +159,9 @@ class TrackerGuide:
 
         Raises AlgorithmError for an invalid answer, and the tracker's own errors.
         """
-        answer = self._tracker.aim(run.vehicle.estimated_pose, self._mast)
+        answer = self._tracker.aim(run.setup.vehicle.estimated_pose, self._mast)
         self._check_inputs()
-        return check_aim(answer, run.rig.calibrated)
+        return check_aim(answer, run.setup.rig.calibrated)
 
     def observe(self, run: RoverRun, view: StopView) -> RunOutcome | None:
         """Update the tracker and append the stop to the run; return the outcome if the run ends, else None.
@@ -180,7 +176,7 @@ class TrackerGuide:
         self._check_inputs()
         update = check_update(answer)
         time_s = answer_time_s(update, elapsed_s)
-        run.stops.append(Stop.from_view(view, run.target.point_world, run.rig.left, update, time_s))
+        run.stops.append(Stop.from_view(view, run.target.point_world, run.setup.rig.left, update, time_s))
         if update.state is TrackingState.FAILURE:
             return RunOutcome.LOST
         return RunOutcome.NOT_SEEDED if update.position_rover is None else None
@@ -190,7 +186,7 @@ class TrackerGuide:
         stop = run.stops[-1]
         if stop.update.position_rover is None:
             raise ValueError("the tracker has not reported a target position yet")
-        current_from_stop = compose(run.vehicle.estimated_pose.inv(), stop.estimated_pose)
+        current_from_stop = compose(run.setup.vehicle.estimated_pose.inv(), stop.estimated_pose)
         return run.create_target_estimate(current_from_stop.apply(np.array(stop.update.position_rover)))
 
 
@@ -208,13 +204,13 @@ class DesignationGuide:
 
     def aim(self, run: RoverRun) -> MastAim | None:
         """Return an aim at the estimated target; None if the mast cannot point there or a camera misses the rock."""
-        stance, rig = run.vehicle.stance, run.rig
+        stance, rig = run.setup.vehicle.stance, run.setup.rig
         angles = mast_angles(self.target(run).position_rover, rig.calibrated, use_both=False)
         if angles is None:
             return None
         rig.point(*angles)
-        corners = run.world.target_triangles.reshape(-1, 3)
-        corners = corners[corners[:, 2] > run.world.rocks.position_m[run.world.target_number, 2]]
+        corners = run.setup.world.target_triangles.reshape(-1, 3)
+        corners = corners[corners[:, 2] > run.setup.world.rocks.position_m[run.setup.world.target_number, 2]]
         in_head = np.asarray((stance.world_from_rover * rig.rover_from_head).inv().apply(corners.copy()))
         boxes = []
         for camera in (rig.left, rig.right):
@@ -236,9 +232,9 @@ class DesignationGuide:
     def target(self, run: RoverRun) -> TargetEstimate:
         """Return the designated position in the rover frame of the estimated pose, or the true target position."""
         if self.position_world is None:
-            true_pose = run.vehicle.stance.world_from_rover
+            true_pose = run.setup.vehicle.stance.world_from_rover
             return run.create_target_estimate(true_pose.inv().apply(run.target.point_world.copy()))
-        return run.create_target_estimate(run.vehicle.estimated_pose.inv().apply(self.position_world.copy()))
+        return run.create_target_estimate(run.setup.vehicle.estimated_pose.inv().apply(self.position_world.copy()))
 
     @classmethod
     def designate(cls, run: RoverRun, margin_px: float, oracle: bool) -> DesignationGuide:
@@ -248,14 +244,14 @@ class DesignationGuide:
         """
         if oracle:
             return cls(margin_px, None)
-        stance, rig = run.vehicle.stance, run.rig
+        stance, rig = run.setup.vehicle.stance, run.setup.rig
         point = run.target.point_world
         angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(point.copy())), rig.calibrated, False)
         if angles is None:
             raise ValueError("the mast cannot point at the target's rock from the start of this drive")
         rig.point(*angles)
         position = triangulate_point(rig, stance, point)
-        return cls(margin_px, np.asarray(run.vehicle.estimated_pose.apply(position)))
+        return cls(margin_px, np.asarray(run.setup.vehicle.estimated_pose.apply(position)))
 
 
 Guide = TrackerGuide | DesignationGuide
@@ -271,12 +267,12 @@ def prepare_run(
 ) -> RoverRun:
     """Create a run at its start and designate its target; the tracker is not called."""
     setup = Setup.draw(p, streams, load_ground)
-    return RoverRun.from_setup(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
+    return RoverRun(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
 
 
 def track_target(p: RoverScenarioParameters, run: RoverRun) -> RoverRun:
     """Drive a prepared run to its end, guided by the tracker of the parameters."""
-    guide, last_leg = TrackerGuide(p, run, run.vehicle.estimated_pose), p.legs[-1]
+    guide, last_leg = TrackerGuide(p, run, run.setup.vehicle.estimated_pose), p.legs[-1]
     failure = drive_legs(p, run, guide)
     if failure is not None:
         run.outcome = failure
@@ -288,8 +284,8 @@ def track_target(p: RoverScenarioParameters, run: RoverRun) -> RoverRun:
         run.outcome = RunOutcome.COMPLETED if is_complete else RunOutcome.NOT_AT_GOAL
     if run.outcome is RunOutcome.COMPLETED and last_leg.motion == "approach":
         goal = GoalCriterion(last_leg.goal_m, 2.0 * GOAL_TOLERANCE_M)
-        result = hand_off(run.stops[-1].update, goal, run.rig.calibrated)
-        run.handed_over = result.outcome is HandOffOutcome.HANDED_OVER
+        result = hand_off(run.stops[-1].update, goal, run.setup.rig.calibrated)
+        run.handed_off = result.outcome is HandOffOutcome.HANDED_OFF
     return run
 
 
@@ -314,7 +310,7 @@ def visit_stop(p: RoverScenarioParameters, run: RoverRun, guide: Guide, leg: int
     aim = guide.aim(run)
     if aim is None:
         return RunOutcome.OUT_OF_REACH
-    world, rig, vehicle, time_s = run.world, run.rig, run.vehicle, run.time_s
+    world, rig, vehicle, time_s = run.setup.world, run.setup.rig, run.setup.vehicle, run.time_s
     rig.point(aim.azimuth_rad, aim.elevation_rad)
     world_from_head = compose(vehicle.stance.world_from_rover, rig.rover_from_head)
     shadow = None
@@ -324,7 +320,7 @@ def visit_stop(p: RoverScenarioParameters, run: RoverRun, guide: Guide, leg: int
         geometry, sun = rig.calibrated.geometry, world.scene(time_s).sun.direction
         shadow = build_shadow_caster(vehicle.rover, stance, geometry, rig.state.true_rad, target, radius_m, sun)
     cameras, boxes, brightness = (rig.left, rig.right), (aim.left, aim.right), world.brightness(time_s)
-    images = run.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
+    images = run.setup.camera.take(world.scene(time_s), shadow, world_from_head, cameras, boxes, brightness, time_s)
     angles, drives = rig.state.readings_rad, tuple(run.drives_since_stop)
     run.drives_since_stop = []
     view = StopView(leg, time_s, vehicle.stance, vehicle.estimated_pose, angles, world_from_head, images, drives)
@@ -338,11 +334,11 @@ def drive_step(
     commands: Iterable[DriveCommand] = plan_step(leg, step_count, target)
     if leg.autonav:
         map_terrain(p, run, leg, target)
-        plan = run.navigator.plan(leg, target, run.vehicle.estimated_pose)
+        plan = run.navigator.plan(leg, target, run.setup.vehicle.estimated_pose)
         if plan.outcome not in (NavigationOutcome.PATH, NavigationOutcome.AT_GOAL):
             return RunOutcome.NO_PATH
         commands = plan.commands
-    start, commanded_m = run.vehicle.stance, 0.0
+    start, commanded_m = run.setup.vehicle.stance, 0.0
     for command in commands:
         part_count = 1
         if leg.visual_odometry:
@@ -355,14 +351,14 @@ def drive_step(
         run.time_s += p.timing.drive_s
         commanded_m += command.length_m
     if commanded_m > 0.0:
-        ends = (stance.world_from_rover.translation for stance in (start, run.vehicle.stance))
+        ends = (stance.world_from_rover.translation for stance in (start, run.setup.vehicle.stance))
         run.steps.append(Step(commanded_m, float(np.linalg.norm(np.subtract(*ends)))))
     return None
 
 
 def drive_part(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, command: DriveCommand) -> Drive:
     """Execute a drive command; with visual odometry, correct the estimated position by the motion between two pairs."""
-    vehicle, is_oracle = run.vehicle, p.navigation.odometry == "oracle-motion"
+    vehicle, is_oracle = run.setup.vehicle, p.navigation.odometry == "oracle-motion"
     if not leg.visual_odometry or is_oracle:
         drive = vehicle.drive(command, leg.visual_odometry)
         run.visual_odometry_failures += vehicle.estimate.visual_failed
@@ -380,10 +376,12 @@ def drive_part(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, co
 
 def take_odometry_pair(p: RoverScenarioParameters, run: RoverRun) -> StereoMeasurement:
     """Take the stereo pair of visual odometry, straight ahead; reuse the last one if the rover has not moved since."""
-    stance = run.vehicle.stance
+    stance = run.setup.vehicle.stance
     if run.odometry_pair is None or run.odometry_pair[0] is not stance:
-        cameras, time_s = run.navigation_cameras, run.time_s
-        pair = cameras.take_mast_pair(p, run.world, run.rig, run.vehicle, 0.0, time_s, ODOMETRY_EDGE_RAYS)
+        cameras, time_s = run.setup.navigation_cameras, run.time_s
+        pair = cameras.take_mast_pair(
+            p, run.setup.world, run.setup.rig, run.setup.vehicle, 0.0, time_s, ODOMETRY_EDGE_RAYS
+        )
         run.odometry_pair = stance, pair
     return run.odometry_pair[1]
 
@@ -395,7 +393,7 @@ def map_terrain(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, t
     """
     run.autonav_updates += 1
     run.time_s += p.timing.autonav_s
-    vehicle, cameras, time_s = run.vehicle, run.navigation_cameras, run.time_s
+    vehicle, cameras, time_s = run.setup.vehicle, run.setup.navigation_cameras, run.time_s
     estimated_pose = vehicle.estimated_pose
     run.navigator.map_start(estimated_pose, vehicle.rover.enclosing_radius_m)
     ahead = goal_position(leg, target)
@@ -403,14 +401,16 @@ def map_terrain(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, t
     azimuths = [azimuth + (number - 0.5 * (leg.wedges - 1)) * MAST_SPACING_RAD for number in range(leg.wedges)]
     if p.navigation.terrain == "oracle-heights":
         ranges_m, azimuths = (BODY_RANGES_M, [0.0]) if leg.map_by == "body" else (MAST_RANGES_M, azimuths)
-        points = [oracle_heights(run.world, vehicle, azimuth, ranges_m, leg.map_by == "body") for azimuth in azimuths]
+        points = [
+            oracle_heights(run.setup.world, vehicle, azimuth, ranges_m, leg.map_by == "body") for azimuth in azimuths
+        ]
         estimated_from_true = estimated_pose * vehicle.stance.world_from_rover.inv()
         run.navigator.map_points(np.asarray(estimated_from_true.apply(np.concatenate(points))))
     elif leg.map_by == "body":
         run.navigator.map_pair(
-            cameras.take_body_pair(run.world, run.rig, vehicle, time_s), estimated_pose, BODY_RANGES_M
+            cameras.take_body_pair(run.setup.world, run.setup.rig, vehicle, time_s), estimated_pose, BODY_RANGES_M
         )
     else:
         for azimuth in azimuths:
-            pair = cameras.take_mast_pair(p, run.world, run.rig, vehicle, azimuth, time_s)
+            pair = cameras.take_mast_pair(p, run.setup.world, run.setup.rig, vehicle, azimuth, time_s)
             run.navigator.map_pair(pair, estimated_pose, MAST_RANGES_M)

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 
-from marsyard.scenarios.exposure import add_haze
 from marsyard.scenarios.horizon import add_unresolved_rocks
+from marsyard.scenarios.radiance import add_haze
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
 from marsyard.scenarios.views import (
     CAMERA_MOUNTINGS,

@@ -1,9 +1,8 @@
-"""Commands `marsyard conformance`, `export`, `score`, `dataset`: check algorithms, export data, score answers."""
+"""Commands `marsyard export`, `score`, `dataset`: export data of cases, and score answers computed elsewhere."""
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +11,6 @@ from typer import Argument, Option
 
 from marsyard.cli import options
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
-from marsyard.cli.options import Exit, JsonOption, console, handle_user_errors
 
 TruthOption = Annotated[
     Path | None, Option(metavar="TRUTH", help="Folder of the ground truth; by default DIR-truth next to DIR.")
@@ -33,10 +31,10 @@ def export(
 ) -> None:
     """Export images, measurements and camera models for an external algorithm. Cases already exported are kept."""
     from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.running.offline import export_campaign, truth_folder
+    from marsyard.campaigns.running.export_scoring import export_campaign, truth_folder
     from marsyard.campaigns.store import record
     from marsyard.reports.wording import count
-    from marsyard.scenarios.offline import EXPORT, LOSSY
+    from marsyard.scenarios.offline_algorithms import EXPORT, LOSSY
 
     truth = truth_folder(out) if truth is None else truth
     no_products = ["retain.products=none", "retain.showcase=none"]
@@ -77,8 +75,13 @@ def score(
     trust: options.TrustOption = False,
 ) -> None:
     """Score the answers of an external algorithm; write verdicts and report."""
-    from marsyard.campaigns.running.engine import ProgressObserver, run_campaign
-    from marsyard.campaigns.running.offline import create_scoring_campaign, find_cases_with_changed_images, truth_folder
+    from marsyard.campaigns.running.engine import run_campaign
+    from marsyard.campaigns.running.export_scoring import (
+        create_scoring_campaign,
+        find_cases_with_changed_images,
+        truth_folder,
+    )
+    from marsyard.campaigns.running.progress import ProgressObserver
     from marsyard.campaigns.store.origin import adopt
     from marsyard.reports.wording import count
 
@@ -122,55 +125,3 @@ def dataset(
     shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs, bits_per_pixel)
     total = sum(path.stat().st_size for path in shards)
     typer.echo(f"{len(shards)} shards, {options.size_text(total)}: {out}")
-
-
-@handle_user_errors
-def conformance(
-    algorithm: Annotated[
-        str,
-        Argument(
-            metavar="ALGORITHM",
-            help="Algorithm, dynamics, instrument or custom score: a name, module:Class, exec:PROGRAM (started "
-            "per case) or serve:PROGRAM (one process for all cases).",
-        ),
-    ],
-    task: Annotated[
-        str | None,
-        Option(
-            metavar="TASK",
-            help="Interface to check: velocity, tracking, landing, localisation, dynamics, instrument or score; by "
-            "default inferred from the methods of the class.",
-        ),
-    ] = None,
-    time_limit: Annotated[float, Option(metavar="S", help="Time limit of one call in seconds.", min=0.1)] = 60.0,
-    as_json: JsonOption = False,
-) -> None:
-    """Check that a custom algorithm, dynamics model, instrument or score follows its interface and time limit."""
-    from marsyard.campaigns.running.conformance import create_subject, run_conformance_checks
-    from marsyard.scenarios.parts.named import KINDS
-
-    candidate = create_subject(algorithm, task, time_limit)
-    findings = []
-    if not as_json:
-        kind = "custom component" if candidate.task in KINDS else "algorithm"
-        typer.echo(f"checking {algorithm} as {candidate.task} ({kind})")
-    for finding in run_conformance_checks(candidate):
-        findings.append(finding)
-        if as_json:
-            continue
-        result = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
-        console().print(f"{result} {finding.check:<14}", end="", highlight=False)
-        lines = [f"{finding.requirement} ({finding.note})" if finding.note else finding.requirement]
-        if not finding.passed:
-            lines += [f"{'':20}{line}" for line in (finding.problem, f"to fix: {finding.next_step}")]
-        for line in lines:
-            console().print(line, markup=False, highlight=False, soft_wrap=True)
-    failures = sum(not finding.passed for finding in findings)
-    if as_json:
-        checks = [{**asdict(finding), "passed": finding.passed} for finding in findings]
-        data = {"algorithm": candidate.spec, "task": candidate.task, "passed": not failures, "checks": checks}
-        typer.echo(json.dumps(data, indent=2))
-    else:
-        typer.echo(f"{len(findings) - failures} of {len(findings)} checks passed")
-    if failures:
-        raise typer.Exit(Exit.FAILED)

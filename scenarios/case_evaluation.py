@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from marsyard.scenarios.algorithm_run import AlgorithmRun, AlgorithmSelection
-from marsyard.scenarios.estimators import labels
+from marsyard.scenarios.algorithm_run import AlgorithmRun
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredCase, compute_scores
+from marsyard.scenarios.tasks import AlgorithmSelection, labels
 from marsyard.scenarios.timeline import Timeline, timeline_products
 
 Answer = TypeVar("Answer")
@@ -75,15 +75,14 @@ def evaluate_case(
         outcome = scored.outcome or algorithm_run.outcome_name
         return CaseResult(outcome, scored.answered, row, products, algorithm_run.failure)
 
-    return case_result(p.algorithms, evaluate, conditions)
+    return _combine_results(labels(p.algorithms), [evaluate(name) for name in p.algorithms], conditions)
 
 
-def case_result(
-    algorithms: Sequence[str], evaluate: Callable[[str], CaseResult], conditions: Mapping[str, Scalar]
+def _combine_results(
+    names: Sequence[str], results: Sequence[CaseResult], conditions: Mapping[str, Scalar]
 ) -> CaseResult:
-    """Score each algorithm (the first is under test) with `evaluate`, and combine the rows."""
-    names = labels(algorithms)
-    first, *compared_results = [evaluate(algorithm) for algorithm in algorithms]
+    """Combine the rows of the algorithms, given by their labels; the first is under test."""
+    first, *compared_results = results
     row: dict[str, Scalar] = {ALGORITHM: names[0], **first.row, **conditions}
     for name, result in zip(names[1:], compared_results, strict=True):
         columns: dict[str, Scalar] = {"outcome": result.outcome, "answered": result.answered}

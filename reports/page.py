@@ -100,7 +100,7 @@ def verdict_row(verdict: Verdict) -> dict[str, Any]:
         "evidence": [count(verdict.n, "case"), f"{verdict.failures:,} failed"],
         "bounds": bounds_text,
         "risk": "" if math.isnan(verdict.consumer_risk) else f"consumer's risk {percent(verdict.consumer_risk)}",
-        "further": NOTHING if verdict.further_cases is None else f"{verdict.further_cases:,}",
+        "additional": NOTHING if verdict.additional_cases is None else f"{verdict.additional_cases:,}",
         "strip": diagram,
     }
 

@@ -1,0 +1,82 @@
+"""Time, disk space and limits of the evidence of a campaign, printed before it runs."""
+
+from __future__ import annotations
+
+import os
+
+import typer
+
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.running.estimate import estimate_campaign
+from marsyard.cli.options import size_text
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.statistics.proportions import minimum_sample_size
+from marsyard.reports.verdicts import ESTIMATE
+from marsyard.reports.wording import count, format_fraction
+
+#: Maximum number of cases that are drawn to count their distinct terrains; the draws of a case take milliseconds.
+_MAX_DRAWS = 5000
+
+
+def evidence_limits(campaign: Campaign) -> list[str]:
+    """Return the reasons why the strictest requirement cannot be PASS even without a failure; empty if it can.
+
+    Each reason contains a remedy. Only requirements that are decided at a confidence are considered. The population is
+    assumed to be all cases; a smaller population requires more cases.
+    """
+    definition = campaign.definition
+    requirements = [item for item in definition.requirements if item.decide_by != ESTIMATE]
+    design = read_sampling_design(definition.model_dump(mode="json"))
+    if not requirements:
+        return []
+    if not design.independent:
+        return [design.no_probability]
+    strictest = max(requirements, key=lambda item: minimum_sample_size(item.probability, item.confidence))
+    min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), definition.total_cases
+    requirement_text = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"
+    limits = []
+    if cases < min_cases:
+        condition = f"{requirement_text} takes at least {count(min_cases, 'case')} without a failure"
+        limits.append(f"{strictest.id}: {condition}; the campaign has {cases}.")
+    terrain_supply = design.terrains
+    if terrain_supply is None:
+        return limits
+    # number of distinct terrains: assigned in turn, or drawn at random
+    terrains = min(cases, terrain_supply.terrains)
+    path = next((path for path in ("location.terrain", "world.terrain") if path in definition.dispersions), None)
+    if not terrain_supply.in_turn and path is not None and cases <= _MAX_DRAWS:
+        terrains = len({campaign.draws(case)[path] for case in range(int(definition.design.nominal), cases)})
+    # if several cases share a terrain, the evidence is limited by the number of terrains
+    if terrains < min(cases, min_cases):
+        limits.append(terrain_supply.advice(min_cases, strictest.probability, strictest.confidence))
+    return limits
+
+
+def print_estimate(campaign: Campaign, executor: ExecutorConfig) -> None:
+    """Print the estimated time and disk space of a campaign."""
+    workers = executor.jobs if executor.cluster is None else os.cpu_count() or 1
+    estimate = estimate_campaign(campaign, workers)
+    total = campaign.definition.total_cases
+    low, high = estimate.case_range_s
+    time_s = estimate.time_s
+    duration = f"{time_s / 60.0:.0f} min" if time_s < 7200.0 else f"{time_s / 3600.0:.1f} h"
+    duration = f"{time_s:.0f} s" if time_s < 120.0 else duration
+    typer.echo(f"{count(total, 'case')} on {count(workers, 'worker')}: about {duration}")
+    if estimate.inputs:
+        typer.echo(f"  {count(estimate.inputs, 'terrain')} (shared inputs) to build, {estimate.input_s:.3g} s each")
+    trials = count(estimate.trials, "trial case")
+    typer.echo(f"  {estimate.case_s:.3g} s per case ({low:.3g} to {high:.3g} s in {trials})")
+    if estimate.unfinished:
+        typer.echo(f"  {estimate.unfinished} of the trial cases did not finish")
+    rows, products = size_text(estimate.rows_bytes), size_text(estimate.products_bytes)
+    typer.echo(f"disk: {rows} of rows, up to {products} of products")
+    if estimate.inputs_bytes:
+        limit = size_text(estimate.cache_limit_bytes)
+        typer.echo(f"  {size_text(estimate.inputs_bytes)} of terrains in the cache (maximum {limit})")
+
+
+def print_limits(campaign: Campaign) -> None:
+    """Print which requirements of the campaign cannot be PASS, and the remedy (see `evidence_limits`)."""
+    for limit in evidence_limits(campaign):
+        typer.echo(f"note: {limit}")

@@ -1,0 +1,60 @@
+"""Columns of conditions common to several scenarios: sun, contrast, attitude, and provenance of the images."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Float64, UInt16
+
+from marsyard.scenarios.interface import Scalar
+from marsyard.sim.dynamics import State
+from marsyard.sim.image_statistics import local_contrast
+from marsyard.sim.kernel_cache import processor_features
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import Backend
+from marsyard.sim.sensor import DetectorParameters
+
+
+def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
+    """Return the sun's azimuth, clockwise from north, and elevation from its direction in world axes."""
+    return {
+        "sun_azimuth_deg": float(np.degrees(np.arctan2(direction[0], direction[1])) % 360.0),
+        "sun_elevation_deg": float(np.degrees(np.arcsin(np.clip(direction[2], -1.0, 1.0)))),
+    }
+
+
+def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: DetectorParameters) -> dict[str, Scalar]:
+    """Return the median of a delivered image's local contrast, and its 90 % quantile divided by its 10 % quantile.
+
+    `local_contrast` defines the contrast; the quotient is NaN if the 10 % quantile is 0.
+    """
+    p10, median, p90 = local_contrast(np.maximum(image - detector.offset_dn, 0.0))
+    return {"image_contrast": median, "image_patchiness": p90 / p10 if p10 > 0.0 else np.nan}
+
+
+def off_nadir_deg(state: State) -> float:
+    """Return the angle between the body's camera axis and nadir."""
+    # the camera looks along -z of the body; the element is the cosine of the angle between the z axes of body and world
+    return float(np.degrees(np.arccos(np.clip(state.attitude.as_matrix()[2, 2], -1.0, 1.0))))
+
+
+def attitude_rate_deg_s(state: State) -> float:
+    """Return the magnitude of the body rate."""
+    return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
+
+
+def hash_images(images: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
+    """Compute the SHA-256 of the counts of images."""
+    return hashlib.sha256(b"".join(counts.tobytes() for counts in images)).hexdigest()
+
+
+def image_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+    """Return the provenance columns of images rendered by a backend."""
+    return {
+        "image_hash": image_hash,
+        "gl_backend": backend,
+        "gl_version": process_renderer(backend).description(),
+        "processor_features": processor_features(),
+    }

@@ -1,0 +1,153 @@
+"""Ground truth of a landing case: relief, and slope and roughness of the footprints on a grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import distance_transform_edt
+
+from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.cameras import camera_optics
+from marsyard.scenarios.landing.flight import LandingFlight
+from marsyard.scenarios.landing.images import Pair, take_images
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
+from marsyard.scenarios.landing.world import LandingWorld
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.streams import Streams
+
+#: Spacing of the ground-truth grid divided by the diameter of a footprint: 0.2 m for a footprint of 2 m.
+STEP_DIAMETERS = 0.1
+#: Width of the margin of relief around the visible ground, in footprint diameters: touchdowns can lie outside it.
+MARGIN_DIAMETERS = 1.5
+#: True safety of the footprint around a pixel's ground point: safe, unsafe, or partly outside of an image.
+SAFE, UNSAFE, UNKNOWN = 0, 1, 255
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Ground truth of a flight on a grid aligned with the horizontal axes of the first image."""
+
+    relief: Relief
+    limits: Limits
+    positions: Float[np.ndarray, "rows columns 2"]  #: world x, y of the grid points
+    footprints: Footprints  #: slope and roughness under a lander at each position
+    covered: Bool[np.ndarray, "rows columns"]  #: whether both images show the whole footprint
+    step_m: float
+
+    @classmethod
+    def from_images(cls, world: LandingWorld, flight: LandingFlight, pair: Pair, limits: Limits) -> GroundTruth:
+        """Compute the ground truth of the area in the first image."""
+        centre = flight.states[0].position_m
+        # rows: unit vectors of the image's right and up directions on the ground
+        right = flight.states[0].attitude.apply(np.array([1.0, 0.0, 0.0]))[:2]
+        right = right / np.hypot(*right)
+        axes = np.array([right, [-right[1], right[0]]])
+        # outline of the ground in the image; every eighth pixel suffices
+        ground_points = pair.frames[0].points_world(np.s_[::8, ::8])[..., :2].reshape(-1, 2)
+        hull = cv2.convexHull(ground_points[np.all(np.isfinite(ground_points), axis=1)].astype(np.float32))
+        outline = (hull[:, 0].astype(np.float64) - centre[:2]) @ axes.T
+        step = STEP_DIAMETERS * limits.diameter_m
+        low, high = (np.floor(limit / step) * step for limit in (outline.min(axis=0), outline.max(axis=0)))
+        x, y = (np.arange(first, last + 0.5 * step, step) for first, last in zip(low, high, strict=True))
+        local = np.stack(np.meshgrid(x, y), axis=-1)
+        positions = np.asarray(centre[:2] + local @ axes)
+        margin = MARGIN_DIAMETERS * limits.diameter_m
+        flat_positions = positions.reshape(-1, 2)
+        west_south, east_north = flat_positions.min(axis=0) - margin, flat_positions.max(axis=0) + margin
+        spacing = SPACING_DIAMETERS * limits.diameter_m
+        relief = Relief.from_ground(world.ground, west_south, east_north, spacing, world.meshes)
+        heights = relief.average(positions, relief.spacing_m)
+        # grid points on the ground; `visible`: whether both images show them
+        points = np.concatenate([flat_positions, heights.reshape(-1, 1)], axis=1)
+        visible = np.ones(len(points), dtype=bool)
+        for image, state in zip(pair.images, flight.states, strict=True):
+            pixels, in_front = image.camera.transform(state.world_from_body).project(points)
+            with np.errstate(invalid="ignore"):
+                visible &= in_front & np.all((pixels >= 0.0) & (pixels <= np.array(image.camera.size) - 1.0), axis=1)
+        distance_to_invisible_m = distance_transform_edt(np.pad(visible.reshape(heights.shape), 1))[1:-1, 1:-1] * step
+        covered = distance_to_invisible_m >= 0.5 * limits.diameter_m
+        return cls(relief, limits, positions, relief.footprints(positions, limits), covered, step)
+
+    @property
+    def safe(self) -> Bool[np.ndarray, "rows columns"]:
+        """Safe positions whose whole footprint is in both images."""
+        return np.asarray(self.covered & self.footprints.safe)
+
+    @property
+    def safe_with_margin(self) -> Bool[np.ndarray, "rows columns"]:
+        """Positions around which all positions within one footprint radius are also safe."""
+        distance_m = distance_transform_edt(np.pad(self.safe, 1))[1:-1, 1:-1] * self.step_m
+        return np.asarray(distance_m > 0.5 * self.limits.diameter_m)
+
+    @property
+    def visible_hazards(self) -> Bool[np.ndarray, "rows columns"]:
+        """Unsafe positions whose whole footprint is in both images."""
+        return np.asarray(self.covered & ~self.footprints.safe)
+
+    def clearance_fraction(self, position: Float[np.ndarray, "2"]) -> float:
+        """Compute the distance of a position (x, y) from the nearest visible hazard, divided by the largest distance.
+
+        The largest distance is that of a position whose footprint is in both images. The result is 0 outside of the
+        images and without a safe position in them, and NaN without a visible hazard.
+        """
+        if not np.any(self.visible_hazards):
+            return float("nan")
+        distances = np.where(self.covered, distance_transform_edt(~self.visible_hazards), 0.0)
+        row, column = divmod(
+            int(np.argmin(np.hypot(*(self.positions.reshape(-1, 2) - position).T))), distances.shape[1]
+        )
+        is_outside = np.hypot(*(self.positions[row, column] - position)) > self.step_m
+        largest = float(distances.max())
+        return 0.0 if is_outside or largest == 0.0 else float(distances[row, column]) / largest
+
+    def distance_to_hazard_m(self, position: Float[np.ndarray, "2"]) -> float:
+        """Compute the distance from a position (x, y) to the nearest unsafe grid position."""
+        unsafe = self.positions[~self.footprints.safe]
+        return float(np.hypot(*(unsafe - position).T).min()) if len(unsafe) else float("inf")
+
+    def classify_points(self, points: Float[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "rows columns"]:
+        """Classify the footprint around each ground point (SAFE, UNSAFE, UNKNOWN) by the nearest grid position."""
+        origin = self.positions[0, 0]
+        axes = np.stack([self.positions[0, 1] - origin, self.positions[1, 0] - origin], axis=1)
+        cells = np.linalg.solve(axes, (points[..., :2] - origin).reshape(-1, 2).T).T
+        is_inside = np.asarray(np.isfinite(cells).all(axis=1))
+        columns, rows = np.rint(np.where(is_inside[:, None], cells, -1.0)).astype(np.int64).T
+        shape = self.covered.shape
+        is_inside &= (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
+        true_class = np.full(len(cells), UNKNOWN, dtype=np.uint8)
+        indices = rows[is_inside], columns[is_inside]
+        footprint_class = np.where(self.footprints.safe[indices], SAFE, UNSAFE)
+        true_class[is_inside] = np.where(self.covered[indices], footprint_class, UNKNOWN)
+        return true_class.reshape(points.shape[:2])
+
+    def footprint_at(self, position: Float[np.ndarray, "2"]) -> Footprints | None:
+        """Compute slope and roughness under a lander at any position (x, y); None outside the relief."""
+        try:
+            return self.relief.footprints(position[None], self.limits)
+        except ValueError:
+            return None
+
+
+@dataclass(frozen=True)
+class RenderedFlight:
+    """A flight with its world, images and ground truth."""
+
+    p: LandingScenarioParameters
+    world: LandingWorld
+    flight: LandingFlight
+    pair: Pair
+    truth: GroundTruth
+
+    @classmethod
+    def simulate(
+        cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
+    ) -> RenderedFlight:
+        """Simulate the flight of a case and take its images."""
+        world = LandingWorld.from_parameters(p, load_ground)
+        flight = LandingFlight.from_parameters(p, world.ground.surface, streams)
+        pair = take_images(p, world, flight, camera_optics(p.optics), streams)
+        return cls(p, world, flight, pair, GroundTruth.from_images(world, flight, pair, p.lander.limits))

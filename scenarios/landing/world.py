@@ -1,0 +1,44 @@
+"""World of a landing case: terrain with rocks, scaled texture, custom meshes, and sun."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, raise_sun_deg
+from marsyard.scenarios.meshes import MeshParameters
+from marsyard.scenarios.radiance import sun_at, sunlight_ratio
+from marsyard.scenarios.views import SiteGround
+from marsyard.sim.render import Sun
+from marsyard.sim.terrain import site
+from marsyard.sim.terrain.sites import SiteTexture
+
+#: Maximum number of terrains in a worker's memory: those of several campaigns, or of a small bank; 12 MB each.
+MAX_GROUNDS = 4
+
+
+@dataclass(frozen=True)
+class LandingWorld:
+    """Terrain with rocks, custom meshes, and sun of a landing case."""
+
+    ground: SiteGround
+    sun: Sun
+    meshes: tuple[MeshParameters, ...]
+    brightness: float  #: sunlight at the ground / reference sunlight of the detector
+
+    @classmethod
+    def from_parameters(
+        cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank
+    ) -> LandingWorld:
+        """Create the world of a case."""
+        ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)
+        texture = p.preset.ground_texture
+        amplitudes = tuple(p.texture * amplitude for amplitude in texture.amplitudes)
+        scaled_texture = SiteTexture(coarsest_m=texture.coarsest_m, amplitudes=amplitudes)
+        ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": scaled_texture}))
+        air = p.preset.environment
+        elevation_deg = raise_sun_deg(p.faults, p.sun.elevation_deg)
+        sun = sun_at(air, p.sun.azimuth_deg, elevation_deg)
+        return cls(ground, sun, p.meshes, sunlight_ratio(air, float(np.radians(elevation_deg)), p.detector))

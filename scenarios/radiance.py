@@ -1,0 +1,64 @@
+"""Radiance of an image: the sun and the brightness of its light, the rendered view, and haze in dusty air."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32
+from scipy.spatial.transform import RigidTransform
+
+from marsyard.scenarios.cameras import Optics
+from marsyard.sim.dynamics import State
+from marsyard.sim.frames import direction
+from marsyard.sim.render import Frame, Scene, Sun, process_renderer
+from marsyard.sim.render.backend import Backend
+from marsyard.sim.render.kernels.photometry import add_air_light
+from marsyard.sim.sensor import DetectorParameters, ImageMotion
+from marsyard.sim.terrain import Environment
+
+#: Path length for which the fault `haze` states an optical depth, m: about the height of the first image.
+HAZE_PATH_M = 2000.0
+
+
+def render_state(
+    backend: Backend, scene: Scene, optics: Optics, state: State, mounting: RigidTransform | None = None
+) -> tuple[Frame, ImageMotion]:
+    """Render the view of a camera at the body's origin, and compute the image motion during its exposure.
+
+    `mounting` rotates the camera in the body.
+    """
+    pose = state.world_from_body if mounting is None else state.world_from_body * mounting
+    frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
+    rate = state.attitude.apply(state.body_rate_rad_s)
+    return frame, ImageMotion.from_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
+
+
+def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> Float32[np.ndarray, "rows columns"]:
+    """Compute the radiance factor of an image through a homogeneous layer of dusty air between ground and camera.
+
+    The light from the ground is attenuated by the transmission ``T = exp(-extinction_m * range_m)``. The air adds
+    ``(1 - T)`` times its source function: single scattering of sunlight (phase function of Henyey & Greenstein 1941)
+    and of the mean light from sky and ground. Sky pixels are not changed.
+    """
+    if extinction_m == 0.0:
+        return frame.radiance
+    transmission = np.multiply(frame.range_m, -extinction_m, dtype=np.float32, casting="same_kind")
+    np.exp(transmission, out=transmission)
+    # sunlight travels along -sun and is scattered along -direction, towards the camera
+    east, north, up = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
+    sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+    ambient = 0.5 * (sky + float(frame.radiance.mean()))
+    scattering = np.float32(air.single_scattering_albedo), np.float32(air.asymmetry), np.float32(ambient)
+    hazy = np.empty_like(frame.radiance)
+    flat_arrays = (array.reshape(-1) for array in (frame.radiance, frame.range_m, transmission))
+    add_air_light(*flat_arrays, frame.rays.directions, (east, north, up), scattering, hazy.reshape(-1))
+    return hazy
+
+
+def sun_at(air: Environment, azimuth_deg: float, elevation_deg: float) -> Sun:
+    """Return the sun over a site; azimuth clockwise from north."""
+    return Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)), air.sun_radius_rad)
+
+
+def sunlight_ratio(air: Environment, elevation_rad: float, detector: DetectorParameters) -> float:
+    """Return direct sunlight at the ground divided by the reference sunlight of the detector's responsivity."""
+    return air.direct_fraction(elevation_rad) * air.solar_irradiance / detector.sunlight
