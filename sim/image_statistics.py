@@ -82,7 +82,7 @@ def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageS
     # a margin of twice the widest filter
     band_4, band_8 = (_standardise((fine - coarse)[16:-16, 16:-16]) for fine, coarse in pairwise(smooth))
     tails = (float((band_4**4).mean()) - 3.0, float((band_8**4).mean()) - 3.0, float((band_8**3).mean()))
-    features = cv2.SIFT_create().detect(_to_bytes(_flatten(_reduce(image, FEATURE_SIDE), 64.0)))
+    features = cv2.SIFT.create().detect(_to_bytes(_flatten(_reduce(image, FEATURE_SIDE), 64.0)))
     template = float(_template_strength(small).max())
     return ImageStatistics(
         rms, spectral_slope(small), p10, p50, p90, p90 / p10, corner, *tails, template, float(len(features))
@@ -96,9 +96,9 @@ def compute_pair_statistics(
 
     The contrast between 1 and 8 pixels is scaled to 8 grey levels in both images.
     """
-    images = [_equalise(_reduce(image, FEATURE_SIDE)) for image in (first, second)]
-    sift = cv2.SIFT_create(6000, contrastThreshold=0.008)
-    (keys, descriptors), (other_keys, other_descriptors) = (sift.detectAndCompute(image, None) for image in images)
+    image, other = images = tuple(_equalise(_reduce(item, FEATURE_SIDE)) for item in (first, second))
+    sift = cv2.SIFT.create(6000, contrastThreshold=0.008)
+    (keys, descriptors), (other_keys, other_descriptors) = (sift.detectAndCompute(item, None) for item in images)
     if descriptors is None or other_descriptors is None:
         return None
     neighbours = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
@@ -112,14 +112,14 @@ def compute_pair_statistics(
         return None
     in_overlap = _is_inside(_warp(np.array([key.pt for key in keys], dtype=np.float32), homography)).sum()
     corners, other_corners = (
-        cv2.goodFeaturesToTrack(image, count, 0.01, 7)[:, 0] for image, count in zip(images, (500, 700), strict=True)
+        cv2.goodFeaturesToTrack(item, count, 0.01, 7)[:, 0] for item, count in zip(images, (500, 700), strict=True)
     )
     expected = _warp(corners, homography)
     visible = _is_inside(expected)
     corners, expected = corners[visible], expected[visible]
     nearest = np.linalg.norm(expected[:, None] - other_corners[None], axis=2).min(axis=1)
     tracked, found, _ = cv2.calcOpticalFlowPyrLK(
-        *images, corners[:, None], expected[:, None].copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+        image, other, corners[:, None], expected[:, None].copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
     errors = np.linalg.norm(tracked[:, 0] - expected, axis=1)[found[:, 0] == 1]
     return PairStatistics(
@@ -127,7 +127,7 @@ def compute_pair_statistics(
         float(inliers.sum() / max(in_overlap, 1)),
         float((nearest < 2.0).mean()),
         float(np.median(errors)) if errors.size else float("nan"),
-        _decorrelation(*images, homography),
+        _decorrelation(image, other, homography),
     )
 
 
@@ -202,7 +202,7 @@ def _warp(points: Float[np.ndarray, "n 2"], homography: Float[np.ndarray, "3 3"]
 
 
 def _is_inside(points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-    return np.all((points > _MARGIN_PX) & (points < FEATURE_SIDE - _MARGIN_PX), axis=1)
+    return np.asarray(np.all((points > _MARGIN_PX) & (points < FEATURE_SIDE - _MARGIN_PX), axis=1))
 
 
 def _decorrelation(
