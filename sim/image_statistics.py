@@ -58,7 +58,8 @@ class PairStatistics(NamedTuple):
       the first image in the overlap
     - repeatability: fraction of the 500 best Harris corners of the first image in the overlap that are within 2 pixels
       of one of the 700 best of the second
-    - tracking_error_px: median distance of corners tracked by the Lucas-Kanade method from the homography
+    - tracking_error_px: median displacement of corners that the Lucas-Kanade method tracks in the second image, warped
+      to the first
     - decorrelation: 1 minus the median correlation of the templates after warping, in `SIDE` x `SIDE` pixels
     """
 
@@ -118,10 +119,9 @@ def compute_pair_statistics(
     visible = _is_inside(expected)
     corners, expected = corners[visible], expected[visible]
     nearest = np.linalg.norm(expected[:, None] - other_corners[None], axis=2).min(axis=1)
-    tracked, found, _ = cv2.calcOpticalFlowPyrLK(
-        image, other, corners[:, None], expected[:, None].copy(), flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    errors = np.linalg.norm(tracked[:, 0] - expected, axis=1)[found[:, 0] == 1]
+    warped = cv2.warpPerspective(other, np.linalg.inv(homography), (FEATURE_SIDE, FEATURE_SIDE))
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(image, warped, corners[:, None], None)
+    errors = np.linalg.norm(tracked[:, 0] - corners, axis=1)[found[:, 0] == 1]
     return PairStatistics(
         float(inliers.mean()),
         float(inliers.sum() / max(in_overlap, 1)),
