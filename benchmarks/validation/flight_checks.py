@@ -1,7 +1,7 @@
 """Checks of the simulated world: statistics of rendered images compared with those of images from Mars.
 
-The limits are derived from Spirit's descent images (the public copies, which have 843 x 843 pixels), HiRISE
-orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images: there
+The limits are derived from three descent images of Spirit (public copies of 843 x 843 pixels), pairs of them, four
+templates of DIMES, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to them: there
 the agreement is no independent test. "Flown" values were measured in images from Mars.
 """
 
