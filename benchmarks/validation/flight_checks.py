@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 from jaxtyping import Float64
 
@@ -22,6 +23,7 @@ from marsyard.sim.image_statistics import (
     compute_image_statistics,
     compute_pair_statistics,
 )
+from marsyard.sim.sensor import preset
 
 #: Altitudes of two of Spirit's descent images, metres.
 ALTITUDES_M = (1433.0, 1983.0)
@@ -70,9 +72,15 @@ def _render(site: str, camera: str, **values: float | int) -> Float64[np.ndarray
 
 
 def _render_descent(site: str, **values: float | int) -> Float64[np.ndarray, "rows columns"]:
-    """Render an image of the flown descent camera under the sun of the landing."""
+    """Render an image of the flown descent camera under the sun of the landing.
+
+    The camera summed four rows on the chip; like the public copies, the image has square pixels again.
+    """
     azimuth, elevation = SUNS_DEG[site]
-    return _render(site, "mer-descent-flown", sun_azimuth_deg=azimuth, sun_elevation_deg=elevation, **values)
+    image = _render(site, "mer-descent-flown", sun_azimuth_deg=azimuth, sun_elevation_deg=elevation, **values)
+    rows, columns = image.shape
+    summed = image.reshape(-1, preset("mer-descent-flown").detector.rows_summed, columns).mean(axis=1)
+    return np.asarray(cv2.resize(summed, (columns, rows), interpolation=cv2.INTER_LINEAR))
 
 
 def _within(claim: str, value: float, limits: tuple[float, float], how: str) -> Iterator[Measure]:
