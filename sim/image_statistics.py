@@ -1,15 +1,23 @@
-"""Statistics of terrain images to compare rendered images with real ones; the camera need not be calibrated."""
+"""Statistics of terrain images, and of pairs of them, to compare rendered with real ones; no calibration is needed."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import gaussian_filter
 
 #: Side of the resized images, pixels, as in DIMES; and side of the blocks for the local contrast.
 SIDE, BLOCK = 256, 16
+#: Side of the resized images for features and pairs, pixels; side of the templates in images of `SIDE`, pixels.
+FEATURE_SIDE, TEMPLATE = 512, 31
+#: Minimum numbers of matches, and of matches that agree with the homography of a pair.
+_MIN_MATCHES, _MIN_INLIERS = 8, 12
+#: Grey level of the mean, and distance of the overlap's border from the image's, pixels.
+_GREY, _MARGIN_PX = 110.0, 8
 #: Frequency range of the fit to the power spectrum, cycles per image.
 MIN_FREQUENCY, MAX_FREQUENCY = 4, 63
 
@@ -22,6 +30,11 @@ class ImageStatistics(NamedTuple):
     - local_p10, local_p50, local_p90: percentiles over all blocks of (standard deviation / mean of a block)
     - patchiness: local_p90 / local_p10
     - corner: mean at distances above 0.9 half diagonals from the centre, divided by the mean below 0.25
+    - kurtosis_4, kurtosis_8, skewness_8: excess kurtosis and skewness of the difference of Gaussians at 2 to 4, and at
+      4 to 8 pixels: large where few strong features stand out of quiet ground
+    - best_template: largest Harris value on a grid of 8 pixels: root mean square of the smaller gradient over a
+      template, divided by the mean
+    - sift: SIFT features in `FEATURE_SIDE` x `FEATURE_SIDE` pixels
     """
 
     rms: float
@@ -31,21 +44,91 @@ class ImageStatistics(NamedTuple):
     local_p90: float
     patchiness: float
     corner: float
+    kurtosis_4: float
+    kurtosis_8: float
+    skewness_8: float
+    best_template: float
+    sift: float
+
+
+class PairStatistics(NamedTuple):
+    """Statistics of two overlapping images that a homography relates, in `FEATURE_SIDE` x `FEATURE_SIDE` pixels.
+
+    - inlier_ratio, matched: SIFT matches that agree with the homography, divided by all matches, and by all features of
+      the first image in the overlap
+    - repeatability: fraction of the 500 best Harris corners of the first image in the overlap that are within 2 pixels
+      of one of the 700 best of the second
+    - tracking_error_px: median displacement of corners that the Lucas-Kanade method tracks in the second image, warped
+      to the first
+    - decorrelation: 1 minus the median correlation of the templates after warping, in `SIDE` x `SIDE` pixels
+    """
+
+    inlier_ratio: float
+    matched: float
+    repeatability: float
+    tracking_error_px: float
+    decorrelation: float
 
 
 def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageStatistics:
     """Compute the statistics of an image in any unit proportional to radiance."""
-    rows, columns = image.shape
-    side = min(rows, columns)
-    top, left = (rows - side) // 2, (columns - side) // 2
-    square = np.asarray(image[top : top + side, left : left + side], dtype=np.float64)
-    small = cv2.resize(square, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    small = _reduce(image, SIDE)
     p10, p50, p90 = local_contrast(small)
     offset = np.arange(SIDE) - 0.5 * (SIDE - 1)
     radius = np.hypot(offset[:, None], offset) / np.hypot(offset[0], offset[0])
     corner = float(small[radius > 0.9].mean() / small[radius < 0.25].mean())
     rms = float(small.std() / small.mean())
-    return ImageStatistics(rms, spectral_slope(small), p10, p50, p90, p90 / p10, corner)
+    flat = _flatten(small, 32.0)
+    smooth = [gaussian_filter(flat, sigma, mode="reflect") for sigma in (2.0, 4.0, 8.0)]
+    # a margin of twice the widest filter
+    band_4, band_8 = (_standardise((fine - coarse)[16:-16, 16:-16]) for fine, coarse in pairwise(smooth))
+    tails = (float((band_4**4).mean()) - 3.0, float((band_8**4).mean()) - 3.0, float((band_8**3).mean()))
+    features = cv2.SIFT.create().detect(_to_bytes(_flatten(_reduce(image, FEATURE_SIDE), 64.0)))
+    template = float(_template_strength(small).max())
+    return ImageStatistics(
+        rms, spectral_slope(small), p10, p50, p90, p90 / p10, corner, *tails, template, float(len(features))
+    )
+
+
+def compute_pair_statistics(
+    first: Float[np.ndarray, "rows columns"], second: Float[np.ndarray, "rows columns"]
+) -> PairStatistics | None:
+    """Compute the statistics of two overlapping images; None where no homography is found.
+
+    The contrast between 1 and 8 pixels is scaled to 8 grey levels in both images.
+    """
+    image, other = images = tuple(_equalise(_reduce(item, FEATURE_SIDE)) for item in (first, second))
+    sift = cv2.SIFT.create(6000, contrastThreshold=0.008)
+    (keys, descriptors), (other_keys, other_descriptors) = (sift.detectAndCompute(item, None) for item in images)
+    if descriptors is None or other_descriptors is None:
+        return None
+    neighbours = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
+    matches = [best[0] for best in neighbours if len(best) == 2 and best[0].distance < 0.8 * best[1].distance]
+    if len(matches) < _MIN_MATCHES:
+        return None
+    points = np.array([keys[match.queryIdx].pt for match in matches], dtype=np.float32)
+    other_points = np.array([other_keys[match.trainIdx].pt for match in matches], dtype=np.float32)
+    homography, inliers = cv2.findHomography(points, other_points, cv2.RANSAC, 2.5, maxIters=20000, confidence=0.9999)
+    if homography is None or inliers.sum() < _MIN_INLIERS:
+        return None
+    in_overlap = _is_inside(_warp(np.array([key.pt for key in keys], dtype=np.float32), homography)).sum()
+    corners, other_corners = (
+        cv2.goodFeaturesToTrack(item, count, 0.01, 7)[:, 0] for item, count in zip(images, (500, 700), strict=True)
+    )
+    expected = _warp(corners, homography)
+    visible = _is_inside(expected)
+    corners, expected = corners[visible], expected[visible]
+    nearest = np.linalg.norm(expected[:, None] - other_corners[None], axis=2).min(axis=1)
+    warped = cv2.warpPerspective(other, np.linalg.inv(homography), (FEATURE_SIDE, FEATURE_SIDE))
+    tracked, found, _ = cv2.calcOpticalFlowPyrLK(image, warped, corners[:, None], None)
+    errors = np.linalg.norm(tracked[:, 0] - corners, axis=1)[found[:, 0] == 1]
+    return PairStatistics(
+        float(inliers.mean()),
+        float(inliers.sum() / max(in_overlap, 1)),
+        float((nearest < 2.0).mean()),
+        float(np.median(errors)) if errors.size else float("nan"),
+        _decorrelation(image, other, homography),
+    )
 
 
 def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
@@ -73,3 +156,69 @@ def spectral_slope(image: Float[np.ndarray, "side side"]) -> float:
     radial_mean = np.bincount(ring_number, power.ravel()) / np.bincount(ring_number)
     fit_range = np.arange(MIN_FREQUENCY, MAX_FREQUENCY + 1)
     return float(np.polyfit(np.log(fit_range), np.log(radial_mean[fit_range]), 1)[0])
+
+
+def _reduce(image: Float[np.ndarray, "rows columns"], side: int) -> Float[np.ndarray, "side side"]:
+    """Area-average the central square to `side` pixels."""
+    rows, columns = image.shape
+    size = min(rows, columns)
+    top, left = (rows - size) // 2, (columns - size) // 2
+    square = np.asarray(image[top : top + size, left : left + size], dtype=np.float64)
+    return np.asarray(cv2.resize(square, (side, side), interpolation=cv2.INTER_AREA))
+
+
+def _flatten(image: Float[np.ndarray, "side side"], sigma_px: float) -> Float[np.ndarray, "side side"]:
+    """Compute the relative deviation from the blurred image."""
+    return np.asarray(image / cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT) - 1.0)
+
+
+def _standardise(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "rows columns"]:
+    return np.asarray((values - values.mean()) / values.std())
+
+
+def _to_bytes(relative: Float[np.ndarray, "side side"]) -> UInt8[np.ndarray, "side side"]:
+    return np.clip(_GREY * (1.0 + relative), 0.0, 255.0).astype(np.uint8)
+
+
+def _equalise(image: Float[np.ndarray, "side side"]) -> UInt8[np.ndarray, "side side"]:
+    """Scale the contrast between 1 and 8 pixels to 8 grey levels."""
+    flat = _flatten(image, 40.0)
+    contrast = np.std(gaussian_filter(flat, 1.0) - gaussian_filter(flat, 8.0))
+    return _to_bytes(8.0 / _GREY / contrast * flat)
+
+
+def _template_strength(image: Float[np.ndarray, "side side"]) -> Float[np.ndarray, "rows columns"]:
+    """Compute the Harris value of templates on a grid of 8 pixels: the smaller RMS gradient divided by the mean."""
+    along_x, along_y = np.gradient(image, axis=1), np.gradient(image, axis=0)
+    size = (TEMPLATE, TEMPLATE)
+    xx, yy, xy = (cv2.blur(product, size) for product in (along_x**2, along_y**2, along_x * along_y))
+    smaller = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
+    strength = np.sqrt(np.maximum(smaller, 0.0)) / cv2.blur(image, size)
+    return np.asarray(strength[40:-40:8, 40:-40:8])
+
+
+def _warp(points: Float[np.ndarray, "n 2"], homography: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
+    return np.asarray(cv2.perspectiveTransform(points[None], homography)[0])
+
+
+def _is_inside(points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+    return np.asarray(np.all((points > _MARGIN_PX) & (points < FEATURE_SIDE - _MARGIN_PX), axis=1))
+
+
+def _decorrelation(
+    first: UInt8[np.ndarray, "side side"], second: UInt8[np.ndarray, "side side"], homography: Float[np.ndarray, "3 3"]
+) -> float:
+    """Compute 1 minus the median correlation of templates of the first image and of the second, warped to the first."""
+    inverse, full = np.linalg.inv(homography), np.full_like(second, 255)
+    warped = [cv2.warpPerspective(image, inverse, (FEATURE_SIDE, FEATURE_SIDE)) for image in (second, full)]
+    a, b, valid = (
+        cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float64) for image in (first, *warped)
+    )
+    half = TEMPLATE // 2
+    correlations = []
+    for row in range(half + 1, SIDE - half - 1, 8):
+        for column in range(half + 1, SIDE - half - 1, 8):
+            window = np.s_[row - half : row + half + 1, column - half : column + half + 1]
+            if valid[window].min() > 254.0:
+                correlations.append(np.corrcoef(a[window].ravel(), b[window].ravel())[0, 1])
+    return 1.0 - float(np.median(correlations)) if correlations else float("nan")

@@ -1,7 +1,7 @@
 """Checks of the simulated world: statistics of rendered images compared with those of images from Mars.
 
-The limits are derived from Spirit's descent images (the public copies, which have 843 x 843 pixels), HiRISE
-orthoimages, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to these images: there
+The limits are derived from three descent images of Spirit (public copies of 843 x 843 pixels), pairs of them, four
+templates of DIMES, and mast images of both rovers. Some terrains of `sim/terrain/sites.toml` are fitted to them: there
 the agreement is no independent test. "Flown" values were measured in images from Mars.
 """
 
@@ -9,49 +9,124 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
+from jaxtyping import Float64
 
 import marsyard
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes.details import TRACK_COLUMNS
-from marsyard.sim.image_statistics import ImageStatistics, compute_image_statistics
+from marsyard.sim.image_statistics import (
+    ImageStatistics,
+    PairStatistics,
+    compute_image_statistics,
+    compute_pair_statistics,
+)
+from marsyard.sim.sensor import preset
 from marsyard.site_images import ImageRequest, render_images
 
 #: Altitudes of two of Spirit's descent images, metres.
 ALTITUDES_M = (1433.0, 1983.0)
+#: Azimuth and elevation of the sun at the landings of Spirit and Opportunity, degrees: Mars24 formulas for the times of
+#: the landings, which are good to ten minutes (2.5 deg).
+SUNS_DEG = {"gusev": (268.0, 56.9), "meridiani": (248.0, 70.8)}
+#: Ranges that the medians over Gusev must have; those of Spirit's three images follow in `FLOWN`.
+LIMITS = {
+    "patchiness": (2.6, 3.3),
+    "slope": (-3.0, -2.1),
+    "local_p10": (0.033, 0.042),
+    "local_p50": (0.050, 0.064),
+    "local_p90": (0.095, 0.120),
+    "kurtosis_4": (4.0, 9.0),
+    "kurtosis_8": (3.0, 13.0),
+    "best_template": (0.048, 0.078),
+    "sift": (50.0, 110.0),
+}
+FLOWN = {
+    "patchiness": "2.83 to 3.00",
+    "slope": "-2.9 to -2.2",
+    "local_p10": "0.036 to 0.038",
+    "local_p50": "0.055 to 0.060",
+    "local_p90": "0.104 to 0.113",
+    "kurtosis_4": "5.7 to 8.5",
+    "kurtosis_8": "3.8 to 12.4",
+    "best_template": "0.055 to 0.071",
+    "sift": "66 to 89",
+}
+#: Statistics of the tails, of which the median over Meridiani differs from that over Gusev by at most a factor of two.
+TAILS = ("kurtosis_4", "kurtosis_8", "best_template")
+#: Distance and rotation about the vertical between the images of a pair, and the ranges of their statistics.
+PAIR_EAST_M, PAIR_AZIMUTH_DEG = 75.0, 12.0
+PAIR_LIMITS = {"repeatability": (0.48, 0.62), "tracking_error_px": (0.3, 0.45), "decorrelation": (0.012, 0.05)}
+FLOWN_PAIRS = {"repeatability": "0.54", "tracking_error_px": "0.39", "decorrelation": "0.020"}
 #: Azimuths and elevation of mast images, degrees; like the compared images from Mars, they do not contain the horizon.
 AZIMUTHS_DEG, ELEVATION_DEG = (0.0, 90.0, 180.0, 270.0), -35.0
+#: First seed of the compared terrains: parameters of the sites were set on other seeds.
+FIRST_SEED = 900
 
 
-def _render_statistics(site: str, camera: str, **values: float | int) -> ImageStatistics:
-    """Compute the statistics of one rendered image; `values` are those of `ImageRequest`."""
+def _render(site: str, camera: str, **values: float | int) -> Float64[np.ndarray, "rows columns"]:
+    """Render one image; `values` are those of `ImageRequest`."""
     image = render_images(ImageRequest.from_defaults(site, camera, **values), both=False)[0]
-    return compute_image_statistics(image.to_uint16().astype(np.float64))
+    return image.to_uint16().astype(np.float64)
+
+
+def _render_descent(site: str, **values: float | int) -> Float64[np.ndarray, "rows columns"]:
+    """Render an image of the flown descent camera under the sun of the landing.
+
+    The camera summed four rows on the chip; like the public copies, the image has square pixels again.
+    """
+    azimuth, elevation = SUNS_DEG[site]
+    image = _render(site, "mer-descent-flown", sun_azimuth_deg=azimuth, sun_elevation_deg=elevation, **values)
+    rows, columns = image.shape
+    summed = image.reshape(-1, preset("mer-descent-flown").detector.rows_summed, columns).mean(axis=1)
+    return np.asarray(cv2.resize(summed, (columns, rows), interpolation=cv2.INTER_LINEAR))
+
+
+def _within(claim: str, value: float, limits: tuple[float, float], how: str) -> Iterator[Measure]:
+    """Compare a value with a lower and an upper limit."""
+    low, high = limits
+    yield Measure(claim, value, "1", low, how, "at least")
+    yield Measure(f"{claim}, upper limit", value, "1", high, how)
 
 
 def compare_descent_images(quick: bool) -> Iterator[Measure]:
-    """Compare descent images over Gusev and Meridiani with Spirit's descent images."""
-    for site in ("gusev", "meridiani"):
-        seeds = range(1, 4 if quick else 21)
+    """Compare descent images over Gusev with Spirit's, and the tails over Meridiani with those over Gusev."""
+    seeds = range(FIRST_SEED, FIRST_SEED + (3 if quick else 20))
+    medians = {}
+    for site in SUNS_DEG:
         rows = [
-            _render_statistics(site, "mer-descent-flown", altitude_m=altitude, seed=seed)
+            compute_image_statistics(_render_descent(site, altitude_m=altitude, seed=seed))
             for seed in seeds
             for altitude in ALTITUDES_M
         ]
-        median = ImageStatistics(*np.median(rows, axis=0))
-        patchiness_range = np.diff(np.percentile([row.patchiness for row in rows], [10.0, 90.0]))
-        how, name = f"median of {len(rows)} images of {len(seeds)} terrains", f"descent over {site}"
-        yield Measure(f"patchiness, {name}", median.patchiness, "1", 2.6, f"{how}; Spirit: 2.83 to 3.00", "at least")
-        yield Measure(f"patchiness, {name}, upper limit", median.patchiness, "1", 3.3, f"{how}; HiRISE: 2.67 to 3.31")
-        yield Measure(f"10 to 90 % range of patchiness, {name}", float(patchiness_range[0]), "1", 0.5, how, "at least")
-        yield Measure(f"slope of the spectrum, {name}", median.slope, "1", -2.0, f"{how}; Spirit: -2.24 to -2.94")
-        claim = f"slope of the spectrum, {name}, lower limit"
-        yield Measure(claim, median.slope, "1", -2.9, how, "at least")
-        claim = f"contrast of the smoothest tenth, {name}"
-        yield Measure(claim, median.local_p10, "1", 0.042, f"{how}; Spirit: 0.036 to 0.038")
-        yield Measure(
-            f"brightness of corners divided by centre, {name}", median.corner, "1", None, f"{how}; cos^4 of the lens"
-        )
+        medians[site] = ImageStatistics(*np.median(rows, axis=0))
+    how = f"median of {len(rows)} images of {len(seeds)} terrains"
+    for name, limits in LIMITS.items():
+        value = getattr(medians["gusev"], name)
+        yield from _within(f"{name}, descent over gusev", value, limits, f"{how}; Spirit: {FLOWN[name]}")
+    for name in TAILS:
+        ratio = getattr(medians["meridiani"], name) / getattr(medians["gusev"], name)
+        yield from _within(f"{name}, descent over meridiani divided by gusev", ratio, (0.5, 2.0), how)
+    for site, median in medians.items():
+        claim = f"brightness of corners divided by centre, descent over {site}"
+        yield Measure(claim, median.corner, "1", None, f"{how}; cos^4 of the lens")
+
+
+def compare_descent_pairs(quick: bool) -> Iterator[Measure]:
+    """Compare pairs of descent images over Gusev with Spirit's pairs."""
+    seeds = range(FIRST_SEED, FIRST_SEED + (3 if quick else 20))
+    rows = []
+    for seed in seeds:
+        views: tuple[dict[str, float], ...] = ({}, {"east_m": PAIR_EAST_M, "azimuth_deg": PAIR_AZIMUTH_DEG})
+        pair = (_render_descent("gusev", altitude_m=ALTITUDES_M[1], seed=seed, **view) for view in views)
+        statistics = compute_pair_statistics(*pair)
+        rows.append(statistics or PairStatistics(*[np.nan] * len(PairStatistics._fields)))
+    median = PairStatistics(*np.median(rows, axis=0))
+    how = f"median of {len(rows)} pairs, {PAIR_EAST_M:g} m and {PAIR_AZIMUTH_DEG:g} deg apart"
+    for name, limits in PAIR_LIMITS.items():
+        claim = f"{name}, pairs of descent images over gusev"
+        yield from _within(claim, getattr(median, name), limits, f"{how}; Spirit: {FLOWN_PAIRS[name]}")
 
 
 def compare_mast_images(quick: bool) -> Iterator[Measure]:
@@ -59,7 +134,9 @@ def compare_mast_images(quick: bool) -> Iterator[Measure]:
     for site, reference in (("gusev", "Spirit: 0.061 to 0.065"), ("meridiani", "Opportunity: 0.046 to 0.055")):
         seeds = range(1, 2 if quick else 6)
         rows = [
-            _render_statistics(site, "mer-navcam", azimuth_deg=azimuth, elevation_deg=ELEVATION_DEG, seed=seed)
+            compute_image_statistics(
+                _render(site, "mer-navcam", azimuth_deg=azimuth, elevation_deg=ELEVATION_DEG, seed=seed)
+            )
             for seed in seeds
             for azimuth in AZIMUTHS_DEG
         ]
@@ -105,6 +182,7 @@ def compare_templates(quick: bool) -> Iterator[Measure]:
 
 CHECKS = (
     Check("flight", "Images from Mars", compare_descent_images),
+    Check("flight-pairs", "Images from Mars", compare_descent_pairs),
     Check("flight-templates", "Images from Mars", compare_templates),
     Check("flight-mast", "Images from Mars", compare_mast_images),
 )

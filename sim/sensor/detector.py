@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 from pydantic import Field, model_validator
@@ -90,6 +91,10 @@ class DetectorParameters(Parameters):
     response_spread: Annotated[_RelativeError, DETECTOR, Field(description="RMS of the pixels' relative response")] = (
         0.01
     )
+    residual_spread: Annotated[
+        _RelativeError, DETECTOR, Field(description="RMS of a pattern in the response that the calibration lacks")
+    ] = 0.0
+    residual_px: Annotated[float, Field(gt=0.0, le=100.0, description="scale (SD) of this pattern's blur, px")] = 2.0
     calibration_error: Annotated[
         _RelativeError, DETECTOR, Field(description="RMS error of the calibrated response")
     ] = 0.002
@@ -117,7 +122,7 @@ class DetectorParameters(Parameters):
         factors = {
             "responsivity_e_s": area, "full_well_e": area, "gain_e_dn": area, "dark_e_s": area,
             "read_noise_e": side, "transfer_row_s": side, "clear_row_s": side, "readout_row_s": side,
-            "response_spread": 1.0 / side, "calibration_error": 1.0 / side,
+            "response_spread": 1.0 / side, "calibration_error": 1.0 / side, "residual_px": 1.0 / side,
         }  # fmt: skip
         scaled = {name: getattr(self, name) * factor for name, factor in factors.items()}
         lengths = ("diffraction_px", "diffusion_px", "defocus_px", "dust_radius_px")
@@ -189,6 +194,9 @@ class Detector:
         names = ("exposure_s", "transfer_row_s", "clear_row_s", "rows_summed", "offset_dn", "full_scale_dn")
         values = {name: getattr(p, name) for name in names}
         calibration = DetectorCalibration(flat_field=measured_response.astype(np.float64), **values)
+        if p.residual_spread > 0.0:
+            pattern = cv2.GaussianBlur(rng.standard_normal(fall_off.shape, dtype=np.float32), (0, 0), p.residual_px)
+            response = response * (1.0 + np.float32(p.residual_spread / pattern.std()) * pattern)
         is_bad, hot_e_s = np.zeros(fall_off.shape, dtype=np.bool_), None
         if p.defects.hot_fraction > 0.0:
             # the dark current of hot pixels is exponentially distributed

@@ -56,6 +56,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         factors = p.units.apply(ground, craters, substream(rng, "units"))
         height += fine_relief * refine(np.ascontiguousarray(factors[..., ROUGHNESS]), ground.side)
         log_albedo += fine_albedo * refine(np.ascontiguousarray(factors[..., TEXTURE]), ground.side)
+        log_albedo += np.float32(p.relief_log_albedo / fine_relief.std(dtype=np.float64)) * fine_relief
     dtm = None
     if p.source is not None:
         dtm = embed(p.source, ground.side, ground.spacing_m)

@@ -30,13 +30,17 @@ class TerrainParameters(Parameters):
     crater_knee_m: Annotated[Positive, Field(description="diameter above which crater_steep_exponent applies, m")] = 1e4
     crater_steep_exponent: Annotated[Positive, Field(description="exponent of the power law above crater_knee_m")] = 3.2
     crater_floor_contrast: Annotated[
-        Fraction, Field(description="SD of the log albedo of crater floors relative to the ground")
+        Fraction, Field(description="SD of the log albedo of crater floors without sand relative to the ground")
     ] = 0.0
+    crater_sand_fraction: Annotated[Fraction, Field(description="fraction of the craters with sand in them")] = 0.0
+    crater_sand_log_albedo: Annotated[
+        float, bounded_field(-2.0, 1.0, "mean logarithm of the albedo of this sand divided by the ground's")
+    ] = -0.4
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
     crater_ejecta_contrast: Annotated[
-        Fraction, Field(description="log albedo of the freshest ejecta relative to the ground; the sign is random")
-    ] = 0.12
+        Fraction, Field(description="mean size of the log albedo of ejecta relative to the ground; most are brighter")
+    ] = 0.03
     albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="mean albedo")] = 0.2
     albedo_contrast: Annotated[
         Fraction, Field(description="SD of the logarithm of the fractal albedo, over all scales")
@@ -47,6 +51,9 @@ class TerrainParameters(Parameters):
     albedo_hurst: Annotated[
         float,
         Field(ge=-0.5, lt=1.0, description="Hurst exponent of the fractal albedo; 0: equal variance in all octaves"),
+    ] = 0.0
+    relief_log_albedo: Annotated[
+        float, bounded_field(-1.0, 1.0, "log albedo of ground one SD of the fine relief above its surroundings")
     ] = 0.0
     units: Annotated[SurfaceUnits | None, Field(description="surface units; None: uniform ground")] = None
     fine_below_m: Annotated[

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
-from marsyard.sim.image_statistics import SIDE, compute_image_statistics, spectral_slope
+from marsyard.sim.image_statistics import SIDE, compute_image_statistics, compute_pair_statistics, spectral_slope
 
 
 @pytest.mark.parametrize("exponent", [-1.5, -2.5])
@@ -35,3 +36,44 @@ def test_corner_brightness_is_relative_to_the_centre() -> None:
     # The mean relative radius is 0.93 for corner pixels (above 0.9) and 0.165 for central pixels (below 0.25).
     assert statistics.corner == pytest.approx((1.0 - 0.4 * 0.93) / (1.0 - 0.4 * 0.165), abs=0.01)
     assert 0.0 < statistics.rms < 0.2
+
+
+def test_sparse_dark_spots_have_kurtosis_and_negative_skewness() -> None:
+    """Gaussian noise has neither; 30 dark discs of 10 pixels radius in it have both, and a strong template."""
+    rng = np.random.default_rng(4)
+    noise = 1000.0 * (1.0 + 0.02 * gaussian_filter(rng.standard_normal((SIDE, SIDE)), 3.0, mode="wrap") * 10.0)
+    spotted = noise.copy()
+    y, x = np.mgrid[:SIDE, :SIDE]
+    for row, column in rng.uniform(30.0, SIDE - 30.0, (30, 2)):
+        spotted[np.hypot(y - row, x - column) < 10.0] *= 0.5
+    plain, spots = compute_image_statistics(noise), compute_image_statistics(spotted)
+    assert max(abs(plain.kurtosis_4), abs(plain.kurtosis_8), abs(plain.skewness_8)) < 0.4
+    assert min(spots.kurtosis_4, spots.kurtosis_8) > 1.5
+    assert spots.skewness_8 < -1.0
+    assert spots.best_template > 1.5 * plain.best_template
+    assert spots.sift > 10
+
+
+def _draw_texture(seed: int) -> np.ndarray:
+    field = gaussian_filter(np.random.default_rng(seed).standard_normal((700, 700)), 2.0)
+    return 1000.0 * (1.0 + 0.05 * field / field.std())
+
+
+def test_pair_of_shifted_images_agrees_except_for_its_noise() -> None:
+    """The same ground, shifted by whole pixels, correlates fully; noise of a third of the contrast lowers this."""
+    ground, rng = _draw_texture(5), np.random.default_rng(6)
+    first, second = ground[50:562, 50:562], ground[62:574, 80:592]
+    exact = compute_pair_statistics(first, second)
+    assert exact is not None
+    assert exact.inlier_ratio > 0.99
+    assert exact.repeatability > 0.95
+    assert exact.tracking_error_px < 0.05
+    assert exact.decorrelation == pytest.approx(0.0, abs=0.002)
+    # noise of the same spectrum, a third of the contrast, in each image: correlation 1 / (1 + 1 / 9)
+    noises = [50.0 / 3.0 * (_draw_texture(seed)[:512, :512] - 1000.0) / 50.0 for seed in (7, 8)]
+    noisy = compute_pair_statistics(first + noises[0], second + noises[1])
+    assert noisy is not None
+    assert noisy.decorrelation == pytest.approx(1.0 - 1.0 / (1.0 + 1.0 / 9.0), abs=0.03)
+    assert noisy.tracking_error_px > 2.0 * exact.tracking_error_px
+    assert noisy.repeatability < exact.repeatability
+    assert compute_pair_statistics(first, 1000.0 + rng.standard_normal((512, 512))) is None

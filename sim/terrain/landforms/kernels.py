@@ -15,6 +15,12 @@ Grid = NDArray[np.float32]
 GridRow = NDArray[np.float32]
 #: Relative change of the rim height of a crater per relative change of its radius.
 RIM_HEIGHT_SENSITIVITY = 8.0
+#: Optical depth of the ejecta at the rim; assumed: they cover a third of the ground at two radii.
+EJECTA_OPACITY = 3.0
+#: Relative amplitude of each of the two sets of rays in the opacity of the ejecta (assumed).
+RAY_CONTRAST = 0.25
+#: Width of the margin of a crater's fill, in crater radii (assumed).
+FILL_MARGIN = 0.25
 
 
 class Bedforms(NamedTuple):
@@ -65,17 +71,20 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
     Each crater is a row of `craters`:
 
     - x, y, radius; depth below the surroundings, rim height, width of the rounded rim crest, all in metres
-    - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the floor
-    - three pairs of cosine and sine terms of the outline with two, three and five lobes; phase of the rays
+    - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the fill; radius of
+      the fill in crater radii; relative increase of its strength per radius along x and y
+    - four pairs of cosine and sine terms of the outline with two, three, five and eight lobes
+    - phase of the rays
 
     With the distance r from the centre in radii, the bowl rises with r**2.2. The ejecta blanket falls with r**-3, has
-    rays outside the rim and ends at `max_r`. The rim is lower where the outline is displaced inwards.
+    rays outside the rim and ends at `max_r`. The rim is lower where the outline is displaced inwards. The ejecta change
+    the albedo where they cover the ground: by 1 - exp(-EJECTA_OPACITY r**-3).
     """
     mask = height.shape[0] - 1
     for n in range(craters.shape[0]):
-        x, y, radius, depth, rim, rounding, fill, ejecta_log_albedo, floor_log_albedo = craters[n, :9]
-        c2, s2, c3, s3, c5, s5, phase = craters[n, 9:]
-        extent = max_r * radius * 1.1
+        x, y, radius, depth, rim, rounding, fill, ejecta_log_albedo, fill_log_albedo, fill_radius = craters[n, :10]
+        lee_x, lee_y, c2, s2, c3, s3, c5, s5, c8, s8, phase = craters[n, 10:]
+        extent = max_r * radius * 1.3
         cos_phase_7, sin_phase_7 = math.cos(phase), math.sin(phase)
         # the twelve rays have another phase than the seven rays
         cos_phase_12, sin_phase_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
@@ -90,20 +99,23 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
                 if d >= extent:
                     continue
                 c, s = dx / max(d, 1e-9), dy / max(d, 1e-9)
-                # cosines and sines of twice, three and five times the azimuth
+                # cosines and sines of multiples of the azimuth
                 cos_2, sin_2 = c * c - s * s, 2.0 * c * s
                 cos_3, sin_3 = cos_2 * c - sin_2 * s, sin_2 * c + cos_2 * s
                 cos_5, sin_5 = cos_3 * cos_2 - sin_3 * sin_2, sin_3 * cos_2 + cos_3 * sin_2
+                cos_8, sin_8 = cos_5 * cos_3 - sin_5 * sin_3, sin_5 * cos_3 + cos_5 * sin_3
                 lobes = c2 * cos_2 + s2 * sin_2 + c3 * cos_3 + s3 * sin_3 + c5 * cos_5 + s5 * sin_5
+                scallops = c8 * cos_8 + s8 * sin_8
                 # distance from the centre in local radii: 1 on the rim
-                r = d / (radius * (1.0 + lobes))
+                r = d / (radius * (1.0 + lobes + scallops))
                 if r >= max_r:
                     continue
                 # inside the bowl the blanket's r**-3 is limited
                 outside = max(r, 0.6)
+                thickness = 1.0 / (outside * outside * outside)
                 fade = min((max_r - r) / (max_r - 1.0), 1.0)
                 notched_rim = rim * max(1.0 + RIM_HEIGHT_SENSITIVITY * lobes, 0.0)
-                blanket = notched_rim / (outside * outside * outside) * fade
+                blanket = notched_rim * thickness * fade
                 rays = 0.0
                 if r > 1.0:
                     # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
@@ -126,11 +138,12 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
                 row, column = i & mask, j & mask
                 height[row, column] += change
                 if ejecta_log_albedo != 0.0:
-                    strength = fade * fade * (1.0 + 0.5 * rays) if r > 1.0 else 1.0
-                    log_albedo[row, column] += ejecta_log_albedo * max(strength, 0.0)
-                if floor_log_albedo != 0.0 and r < 1.1:
-                    # constant over the floor, zero at the rim
-                    log_albedo[row, column] += floor_log_albedo * min(max((1.1 - r) / 0.5, 0.0), 1.0)
+                    coverage = 1.0 - math.exp(-EJECTA_OPACITY * thickness * max(1.0 + RAY_CONTRAST * rays, 0.0))
+                    log_albedo[row, column] += ejecta_log_albedo * coverage * fade
+                if fill_log_albedo != 0.0 and r < fill_radius:
+                    # the fill thins out at its margin, and upwind
+                    strength = min((fill_radius - r) / FILL_MARGIN, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
+                    log_albedo[row, column] += fill_log_albedo * strength
 
 
 @njit(cache=True)

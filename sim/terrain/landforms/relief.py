@@ -39,7 +39,11 @@ FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
 FRESH_RIM, DEGRADED_RIM = 0.04, 0.004
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
-BRIGHT_ABOVE = 0.75  #: Freshness above which ejecta differ from the ground in brightness.
+DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
+FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
+SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
+#: RMS amplitude of the lobes of an outline (two, three, five and eight), in radii: together 7 %.
+OUTLINE_RMS = (0.045, 0.04, 0.03, 0.015)
 APEX_ROUNDING = 0.06  #: Rounding of a fan's apex, as a fraction of its radius.
 CONE_DETAIL = 1.0 / 50.0  #: Scale of the smallest detail of the fans' broad shape, as a fraction of their radius.
 Channels = Float64[np.ndarray, "channels"]  #: One value per channel.
@@ -205,13 +209,14 @@ class Ramp(Parameters):
         np.add(ground.height, profile[None, :] if self.uphill == "east" else profile[:, None], out=ground.height)
 
 
-def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 16"]:
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 21"]:
     """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
 
     Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
     `crater_knee_m` (saturation, Hartmann 1984: -1.83) and ``D**-crater_steep_exponent`` above it (production function,
     Hartmann 2005). Freshness is ``u**2`` with a uniform u: most craters are degraded. Outlines deviate from circles by
-    a few per cent.
+    `OUTLINE_RMS`. Sand, dark on Mars, fills the inner part of some craters, and dust that the impact has brought up or
+    that the rim retains brightens the ejecta of most.
     """
     p = parameters
     min_m, max_m = p.crater_diameter_min_m, p.crater_diameter_max_m
@@ -232,14 +237,22 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     depth = diameter * (DEGRADED_DEPTH + (FRESH_DEPTH - DEGRADED_DEPTH) * freshness) - rim
     rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * freshness)
     fill = DEEPEST_FILL * (1.0 - freshness)
-    ejecta_log_albedo = p.crater_ejecta_contrast * np.maximum(freshness - BRIGHT_ABOVE, 0.0) / (1.0 - BRIGHT_ABOVE)
-    ejecta_log_albedo *= rng.choice([-1.0, 1.0], count)
-    floor_log_albedo = p.crater_floor_contrast * rng.standard_normal(count)
-    outline = rng.standard_normal((count, 6)) * np.repeat([0.025, 0.02, 0.012], 2)
-    phase = rng.uniform(0.0, 2.0 * np.pi, count)
-    return np.column_stack(
-        [position, diameter / 2.0, depth, rim, rounding, fill, ejecta_log_albedo, floor_log_albedo, outline, phase]
+    # small craters shelter less sand, and throw out less material of other brightness
+    size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
+    ejecta_log_albedo = p.crater_ejecta_contrast * size_factor * rng.gamma(3.0, 1.0 / 3.0, count)
+    ejecta_log_albedo *= np.where(rng.uniform(size=count) < DARK_EJECTA, -1.0, 1.0)
+    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * size_factor
+    fill_log_albedo = np.where(
+        has_sand,
+        p.crater_sand_log_albedo * rng.uniform(0.5, 1.5, count),
+        p.crater_floor_contrast * rng.standard_normal(count),
     )
+    fill_radius = rng.uniform(SMALLEST_FILL, LARGEST_FILL, count)
+    lee = 0.3 * rng.standard_normal((count, 2))
+    outline = rng.standard_normal((count, 8)) * np.repeat(OUTLINE_RMS, 2)
+    phase = rng.uniform(0.0, 2.0 * np.pi, count)
+    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
+    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, phase])
 
 
 def draw_channels(

@@ -234,3 +234,16 @@ def test_subframe_has_the_pixels_of_the_full_frame() -> None:
     for invalid in ((0, 2, (8, 8)), (0, 0, (8, 6)), (44, 0, (8, 8)), (0, -4, (8, 8)), (0, 0, (0, 8))):
         with pytest.raises(ValueError, match="a subframe of"):
             full_frame.window(*invalid)
+
+
+def test_residual_pattern_is_smooth_and_not_in_the_calibration() -> None:
+    parameters = DetectorParameters.model_validate(
+        NO_ERRORS | {"residual_spread": 0.01, "residual_px": 3.0, "rows_summed": 1}
+    )
+    detector = Detector.draw(np.ones((256, 256), dtype=np.float32), parameters, np.random.default_rng(2))
+    pattern = detector.response.astype(np.float64) - 1.0
+    assert pattern.std() == pytest.approx(0.01, rel=1e-3)
+    # white noise blurred with the SD s: correlation exp(-d**2 / (4 s**2)) at the distance d
+    correlation = (pattern[:, 3:] * pattern[:, :-3]).mean() / pattern.var()
+    assert correlation == pytest.approx(np.exp(-0.25), abs=0.03)
+    np.testing.assert_array_equal(detector.calibration.flat_field, 1.0)

@@ -13,7 +13,14 @@ from scipy.spatial import cKDTree
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell, TerrainGround
 from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
-from marsyard.sim.terrain.landforms.kernels import Bedforms, add_cracks, add_dunes, stamp_craters
+from marsyard.sim.terrain.landforms.kernels import (
+    EJECTA_OPACITY,
+    RAY_CONTRAST,
+    Bedforms,
+    add_cracks,
+    add_dunes,
+    stamp_craters,
+)
 from marsyard.sim.terrain.surface import mean_slope_deg
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
@@ -252,7 +259,7 @@ def test_ejecta_have_seven_and_twelve_rays() -> None:
     side, spacing, radius, rim, max_radius, phase = 128, 1.0, 12.0, 0.8, 4.0, 0.7
     height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
     # Columns: see `stamp_craters`.
-    crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, phase]])
+    crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 1.0, *np.zeros(10), phase]])
     stamp_craters(height, log_albedo, spacing, crater, max_radius)
     y, x = np.mgrid[:side, :side] - 64.0
     r, azimuth = np.hypot(x, y) / radius, np.arctan2(y, x)
@@ -261,8 +268,8 @@ def test_ejecta_have_seven_and_twelve_rays() -> None:
     rays = np.cos(7.0 * azimuth + phase) + np.cos(12.0 * azimuth + 2.3 * phase)
     blanket = rim / np.maximum(r, 0.6) ** 3 * fade * (1.0 + 0.25 * rays * np.minimum(2.0 * (r - 1.0), 1.0))
     np.testing.assert_allclose(height[is_ejecta], blanket[is_ejecta], atol=1e-6)
-    ray_contrast = np.maximum(fade**2 * (1.0 + 0.5 * rays), 0.0)
-    np.testing.assert_allclose(log_albedo[is_ejecta], 0.2 * ray_contrast[is_ejecta], atol=1e-6)
+    coverage = 1.0 - np.exp(-EJECTA_OPACITY / np.maximum(r, 0.6) ** 3 * (1.0 + RAY_CONTRAST * rays))
+    np.testing.assert_allclose(log_albedo[is_ejecta], 0.2 * (coverage * fade)[is_ejecta], atol=1e-6)
 
 
 def test_cracks_follow_periodic_voronoi_borders() -> None:

@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 from marsyard.sim.terrain.landforms.ground import Spectrum
-from marsyard.sim.terrain.landforms.kernels import stamp_craters
+from marsyard.sim.terrain.landforms.kernels import EJECTA_OPACITY, stamp_craters
 from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 
 
@@ -159,7 +159,7 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     height, log_albedo = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
     radius, depth, rim = 20.0, 6.4, 1.6
     # A crater with a sharp rim and a round outline, centred on the corner of the grid. Columns: see `stamp_craters`.
-    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, *np.zeros(7), 0.3]
+    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, 0.0, 1.0, *np.zeros(10), 0.3]
     stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
@@ -167,13 +167,15 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     assert centred[128, 128 + 20] == pytest.approx(rim)
     assert centred[128 - 20, 128] == pytest.approx(rim)
     assert np.count_nonzero(centred[:, :60]) == 0
-    assert np.roll(log_albedo, 128, axis=1)[0, 128] == pytest.approx(0.1)
+    # the ejecta cover the bowl: 95 % at the rim, more inside
+    assert np.roll(log_albedo, 128, axis=1)[0, 128] == pytest.approx(0.1, rel=1e-4)
+    assert np.roll(log_albedo, 128, axis=1)[0, 148] == pytest.approx(0.1 * (1.0 - np.exp(-EJECTA_OPACITY)), rel=0.02)
 
 
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     # A crater of radius 30 m and depth 3 m, filled up to a flat floor. Columns: see `stamp_craters`.
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, *np.zeros(7), 0.0]
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, 0.0, 1.0, *np.zeros(11)]
     stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
     assert np.ptp(height[64, 56:73]) < 0.15

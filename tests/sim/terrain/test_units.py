@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.ndimage import gaussian_filter
 
 from marsyard.sim.terrain import (
     PlacedRock,
@@ -17,8 +18,8 @@ from marsyard.sim.terrain import (
     synthesise,
 )
 from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels import scale_roughness, stamp_craters, stamp_streaks
-from marsyard.sim.terrain.landforms.relief import draw_craters
+from marsyard.sim.terrain.landforms.kernels import FILL_MARGIN, scale_roughness, stamp_craters, stamp_streaks
+from marsyard.sim.terrain.landforms.relief import DARK_EJECTA, FULL_CONTRAST_M, draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
@@ -34,7 +35,7 @@ KINDS: list[dict[str, Any]] = [
 ]
 PLAIN = [{"name": "plain", "fraction": 1.0}]
 #: An empty table of craters; columns: see `stamp_craters`.
-NO_CRATERS = np.empty((0, 16))
+NO_CRATERS = np.empty((0, 21))
 
 
 def _make_units(**changes: Any) -> SurfaceUnits:
@@ -111,13 +112,18 @@ def test_crater_sizes_follow_saturation_and_production() -> None:
     assert np.log2(counts[64.0] / counts[128.0]) == pytest.approx(3.2, abs=0.25)
 
 
-def test_crater_floor_has_the_specified_albedo() -> None:
+def test_sand_in_a_crater_has_the_specified_albedo_and_margin() -> None:
+    """The sand ends at its radius, and is thicker downwind, which is along x."""
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
-    # x, y, radius, depth, rim height, rim width; filled fraction; albedo of ejecta and floor; circular outline; phase
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, 0.15, *np.zeros(6), 0.0]
+    # x, y, radius, depth, rim height, rim width; filled fraction; albedo of ejecta and sand; radius of the sand and its
+    # increase along x and y; circular outline; phase
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, -0.5, 0.8, 0.3, 0.0, *np.zeros(9)]
     stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
-    assert log_albedo[64, 64] == pytest.approx(0.15)
-    assert not log_albedo[np.hypot(*(np.mgrid[:128, :128] - 64.0)) > 34.0].any()
+    assert log_albedo[64, 64] == pytest.approx(-0.5)
+    assert log_albedo[64, 64 + 12] == pytest.approx(-0.5 * (1.0 + 0.3 * 0.4))
+    assert log_albedo[64, 64 - 12] == pytest.approx(-0.5 * (1.0 - 0.3 * 0.4))
+    assert log_albedo[64 + 21, 64] == pytest.approx(-0.5 * (0.8 - 0.7) / FILL_MARGIN, rel=1e-5)
+    assert not log_albedo[np.hypot(*(np.mgrid[:128, :128] - 64.0)) >= 24.0].any()
 
 
 def test_crater_floors_are_smoother_and_ejecta_rougher() -> None:
@@ -252,3 +258,28 @@ def test_abundance_changes_the_cached_terrain_only_with_tails(tmp_path: Path, mo
             TerrainBank(parameters.with_changes({"rocks": {"abundance": abundance, "tails": tails}}), 1).store(0)
     terrains = [path for path in (tmp_path / "terrain").glob("*.npy") if not path.name.startswith("rocks-")]
     assert len(terrains) == 3  # one without tails, two with tails
+
+
+def test_albedo_follows_the_fine_relief() -> None:
+    """Ground above its surroundings is darker with a negative parameter, in proportion to the fine relief."""
+    parameters = _make_parameters(albedo_contrast=0.0, units={"kinds": PLAIN}, relief_log_albedo=-0.1)
+    level, other = (
+        synthesise(p, np.random.default_rng(3)).levels[0].astype(np.float64)
+        for p in (parameters, parameters.model_copy(update={"relief_log_albedo": 0.0}))
+    )
+    change = np.log(level[..., 1] / other[..., 1])
+    assert change.std() == pytest.approx(0.1, rel=0.02)
+    relief = level[..., 0] - gaussian_filter(level[..., 0], 10.0, mode="wrap")
+    assert np.corrcoef(change.ravel(), relief.ravel())[0, 1] < -0.8
+
+
+def test_small_craters_have_less_sand_and_fainter_ejecta() -> None:
+    p = TerrainParameters(crater_sand_fraction=0.8, crater_sand_log_albedo=-0.6, craters_per_km2=400.0)
+    craters = draw_craters(p, np.random.default_rng(5))
+    diameter, ejecta, sand = 2.0 * craters[:, 2], craters[:, 7], craters[:, 8]
+    large, small = diameter > FULL_CONTRAST_M, diameter < 0.25 * FULL_CONTRAST_M
+    assert np.mean(sand[large] < -0.25) == pytest.approx(0.8, abs=0.06)
+    assert np.mean(sand[small] < -0.25) == pytest.approx(0.8 * np.mean(diameter[small]) / FULL_CONTRAST_M, abs=0.02)
+    assert np.mean(ejecta[large] < 0.0) == pytest.approx(DARK_EJECTA, abs=0.05)
+    assert np.abs(ejecta[large]).mean() == pytest.approx(p.crater_ejecta_contrast, rel=0.1)
+    assert np.abs(ejecta[small]).mean() < 0.3 * p.crater_ejecta_contrast
