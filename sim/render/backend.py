@@ -1,4 +1,4 @@
-"""Choice of the OpenGL backend (OSMesa or EGL), and creation of its renderer.
+"""Choice of the OpenGL backend: OSMesa or EGL.
 
 The backend must be chosen before pyrender or PyOpenGL is first imported. A context can be used only in the process and
 thread that created it.
@@ -7,12 +7,8 @@ thread that created it.
 from __future__ import annotations
 
 import os
-import sys
 from ctypes.util import find_library
-from typing import TYPE_CHECKING, Literal
-
-if TYPE_CHECKING:
-    from marsyard.sim.render.pinhole import DepthRenderer
+from typing import Literal
 
 Backend = Literal["osmesa", "egl"]
 BACKENDS: tuple[Backend, ...] = ("osmesa", "egl")
@@ -40,32 +36,3 @@ def default_backend() -> Backend:
         if name == backend:
             return backend
     raise RenderingError(f"{BACKEND_VARIABLE} is '{name}'; allowed: {', '.join(BACKENDS)}")
-
-
-def create_depth_renderer(side_px: int, backend: Backend) -> DepthRenderer:
-    """Create a renderer of square depth images with `side_px` rows, and its OpenGL context.
-
-    Raises RenderingError if no context can be created.
-    """
-    if not __debug__:
-        raise RenderingError("pyrender calls OpenGL inside assert statements: run Python without -O")
-    current = os.environ.get("PYOPENGL_PLATFORM")
-    if "OpenGL" in sys.modules and current != backend:
-        raise RenderingError(
-            f"this process already uses OpenGL through {current}; a process can use one backend: "
-            f"start another process for {backend}"
-        )
-    os.environ["PYOPENGL_PLATFORM"] = backend
-    try:
-        from marsyard.sim.render.pinhole import DepthRenderer
-    # PyOpenGL raises AttributeError for the functions of a missing library
-    except (ImportError, AttributeError, OSError) as error:
-        raise RenderingError(
-            f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"
-        ) from error
-    try:
-        return DepthRenderer(side_px)
-    except Exception as error:
-        raise RenderingError(
-            f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
-        ) from error

@@ -1,7 +1,7 @@
 """Pinhole views drawn by pyrender: depth and triangle numbers of the visible surface.
 
 This module imports pyrender and PyOpenGL, which read the backend from the environment: call
-`backend.create_depth_renderer` instead of importing this module.
+`renderer.create_depth_renderer` instead of importing this module.
 """
 
 from __future__ import annotations

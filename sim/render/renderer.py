@@ -13,6 +13,8 @@ pixel's centre.
 from __future__ import annotations
 
 import ctypes
+import os
+import sys
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -28,7 +30,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import rotation_matrix
-from marsyard.sim.render.backend import Backend, RenderingError, create_depth_renderer
+from marsyard.sim.render.backend import Backend, RenderingError
 from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.kernels.primary import MAX_GRAZING_SINE, trace_primary_rays
 from marsyard.sim.render.kernels.shading import shade
@@ -259,6 +261,35 @@ def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, lig
 
     run_in_parts(shade_part, count)
     return image
+
+
+def create_depth_renderer(side_px: int, backend: Backend) -> DepthRenderer:
+    """Create a renderer of square depth images with `side_px` rows, and its OpenGL context.
+
+    Raises RenderingError if no context can be created.
+    """
+    if not __debug__:
+        raise RenderingError("pyrender calls OpenGL inside assert statements: run Python without -O")
+    current = os.environ.get("PYOPENGL_PLATFORM")
+    if "OpenGL" in sys.modules and current != backend:
+        raise RenderingError(
+            f"this process already uses OpenGL through {current}; a process can use one backend: "
+            f"start another process for {backend}"
+        )
+    os.environ["PYOPENGL_PLATFORM"] = backend
+    try:
+        from marsyard.sim.render.pinhole import DepthRenderer
+    # PyOpenGL raises AttributeError for the functions of a missing library
+    except (ImportError, AttributeError, OSError) as error:
+        raise RenderingError(
+            f"OpenGL through {backend} cannot be loaded ({error}); run 'marsyard doctor' to see what is missing"
+        ) from error
+    try:
+        return DepthRenderer(side_px)
+    except Exception as error:
+        raise RenderingError(
+            f"no OpenGL context through {backend} ({error}); run 'marsyard doctor' to see what is missing"
+        ) from error
 
 
 @cache

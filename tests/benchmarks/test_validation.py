@@ -137,5 +137,6 @@ def test_profiled_stages_name_existing_functions() -> None:
     root = Path(__file__).parents[2]
     for file, function in {pair for stages in (STAGES, DESCENT_STAGES) for pairs in stages.values() for pair in pairs}:
         # folders sim, scenarios, algorithms and campaigns
-        texts = [path.read_text() for path in root.glob(f"[sac]*/**/{file}")]
+        paths = [path for path in root.glob("[sac]*/**/*.py") if path.as_posix().endswith(f"/{file}")]
+        texts = [path.read_text() for path in paths]
         assert any(f"def {function}(" in text for text in texts), (file, function)

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from marsyard.sim.render.backend import RenderingError, create_depth_renderer, default_backend
+from marsyard.sim.render.backend import RenderingError, default_backend
 from marsyard.sim.render.pinhole import DepthRenderer
+from marsyard.sim.render.renderer import create_depth_renderer
 
 SCRIPT = """
 import sys
@@ -208,7 +209,8 @@ def test_too_many_vertices_are_reported(small_renderer: DepthRenderer, monkeypat
 
 def test_second_backend_in_one_process_is_rejected() -> None:
     program = (
-        "from marsyard.sim.render.backend import RenderingError, create_depth_renderer\n"
+        "from marsyard.sim.render.backend import RenderingError\n"
+        "from marsyard.sim.render.renderer import create_depth_renderer\n"
         "import OpenGL\n"
         "try:\n    create_depth_renderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
     )
@@ -222,7 +224,8 @@ def test_second_backend_in_one_process_is_rejected() -> None:
 @pytest.mark.slow
 def test_python_without_assertions_is_rejected() -> None:
     program = (
-        "from marsyard.sim.render.backend import RenderingError, create_depth_renderer\n"
+        "from marsyard.sim.render.backend import RenderingError\n"
+        "from marsyard.sim.render.renderer import create_depth_renderer\n"
         "try:\n    create_depth_renderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
     )
     run = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
