@@ -23,7 +23,7 @@ from marsyard.campaigns.definition.checks import find_campaign_problems
 from marsyard.campaigns.definition.identity import find_scenario
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
-from marsyard.campaigns.sampling.design import MATRICES
+from marsyard.campaigns.sampling.correlation import MATRICES
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.systems import UnknownScenarioError, catalogue, scenario
 
