@@ -213,11 +213,11 @@ def verdicts(directory: str | Path) -> Sequence[Verdict]:
     return evaluate_run(Path(directory)).verdicts
 
 
-def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
-    """Return the column `metric` of results of `run_case`, one value per case; NaN for a case without the column."""
+def collect_metric(results: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
+    """Collect the column `metric` of results of `run_case`, one value per case; NaN for a case without the column."""
     import pandas as pd
 
-    return pd.Series([result.row.get(metric, float("nan")) for result in rows], name=metric).rename_axis("case")
+    return pd.Series([result.row.get(metric, float("nan")) for result in results], name=metric).rename_axis("case")
 
 
 def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True, **pose: Any) -> list[RenderedImage]:
