@@ -160,6 +160,13 @@ def replace_file(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)
 
 
+def write_atomic(path: Path, text: str) -> None:
+    """Write a text file atomically: write a temporary file, then rename it."""
+    with replace_file(path) as partial_path:
+        # JSON can contain lone surrogates, which cannot be encoded as UTF-8
+        partial_path.write_text(text, encoding="utf-8", errors="replace")
+
+
 def _remove_abandoned(directory: Path) -> None:
     """Remove temporary files and folders of dead processes of this machine from a campaign's folder and its cases."""
     remove_abandoned((*directory.glob("*.partial"), *directory.glob("cases/*/*.partial")))

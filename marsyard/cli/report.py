@@ -54,7 +54,7 @@ def report(
     if trust:
         adopt(directory)
     if gallery:
-        outcome.rerun_notable_cases(directory)
+        outcome.rerun_gallery_cases(directory)
     applicable_requirements = None
     if requirements is not None:
         name = str(record.read(directory)["name"])

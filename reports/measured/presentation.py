@@ -15,16 +15,8 @@ from matplotlib.ticker import MaxNLocator
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
 from marsyard.reports.images import Image, show_image
-from marsyard.reports.presentation import (
-    CaseFigure,
-    CaseKind,
-    CaseView,
-    Presentation,
-    Products,
-    TableRow,
-    check_shape,
-    to_matrix,
-)
+from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Presentation, TableRow
+from marsyard.reports.products import Products, check_shape, to_matrix
 from marsyard.reports.section import (
     MARKERS,
     MUTED,
