@@ -43,8 +43,8 @@ from marsyard.sim.terrain import Surface, TerrainBank
 
 #: Spacing of the grid on which cloud transmittance is evaluated, pixels.
 CLOUD_GRID_PX = 32
-#: Cache sizes of grounds, runs and scenes: large enough for all runs of the paper, because the cases alternate runs.
-_CACHED_GROUNDS, _CACHED_RUNS, _CACHED_SCENES = 3, 16, 5
+#: Cache sizes of runs and scenes: large enough for all runs of the paper, because the cases alternate runs.
+_CACHED_RUNS, _CACHED_SCENES = 16, 5
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,10 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
     name = "fieldtest"
     parameters_type = FieldTestParameters
     task = VELOCITY
+    max_cached_grounds = 3
 
     def __init__(self) -> None:
-        super().__init__(_CACHED_GROUNDS)
+        super().__init__()
         self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(lambda key: simulate_run(key, self.load_ground))
         self._start_scene = lru_cache(maxsize=_CACHED_SCENES)(
             lambda key: build_start_scene(self._simulate_run(key).flown, run_ground(key, self.load_ground))

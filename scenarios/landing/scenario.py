@@ -17,7 +17,7 @@ from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing.ground_truth import RenderedFlight
-from marsyard.scenarios.landing.images import measure
+from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import (
     conditions,
@@ -26,12 +26,11 @@ from marsyard.scenarios.landing.score import (
     motion_row,
     outcome_row,
     products,
-    simulate_touchdown,
     site_row,
     times_row,
 )
 from marsyard.scenarios.landing.timeline import landing_timeline
-from marsyard.scenarios.landing.world import MAX_GROUNDS
+from marsyard.scenarios.landing.touchdown import simulate_touchdown
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding
 from marsyard.sim.streams import Streams
@@ -43,9 +42,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     name = "landing"
     parameters_type = LandingScenarioParameters
     task = LANDING
-
-    def __init__(self) -> None:
-        super().__init__(MAX_GROUNDS)
+    max_cached_grounds = 4
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[ImageSample]:
         """Yield the two delivered images of a case with the ground truth of their pixels."""
