@@ -1,5 +1,9 @@
-"""Test that links between the Markdown pages lead to existing files and headings; `test_site` checks the built site."""
+"""Test that links between the Markdown pages lead to existing files and headings; `test_site` checks the built site.
 
+The page on the architecture may name only existing modules and folders.
+"""
+
+import pydoc
 import re
 from pathlib import Path
 
@@ -40,3 +44,14 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
         if not path.exists() or not has_anchor:
             broken.append(target)
     assert broken == []
+
+
+def test_architecture_names_existing_code() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    # modules of a system are relative to `scenarios`
+    paths = re.findall(r"`(\w+/[\w/]+(?:\.py)?)`", text)
+    missing = [path for path in paths if not any((ROOT / parent / path).exists() for parent in (".", "scenarios"))]
+    modules = set(re.findall(r"\bmarsyard(?:\.\w+)+", text))
+    assert len(paths) > 30
+    assert len(modules) > 10
+    assert missing + [name for name in modules if pydoc.locate(name) is None] == []
