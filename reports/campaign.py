@@ -104,7 +104,7 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
 
 def section_makers() -> list[SectionMaker]:
     """List the functions that create the sections of all campaigns and of all systems, in the order of the page."""
-    systems = presentations()
+    systems = presentations().values()
     first_makers = [maker for system in systems for maker in system.first]
     system_makers = [maker for system in systems for maker in system.sections]
     return [*first_makers, *COMMON_SECTIONS, *system_makers, conditions_section]

@@ -101,46 +101,37 @@ class Presentation:
 
 
 @cache
-def presentations() -> tuple[Presentation, ...]:
-    """Import the presentations of all systems, those of recorded data first; omit an invalid one with a warning."""
-    valid_presentations: list[Presentation] = []
-    # cases of recorded data also contain products of other systems, which must not claim them
+def presentations() -> Mapping[str, Presentation]:
+    """Import the presentations of all systems, by system; omit an invalid one with a warning.
+
+    Those of recorded data are first: their cases also contain products of other systems, which must not claim them.
+    """
+    valid = {}
     for system in sorted(systems(), key=lambda system: not system.ingest):
         if not system.report:
             continue
-        description = f"the report '{system.report}' of system '{system.name}'"
         try:
             presentation = import_object(system.report)
+            problem = f"is a {type(presentation).__name__}; allowed: a marsyard.reports.presentation.Presentation"
         except ImportError as error:
-            _warn(f"{description} cannot be imported: {error}")
-            continue
+            presentation, problem = None, f"cannot be imported: {error}"
         if isinstance(presentation, Presentation):
-            valid_presentations.append(presentation)
+            valid[system.name] = presentation
         else:
-            type_name = type(presentation).__name__
-            _warn(f"{description} is a {type_name}; allowed: a marsyard.reports.presentation.Presentation")
-    return tuple(valid_presentations)
+            reason = f"the report '{system.report}' of system '{system.name}' {problem}"
+            warnings.warn(f"{reason}; its sections and images are omitted", stacklevel=2)
+    return valid
 
 
 def system_presentation(scenario: str) -> Presentation | None:
     """Return the presentation of the system with this scenario; None without one."""
     system = find_system(scenario)
-    if system is None or not system.report:
-        return None
-    try:
-        presentation = import_object(system.report)
-    except ImportError:
-        return None
-    return presentation if isinstance(presentation, Presentation) else None
-
-
-def _warn(reason: str) -> None:
-    warnings.warn(f"{reason}; its sections and images are omitted", stacklevel=3)
+    return None if system is None else presentations().get(system.name)
 
 
 def find_case_kind(products: Products) -> CaseKind | None:
     """Find the kind of case of these products; None if no system recognizes them."""
-    kinds = (kind for presentation in presentations() for kind in presentation.cases)
+    kinds = (kind for presentation in presentations().values() for kind in presentation.cases)
     return next((kind for kind in kinds if kind.is_case(products)), None)
 
 

@@ -107,8 +107,8 @@ def match_landmarks(
     # a prior with the state's attitude would remove the landmarks that show its error; the filter tests the attitude
     prior_sd = np.append(np.maximum(position_sd_m, 1e-3), np.full(3, options.fit_attitude_sd_rad))
     sigma_px = np.hypot(
-        float(np.max(position_sd_m)) / (height_m * image.pixel_angle_rad),
-        options.attitude_sd_rad / image.pixel_angle_rad,
+        float(np.max(position_sd_m)) / (height_m * image.camera.pixel_angle_rad),
+        options.attitude_sd_rad / image.camera.pixel_angle_rad,
     )
     half_px = options.search_sigmas_fine * float(sigma_px) / factor
     corrected, extra_binning = image, _acquisition_factor(image, factor, half_px, options)

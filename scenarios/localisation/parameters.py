@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.case_faults import SizedFaults
+from marsyard.scenarios.case_faults import Haze, SizedFaults
 from marsyard.scenarios.localisation.flight import ProfileParameters
 from marsyard.scenarios.localisation.instruments import (
     IMAGE_CLOCK,
@@ -38,7 +38,7 @@ class LocalisationFaults(SizedFaults):
     heat_shield_deg: Annotated[
         NonNegative, Field(le=60.0, description="angular diameter of the falling heat shield in the first image")
     ] = 0.0
-    haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
+    haze: Haze = 0.0
     lost_images: Annotated[NonNegative, Field(le=1.0, description="fraction of images that is not delivered")] = 0.0
     black_image: Annotated[int, bounded_field(0, 100, "image that is delivered black, from 1; 0: none")] = 0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0

@@ -14,7 +14,6 @@ from marsyard.algorithms.dimes.binning import (
     ground_lattice,
     homography_lattice,
     inside_frame,
-    pixel_angle_rad,
     pixels_from_ground,
     rectify_patch,
     square_lattice,
@@ -113,7 +112,7 @@ def test_camera_is_above_origin_for_any_mounting_position() -> None:
 def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     # 4 x 12 um / 14.67 mm = 3.272 mrad; distortion changes it by less than 0.1 % near the image centre.
-    assert pixel_angle_rad(second) == pytest.approx(4 * 12e-6 / 0.01467, rel=2e-3)
+    assert second.camera.pixel_angle_rad == pytest.approx(4 * 12e-6 / 0.01467, rel=2e-3)
     geometry = search_geometry(first, second, OPTIONS)
     assert geometry.gsd_m == pytest.approx(1719.0 * 3.272e-3, rel=2e-3)
     # 30 m/s in 3.75 s: 112.5 m (the paper's "at least 110 m") are 20.003 px, rounded up to 21, plus the margin.
