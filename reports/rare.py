@@ -9,11 +9,11 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.counting import CountingBound
 from marsyard.campaigns.studies.interval import ProbabilityInterval
 from marsyard.campaigns.studies.rare_decision import Basis, ContinuityCheck, Decision
 from marsyard.campaigns.studies.results import RARE, Replicate
-from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.campaigns.studies.subset import LEVEL_FRACTION
 from marsyard.reports.section import (
     MARKERS,

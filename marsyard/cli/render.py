@@ -11,14 +11,7 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from marsyard.cli.options import (
-    BitsOption,
-    MaxHolesOption,
-    OverwriteOption,
-    SiteArgument,
-    exit_with_error,
-    with_options,
-)
+from marsyard.cli import options
 
 #: Name of the kernels of `marsyard render` in `marsyard.sim.kernel_cache`, next to the names of scenarios.
 RENDER_KERNELS = "render"
@@ -28,7 +21,7 @@ RENDER_KERNELS = "render"
 class RenderOptions:
     """Arguments and options of `marsyard render`."""
 
-    site: SiteArgument
+    site: options.SiteArgument
     camera: Annotated[
         str, Option(metavar="NAME", help="Camera, such as mer-navcam or mer-descent-flown; an unknown name lists all.")
     ]
@@ -62,12 +55,12 @@ class RenderOptions:
         bool, Option("--detector/--radiance", help="Write detector counts, or the radiance factor (I/F).")
     ] = True
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain and the noise.")] = 1
-    bits_per_pixel: BitsOption = None
-    overwrite: OverwriteOption = False
-    max_holes: MaxHolesOption = None
+    bits_per_pixel: options.BitsOption = None
+    overwrite: options.OverwriteOption = False
+    max_holes: options.MaxHolesOption = None
 
 
-@with_options(RenderOptions)
+@options.with_options(RenderOptions)
 def render(arguments: RenderOptions) -> None:
     """Render an image of a site or DTM.
 
@@ -119,9 +112,9 @@ def report_image_errors(out: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, RenderingError) as error:
-        exit_with_error(error)
+        options.exit_with_error(error)
     except OSError as error:
-        exit_with_error(f"cannot write to {out}: {error}")
+        options.exit_with_error(f"cannot write to {out}: {error}")
 
 
 def gallery(
@@ -130,7 +123,7 @@ def gallery(
         list[Path] | None,
         Option("--terrain", metavar="FILE", help="Also show this DTM, seen by a descent camera. Can be repeated."),
     ] = None,
-    overwrite: OverwriteOption = False,
+    overwrite: options.OverwriteOption = False,
 ) -> None:
     """Render each site with suitable cameras; write one page and a contact sheet. Takes about a minute."""
     from marsyard.cli.gallery import render_gallery

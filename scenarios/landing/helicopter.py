@@ -9,16 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-from marsyard.sim.dynamics import State, Trajectory
-from marsyard.sim.dynamics.rotorcraft import (
-    Air,
-    AirParameters,
-    LandingGuidance,
-    RotorcraftFlight,
-    RotorcraftParameters,
-    TransitParameters,
-    simulate_transit,
-)
+from marsyard.sim.dynamics import State, Trajectory, rotorcraft
 from marsyard.sim.error_sources import COMPASS, INERTIAL, RECEIVER
 from marsyard.sim.measurements import PoseMeasurement
 from marsyard.sim.parameters import Parameters
@@ -33,10 +24,10 @@ from marsyard.sim.streams import Streams
 class LandingHelicopterParameters(Parameters):
     """Parameters of a helicopter flight: vehicle, air, guidance and instruments."""
 
-    craft: RotorcraftParameters = RotorcraftParameters()
-    air: AirParameters = AirParameters()
-    transit: TransitParameters = TransitParameters()
-    guidance: LandingGuidance = LandingGuidance()
+    craft: rotorcraft.RotorcraftParameters = rotorcraft.RotorcraftParameters()
+    air: rotorcraft.AirParameters = rotorcraft.AirParameters()
+    transit: rotorcraft.TransitParameters = rotorcraft.TransitParameters()
+    guidance: rotorcraft.LandingGuidance = rotorcraft.LandingGuidance()
     # the filter is tuned with the parameters of its sensors
     imu: Annotated[ImuParameters, INERTIAL] = SMALL_UNIT
     rtk: Annotated[RtkParameters, replace(RECEIVER, remaining=0.1)] = RtkParameters()
@@ -139,8 +130,8 @@ class Transit:
 
     parameters: LandingHelicopterParameters
     instruments: HelicopterInstruments
-    air: Air
-    flight: RotorcraftFlight  #: true flight
+    air: rotorcraft.Air
+    flight: rotorcraft.RotorcraftFlight  #: true flight
     navigation_leg: NavigatedLeg
     times_s: Float64[np.ndarray, "images"]  #: true mid-exposure times
     tags_s: Float64[np.ndarray, "images"]  #: time tags of the images
@@ -161,8 +152,8 @@ class Transit:
         """
         p = parameters
         start, end = p.span_s
-        air = Air.draw(p.air, p.craft.step_s, end - start, streams.generator("gusts"))
-        flight = simulate_transit(
+        air = rotorcraft.Air.draw(p.air, p.craft.step_s, end - start, streams.generator("gusts"))
+        flight = rotorcraft.simulate_transit(
             p.craft, p.transit, start_m, course_rad, heading_rad, gravity_m_s2, air, streams.generator("vibration")
         )
         instruments = HelicopterInstruments.draw(p, gravity_m_s2, streams)

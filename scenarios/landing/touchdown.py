@@ -20,15 +20,7 @@ from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.helicopter import NavigatedLeg, Transit
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
-from marsyard.sim.dynamics import Resting, State
-from marsyard.sim.dynamics.rotorcraft import (
-    AltimeterErrors,
-    GroundPatch,
-    Phase,
-    RotorcraftFlight,
-    SimulatedPath,
-    simulate_landing,
-)
+from marsyard.sim.dynamics import Resting, State, rotorcraft
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
 
@@ -40,7 +32,7 @@ MAX_ITERATIONS, MAX_PATH_CHANGE_M = 8, 1e-3
 class Touchdown:
     """True and estimated state at the touchdown of a landing."""
 
-    flight: RotorcraftFlight  #: true flight from its start to rest on the ground
+    flight: rotorcraft.RotorcraftFlight  #: true flight from its start to rest on the ground
     navigation_leg: NavigatedLeg  #: navigation from the end of the transit
     time_s: float  #: time of first skid contact
     state: State  #: true state at touchdown
@@ -65,7 +57,7 @@ def simulate_touchdown(
     relief = truth.relief
     if flight.transit is None or estimate.site_world is None:
         return None
-    ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
+    ground = rotorcraft.GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
     unit = RangingUnit.draw(p.laser, streams.generator("laser"))
     return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
 
@@ -73,7 +65,7 @@ def simulate_touchdown(
 def land(
     transit: Transit,
     site_m: Float64[np.ndarray, "3"],
-    ground: GroundPatch,
+    ground: rotorcraft.GroundPatch,
     laser: RangingUnit,
     streams: Streams,
     laser_stuck_m: float | None = None,
@@ -85,7 +77,7 @@ def land(
     p, path = transit.parameters, transit.flight.path
     noise = np.hypot(laser.parameters.noise_m, laser.parameters.noise * p.guidance.flare_range_m)
     errors_m = noise * streams.generator("laser noise, landing").standard_normal(len(transit.air.gusts_m_s))
-    altimeter = AltimeterErrors(laser.scale, errors_m, laser_stuck_m)
+    altimeter = rotorcraft.AltimeterErrors(laser.scale, errors_m, laser_stuck_m)
     start = float(transit.navigation_leg.boundaries_s[-1])
     transit_errors = _interpolate_at_knots(
         path, transit.navigation_leg.boundaries_s, transit.navigation_leg.errors(path)
@@ -93,7 +85,9 @@ def land(
     errors, previous, end = transit_errors, None, None
     iterations, path_change_m, initial = 0, np.inf, transit.navigation_leg.solution.end
     while iterations < MAX_ITERATIONS and path_change_m > MAX_PATH_CHANGE_M:
-        flight = simulate_landing(transit.flight, p.guidance, site_m[:2], errors, transit.air, ground, altimeter, end)
+        flight = rotorcraft.simulate_landing(
+            transit.flight, p.guidance, site_m[:2], errors, transit.air, ground, altimeter, end
+        )
         path = flight.path
         end = path.span_s[1] if end is None else end  # all iterations have the duration of the first one
         navigation_leg = NavigatedLeg.simulate(path, start, end, transit.instruments, streams, "landing", initial)
@@ -101,7 +95,7 @@ def land(
         errors = np.concatenate([transit_errors, leg_errors[len(transit_errors) :]])
         path_change_m = np.inf if previous is None else float(np.abs(path.rows[:, :3] - previous.rows[:, :3]).max())
         previous, iterations = path, iterations + 1
-    time = flight.phase_start_s(Phase.ON_GROUND)
+    time = flight.phase_start_s(rotorcraft.Phase.ON_GROUND)
     if time is None:
         return None
     # the receiver's averaged solutions, with the helicopter at rest
@@ -129,7 +123,7 @@ def land(
 
 
 def _interpolate_at_knots(
-    path: SimulatedPath, times_s: Float64[np.ndarray, "m"], values: Float64[np.ndarray, "m 9"]
+    path: rotorcraft.SimulatedPath, times_s: Float64[np.ndarray, "m"], values: Float64[np.ndarray, "m 9"]
 ) -> Float64[np.ndarray, "knots 9"]:
     """Interpolate values linearly at a path's knots; constant before the first and after the last time."""
     return np.stack([np.interp(path.knots_s, times_s, column) for column in values.T], axis=1)

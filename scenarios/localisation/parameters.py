@@ -10,16 +10,8 @@ from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.case_faults import Haze, SizedFaults
+from marsyard.scenarios.localisation import instruments
 from marsyard.scenarios.localisation.flight import ProfileParameters
-from marsyard.scenarios.localisation.instruments import (
-    IMAGE_CLOCK,
-    LANDER_DETECTOR,
-    RADAR,
-    ImageSchedule,
-    InitialErrors,
-    LanderCameraParameters,
-    check_clock,
-)
 from marsyard.scenarios.localisation.map_product import MapParameters
 from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
 from marsyard.scenarios.localisation.task import LOCALISATION
@@ -70,13 +62,13 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     dust_opacity: DustOpacity = None
     map: MapParameters = MapParameters()
     flight: ProfileParameters = ProfileParameters()
-    images: ImageSchedule = ImageSchedule()
-    camera: LanderCameraParameters = LanderCameraParameters()
-    detector: DetectorParameters = LANDER_DETECTOR
+    images: instruments.ImageSchedule = instruments.ImageSchedule()
+    camera: instruments.LanderCameraParameters = instruments.LanderCameraParameters()
+    detector: DetectorParameters = instruments.LANDER_DETECTOR
     imu_class: Annotated[ImuClass, Field(description="class of the inertial unit")] = "ln-200"
-    initial: InitialErrors = InitialErrors()
-    altimeter: RadarParameters = RADAR
-    clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = IMAGE_CLOCK
+    initial: instruments.InitialErrors = instruments.InitialErrors()
+    altimeter: RadarParameters = instruments.RADAR
+    clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = instruments.IMAGE_CLOCK
     exact_instruments: Annotated[
         bool, Field(description="estimators receive exact attitudes, altitudes, times, inertial data and camera")
     ] = False
@@ -118,8 +110,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
             raise ValueError(
                 "faults.wrong_map needs another terrain; all terrains with terrain.source contain the same DTM"
             )
-        check_clock("clock", self.clock)
-        check_clock("altimeter.clock", self.altimeter.clock)
+        instruments.check_clock("clock", self.clock)
+        instruments.check_clock("altimeter.clock", self.altimeter.clock)
         if self.faults.wrong_map and self.location.bank < 2:
             raise ValueError("faults.wrong_map needs another terrain; allowed: a location.bank of at least 2")
         return self
