@@ -1,7 +1,6 @@
 """Elevation map (section II.D), hazard maps, safe landing map and selection of the landing site (section III).
 
-With the option `check_footprints`, the estimator replaces the safe landing map of section III by that of
-`marsyard.algorithms.hda.footprints`.
+With the option `check_footprints`, the estimator replaces section III's safe landing map by that of `footprints`.
 
 Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
