@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.lock import write_atomic
+from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences
@@ -28,6 +24,7 @@ from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.gallery import CASES_PER_GROUP, gallery_views
 from marsyard.reports.overall import OverallVerdict, multiplicity_text
+from marsyard.reports.page_environment import page_environment
 from marsyard.reports.presentation import presentations
 from marsyard.reports.rare import rare_section, rare_sentences
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
@@ -245,28 +242,3 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
 def _unique_values(frame: pd.DataFrame, column: str) -> tuple[str, ...]:
     values = frame[column].dropna().unique()[:_MAX_NAMES] if column in frame else ()
     return tuple(str(value) for value in values)
-
-
-def status_class(word: object) -> str:
-    """Return the name of the style of a verdict; a PASS with a qualification has that of MET BY RATE.
-
-    >>> [status_class(word) for word in ("PASS", "PASS (unregistered)", "NO REQUIREMENT")]
-    ['pass', 'met-by-rate', 'no-requirement']
-    """
-    text = str(word)
-    return "met-by-rate" if text.startswith("PASS (") else text.lower().replace(" ", "-")
-
-
-@cache
-def page_environment() -> Environment:
-    """Create a Jinja environment that escapes all values; its filter `code` marks words in backticks as code."""
-    environment = Environment(
-        autoescape=True,
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        lstrip_blocks=True,
-        trim_blocks=True,
-        undefined=StrictUndefined,
-    )
-    environment.filters["status_class"] = status_class
-    environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
-    return environment

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.key import sign
-from marsyard.campaigns.store.lock import write_atomic
+from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import explorer
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE

@@ -21,7 +21,7 @@ import numpy as np
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import StoreError, report_write_errors
-from marsyard.campaigns.store.lock import partial_suffix
+from marsyard.campaigns.store.temporary_files import partial_suffix
 from marsyard.sim.files import report_damage
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
