@@ -16,7 +16,7 @@ from benchmarks.timing import Measurement, core_seconds
 from marsyard.algorithms.hda import ElevationMap, HdaDetails, HdaEstimator, HdaOptions, hazard_maps
 from marsyard.algorithms.hda.baselines import SemiGlobalEstimator
 from marsyard.algorithms.hda.estimator import expected_pixels, map_ground, match_structure, motion_from_tracks
-from marsyard.algorithms.hda.hazards import map_resolution
+from marsyard.algorithms.hda.footprints import map_resolution
 from marsyard.algorithms.hda.motion import build_scene, undistort
 from marsyard.algorithms.hda.structure import scale_factor
 from marsyard.algorithms.hda.tracking import select_features, track_features

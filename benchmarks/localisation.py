@@ -14,7 +14,7 @@ STAGES: Stages = {
     "map product": (("localisation/map_product.py", "make_map"),),
     "flight": (("localisation/flight.py", "simulate"),),
     "scene": (("localisation/world.py", "scene"),),
-    "24 images": (("scenarios/radiance.py", "render_state"), ("scenarios/radiance.py", "add_haze")),
+    "24 images": (("scenarios/views.py", "render_state"), ("scenarios/radiance.py", "add_haze")),
     "detector": (("sensor/detector.py", "expose"),),
     "landmarks of the map": (("localisation/landmarks.py", "select_landmarks"),),
     "coarse stage": (("localisation/coarse.py", "find_coarse_position"),),

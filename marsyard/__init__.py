@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from marsyard.api import *  # noqa: F403
 
-__all__ = ["CameraModel", "Campaign", "CaseResult", "catalogue", "create_campaign", "draw", "draws", "load_campaign"]
-__all__ += ["open_result", "read_camera", "read_cameras", "render_view", "results", "run", "run_campaign", "run_case"]
-__all__ += ["score", "sites", "verdicts"]
+__all__ = ["CameraModel", "Campaign", "CaseResult", "catalogue", "collect_metric", "create_campaign", "draw", "draws"]
+__all__ += ["load_campaign", "open_result", "read_camera", "read_cameras", "render_view", "results", "run"]
+__all__ += ["run_campaign", "run_case", "sites", "verdicts"]
 
 
 def __getattr__(name: str) -> Any:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from marsyard.campaigns.definition import loading
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
+from marsyard.campaigns.errors import CampaignError
 from marsyard.scenarios import systems
 from marsyard.scenarios.interface import CaseResult as CaseResult
 from marsyard.sim.camera import CameraModel as CameraModel
@@ -116,7 +117,6 @@ def run(
     - jobs: number of worker processes
     - directory: new folder of the results; `runs/NAME-TIME` if None
     """
-    from marsyard.campaigns.errors import CampaignError
     from marsyard.cli.execution import default_directory
     from marsyard.result import open_result
 
@@ -147,7 +147,6 @@ def open_result(directory: str | Path) -> Result:
 
 def _name_algorithms(algorithms: Sequence[Any], folder: Path) -> list[str]:
     """Return the specifications of algorithms; objects are stored in `folder`. Raises CampaignError."""
-    from marsyard.campaigns.errors import CampaignError
     from marsyard.scenarios.stored_objects import name_object
 
     try:
@@ -213,11 +212,11 @@ def verdicts(directory: str | Path) -> Sequence[Verdict]:
     return evaluate_run(Path(directory)).verdicts
 
 
-def score(campaign: Campaign, rows: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
-    """Return the column `metric` of results of `run_case`, one value per case; NaN for a case without the column."""
+def collect_metric(results: Sequence[CaseResult], metric: str) -> pd.Series[Any]:
+    """Collect the column `metric` of results of `run_case`, one value per case; NaN for a case without the column."""
     import pandas as pd
 
-    return pd.Series([result.row.get(metric, float("nan")) for result in rows], name=metric).rename_axis("case")
+    return pd.Series([result.row.get(metric, float("nan")) for result in results], name=metric).rename_axis("case")
 
 
 def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True, **pose: Any) -> list[RenderedImage]:

@@ -19,18 +19,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 
+from marsyard.scenarios import views
 from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.radiance import add_haze
 from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
-from marsyard.scenarios.views import (
-    CAMERA_MOUNTINGS,
-    SiteGround,
-    Viewpoint,
-    camera_pose,
-    mast_pose,
-    site_scene,
-    smallest_rock_rad,
-)
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.dynamics.rover import RoverParameters, Stance
@@ -76,7 +68,7 @@ class ImageRequest:
             check_site_name(site)
             _check_name("site", site, sites())
         _check_name("camera", camera, sensor.PRESETS)
-        mounting = CAMERA_MOUNTINGS[camera]
+        mounting = views.CAMERA_MOUNTINGS[camera]
         defaults = {"scale": mounting.scale, "altitude_m": mounting.height_m, "elevation_deg": mounting.elevation_deg}
         defaults |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
         defaults |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
@@ -153,18 +145,18 @@ def render_images(
     """
     preset, site = sensor.preset(request.camera), request.site_definition
     note(f"terrain and rocks of {request.site}")
-    ground = SiteGround.from_site(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
+    ground = views.SiteGround.from_site(site, "descent" if request.scale == "descent" else "ground", seed=request.seed)
     cameras = preset.cameras()
     position = (request.east_m, request.north_m, request.altitude_m)
-    pose = camera_pose(ground.surface, preset.design, *position, request.azimuth_deg, request.elevation_deg)
+    pose = views.camera_pose(ground.surface, preset.design, *position, request.azimuth_deg, request.elevation_deg)
     sun_direction = direction(np.radians(request.sun_azimuth_deg), np.radians(request.sun_elevation_deg))
     sun = Sun(sun_direction, ground.site.environment.sun_radius_rad)
     rendered_cameras = cameras if both else cameras[:1]
     rays = [PixelRays.from_camera(camera) for camera in rendered_cameras]
     # The baseline of a stereo pair is short: both cameras use the scene built for the left camera.
-    viewpoint = Viewpoint.from_pose(rays[0], pose, ground.surface)
-    scene = _add_rover(site_scene(ground, viewpoint, sun), request, ground)
-    smallest_rad = smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
+    viewpoint = views.Viewpoint.from_pose(rays[0], pose, ground.surface)
+    scene = _add_rover(views.site_scene(ground, viewpoint, sun), request, ground)
+    smallest_rad = views.smallest_rock_rad(ground.rocks, viewpoint) if ground.rocks is not None else 0.0
     rms_slope = math.tan(math.radians(ground.terrain.rms_slope_deg))
     images = []
     for number, camera in enumerate(rendered_cameras):
@@ -178,18 +170,20 @@ def render_images(
     return images
 
 
-def _add_rover(scene: Scene, request: ImageRequest, ground: SiteGround) -> Scene:
+def _add_rover(scene: Scene, request: ImageRequest, ground: views.SiteGround) -> Scene:
     """Add the rover on which the camera is mounted: level, with its mounting point at the camera's position."""
-    position_on_rover = CAMERA_MOUNTINGS[request.camera].on_rover_m
+    position_on_rover = views.CAMERA_MOUNTINGS[request.camera].on_rover_m
     if position_on_rover is None:
         return scene
-    camera = mast_pose(ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0)
+    camera = views.mast_pose(
+        ground.surface, request.east_m, request.north_m, request.altitude_m, request.azimuth_deg, 0.0
+    )
     stance = Stance(rigid(camera.rotation, camera.apply(-np.array(position_on_rover))), 0.0, (0.0, 0.0), np.zeros(6))
     rover = rover_objects(RoverParameters(), stance, MER_MAST, 0.0, 0.0)
     return scene.with_objects(Objects.join([scene.objects, rover]))
 
 
-def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
+def _mark_filled(ground: views.SiteGround, frame: Frame) -> Bool[np.ndarray, "rows columns"] | None:
     """Mark the pixels that show filled holes of a DTM; None for a preset site."""
     terrain = ground.terrain
     if terrain.source is None:
@@ -202,7 +196,7 @@ def _mark_filled(ground: SiteGround, frame: Frame) -> Bool[np.ndarray, "rows col
 
 
 def _expose(
-    request: ImageRequest, ground: SiteGround, camera: CameraModel, number: int, frame: Frame, sun: Sun
+    request: ImageRequest, ground: views.SiteGround, camera: CameraModel, number: int, frame: Frame, sun: Sun
 ) -> tuple[sensor.AutoExposure, UInt16[np.ndarray, "rows columns"]]:
     """Simulate the detector with automatic exposure time and without summed rows; return the detector and counts."""
     streams = Streams(request.seed, "render", number)

@@ -9,9 +9,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.contributions import Budget
 from marsyard.campaigns.studies.results import BUDGET, BudgetResult
-from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.reports.section import (
     GRID,
     INK,

@@ -2,41 +2,38 @@
 
 from __future__ import annotations
 
-import hmac
 import json
 import math
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.key import sign
-from marsyard.campaigns.store.lock import replace_file
+from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
+from marsyard.reports.gallery import CASES_PER_GROUP, gallery_views
 from marsyard.reports.overall import OverallVerdict, multiplicity_text
-from marsyard.reports.presentation import CASES_PER_GROUP, presentations, showcase_views
+from marsyard.reports.page_environment import page_environment
+from marsyard.reports.presentation import presentations
 from marsyard.reports.rare import rare_section, rare_sentences
-from marsyard.reports.report_file import SCHEMA, CampaignReport, StudySummary
+from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
 from marsyard.reports.requirement_cases import CaseFinder
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
-from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, table
+from marsyard.reports.signature import sign_report
+from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
@@ -56,14 +53,8 @@ STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget
 #: Maximum number of names of sites, and of algorithms, in `report.json`.
 _MAX_NAMES = 24
 
-PAGE_FILE = "report.html"
-REPORT_JSON = "report.json"
 VERIFICATION_FILE = "verification.csv"
 JUNIT_FILE = "junit.xml"
-#: Layout of a page, which the dashboard depends on.
-_LAYOUT_FILES = tuple(Path(__file__).parent / "templates" / name for name in ("report.html.j2", "parts.html.j2"))
-#: Hash of page and data with the key of the user who wrote them; others' reports are written again for the dashboard.
-SIGNATURE_FILE = "report.signature"
 
 
 def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Path:
@@ -108,33 +99,9 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     return page_file
 
 
-def sign_report(directory: Path, campaign: Path) -> None:
-    """Record that this user's installation wrote the report in a folder from the present rows of a campaign's folder.
-
-    Raises StoreError if the key of the user cannot be read.
-    """
-    write_atomic(directory / SIGNATURE_FILE, _compute_signature(directory, campaign))
-
-
-def is_own_report(directory: Path, campaign: Path) -> bool:
-    """Whether this user's installation wrote the report in a folder from the present rows of a campaign's folder."""
-    try:
-        signature = (directory / SIGNATURE_FILE).read_bytes()
-        return hmac.compare_digest(signature, _compute_signature(directory, campaign).encode())
-    except (OSError, StoreError, RuntimeError):
-        return False
-
-
-def _compute_signature(directory: Path, campaign: Path) -> str:
-    """Sign page and data of a report, the script and the layout of this version's pages, and the record and rows."""
-    files = (directory / PAGE_FILE, directory / REPORT_JSON, campaign / RECORD_FILE, campaign / TABLE_FILE)
-    contents = [explorer.read_script().encode(), *map(Path.read_bytes, _LAYOUT_FILES)]
-    return sign(*contents, *(path.read_bytes() if path.is_file() else b"" for path in files))
-
-
 def section_makers() -> list[SectionMaker]:
     """List the functions that create the sections of all campaigns and of all systems, in the order of the page."""
-    systems = presentations()
+    systems = presentations().values()
     first_makers = [maker for system in systems for maker in system.first]
     system_makers = [maker for system in systems for maker in system.sections]
     return [*first_makers, *COMMON_SECTIONS, *system_makers, conditions_section]
@@ -148,7 +115,7 @@ def page_context(
     crash_text = f"{count(overall.crashed, 'case')} crashed. Fix the cause before you use the verdict."
     cautions = [crash_text] if overall.crashed else []
     finder = CaseFinder(subject.run, verdicts)
-    showcases = showcase_views(run, finder.notable_cases(CASES_PER_GROUP))
+    gallery = gallery_views(run, finder.worst_violations(CASES_PER_GROUP))
     context: dict[str, Any] = {
         "run": run,
         "description": str(run.recorded("description") or ""),
@@ -168,9 +135,9 @@ def page_context(
         "crashed": page.crashed_rows(run),
         "dispersions": page.dispersion_grid(subject.run),
         "requirement_cases": finder.requirement_cases(),
-        "showcases": showcases,
-        "links": {case.case: f"#case-{case.case}" for case in showcases},
-        "summaries": {case.case: finder.summary(case.case) for case in showcases},
+        "gallery": gallery,
+        "links": {case.case: f"#case-{case.case}" for case in gallery},
+        "summaries": {case.case: finder.summary(case.case) for case in gallery},
         "provenance": page.list_provenance(run),
         "versions": page.list_versions(run),
         "definition": json.dumps(run.definition, indent=2, ensure_ascii=False, default=str),
@@ -178,9 +145,9 @@ def page_context(
         "rerun": page.rerun_commands(run),
         "rerun_is_stored": run.command is not None,
         "replay": page.replay_command(run, "CASE"),
-        "gallery": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
+        "gallery_command": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
     }
-    cases_with_images = [str(case.case) for case in context["showcases"]]
+    cases_with_images = [str(case.case) for case in gallery]
     if metric is None:
         empty_table = page.CaseTable((), ())
         context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
@@ -268,42 +235,10 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
         statistics=dict(summaries),
         worst_cases=tuple(row.case for row in worst_rows),
         sections={section.key: section.data for section in extra_sections},
-        showcases=run.showcases,
+        showcases=run.stored_cases,
     )
 
 
 def _unique_values(frame: pd.DataFrame, column: str) -> tuple[str, ...]:
     values = frame[column].dropna().unique()[:_MAX_NAMES] if column in frame else ()
     return tuple(str(value) for value in values)
-
-
-def status_class(word: object) -> str:
-    """Return the name of the style of a verdict; a PASS with a qualification has that of MET BY RATE.
-
-    >>> [status_class(word) for word in ("PASS", "PASS (unregistered)", "NO REQUIREMENT")]
-    ['pass', 'met-by-rate', 'no-requirement']
-    """
-    text = str(word)
-    return "met-by-rate" if text.startswith("PASS (") else text.lower().replace(" ", "-")
-
-
-@cache
-def page_environment() -> Environment:
-    """Create a Jinja environment that escapes all values; its filter `code` marks words in backticks as code."""
-    environment = Environment(
-        autoescape=True,
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        lstrip_blocks=True,
-        trim_blocks=True,
-        undefined=StrictUndefined,
-    )
-    environment.filters["status_class"] = status_class
-    environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
-    return environment
-
-
-def write_atomic(path: Path, text: str) -> None:
-    """Write a text file atomically: write a temporary file, then rename it."""
-    with replace_file(path) as partial_path:
-        # JSON can contain lone surrogates, which cannot be encoded as UTF-8
-        partial_path.write_text(text, encoding="utf-8", errors="replace")

@@ -200,9 +200,8 @@ def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, 
     rate = (n - failures) / n
     with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=evidence.terrains)
     if not sampling.independent:
-        reason = (
-            f"{'Evaluated by the observed rate of these cases. ' if decides_by_rate else ''}{sampling.no_probability}"
-        )
+        prefix = "Evaluated by the observed rate of these cases. " if decides_by_rate else ""
+        reason = prefix + sampling.no_probability_reason
         status = _status_by_rate(rate, n, verdict.probability) if decides_by_rate else verdict.status
         return replace(with_counts, status=status, reason=reason)
     in_first_look = None if evidence.in_first_look.all() else evidence.in_first_look

@@ -18,9 +18,9 @@ from marsyard.reports.rates import engine_failed
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import axis_columns, is_varying_number, label, numbers
 
-#: Maximum number of points of the explorer, without violations, and of violations. Maximum number of notable cases of
+#: Maximum number of points of the explorer, without violations, and of violations. Maximum number of extreme cases of
 #: each kind: largest errors, no answer, crashed.
-MAX_POINTS, MAX_VIOLATIONS, MAX_NOTABLE = 2000, 4000, 150
+MAX_POINTS, MAX_VIOLATIONS, MAX_EXTREME = 2000, 4000, 150
 _SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
 #: Columns that are not quantities of a case.
 _NOT_EXPLORED = ("case", "image_hash", "gl_backend", "gl_version", "processor_features", "error", "traceback")
@@ -99,7 +99,7 @@ def explorer_data(
 def choose_points(
     frame: pd.DataFrame, metric: str, is_violation: Bool[np.ndarray, " n"] | None = None
 ) -> Int[np.ndarray, " points"]:
-    """Select the rows of the explorer: all up to `MAX_POINTS`; else violations, notable cases, and the first others."""
+    """Select the rows of the explorer: all up to `MAX_POINTS`; else violations, extreme cases, and the first others."""
     if len(frame) <= MAX_POINTS:
         return np.arange(len(frame))
     violations = np.zeros(0, dtype=np.int64) if is_violation is None else np.flatnonzero(is_violation)[:MAX_VIOLATIONS]
@@ -107,10 +107,10 @@ def choose_points(
     finite = np.isfinite(magnitude)
     is_crashed = engine_failed(frame)
     worst = np.argsort(-np.where(finite, magnitude, -1.0), kind="stable")
-    notable = [
-        group[:MAX_NOTABLE] for group in (worst, np.flatnonzero(~finite & ~is_crashed), np.flatnonzero(is_crashed))
+    extreme = [
+        group[:MAX_EXTREME] for group in (worst, np.flatnonzero(~finite & ~is_crashed), np.flatnonzero(is_crashed))
     ]
-    others = np.setdiff1d(pd.unique(np.concatenate([*notable, np.arange(len(frame))]))[:MAX_POINTS], violations)
+    others = np.setdiff1d(pd.unique(np.concatenate([*extreme, np.arange(len(frame))]))[:MAX_POINTS], violations)
     return np.sort(np.concatenate([violations, others]))
 
 

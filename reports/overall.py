@@ -65,7 +65,7 @@ def combine_verdicts(
         rate_statuses = [verdict.status for verdict in verdicts if verdict.decide_by == ESTIMATE and verdict.n]
         met_text = f"{rate_statuses.count(Status.MET_BY_RATE)} of {count(len(rate_statuses), 'requirement')}"
         rate_text = f"{met_text} met by the rate of these cases. " if rate_statuses else ""
-        return OverallVerdict(worst, crashed, rate_text + sampling.no_probability + crash_text)
+        return OverallVerdict(worst, crashed, rate_text + sampling.no_probability_reason + crash_text)
     n_withheld = sum(verdict.withheld_status is not None for verdict in verdicts)
     if n_withheld and worst is Status.INSUFFICIENT:
         would_be_met = f"{n_withheld} of {count(len(statuses), 'requirement')} would be met."

@@ -111,7 +111,7 @@ def outcome_grid(frame: pd.DataFrame, scenario: str) -> Grid:
     Several systems have outcomes of the same name: the meaning in the scenario's own system takes precedence.
     """
     own_presentation = system_presentation(scenario)
-    others = [presentation for presentation in presentations() if presentation is not own_presentation]
+    others = [presentation for presentation in presentations().values() if presentation is not own_presentation]
     # later meanings replace earlier ones
     ordered = others if own_presentation is None else [*others, own_presentation]
     kinds: list[type[Enum]] = [Fault, *(kind for presentation in ordered for kind in presentation.outcomes)]

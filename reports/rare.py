@@ -9,24 +9,13 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.counting import CountingBound
 from marsyard.campaigns.studies.interval import ProbabilityInterval
 from marsyard.campaigns.studies.rare_decision import Basis, ContinuityCheck, Decision
 from marsyard.campaigns.studies.results import RARE, Replicate
-from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.campaigns.studies.subset import LEVEL_FRACTION
-from marsyard.reports.section import (
-    MARKERS,
-    REQUIREMENT,
-    SERIES,
-    Block,
-    Grid,
-    Section,
-    Subject,
-    in_page_style,
-    new_axes,
-    svg_figure,
-)
+from marsyard.reports import section
 from marsyard.reports.wording import count, format_fraction
 
 #: Maximum number of replicates in the figure.
@@ -109,7 +98,7 @@ def _remedies(decision: Decision) -> list[str]:
     return sentences
 
 
-def rare_section(subject: Subject) -> Section | None:
+def rare_section(subject: section.Subject) -> section.Section | None:
     """Create the section of a study of rare violations; None for another run."""
     study = RARE.read(subject.run.record)
     if study is None:
@@ -119,7 +108,7 @@ def rare_section(subject: Subject) -> Section | None:
         [str(number), probability_text(replicate.probability), str(len(replicate.thresholds)), replicate.end]
         for number, replicate in enumerate(result.replicates, start=1)
     ]
-    grid = Grid(["Replicate", "Probability", "Levels", "End"], rows)
+    grid = section.Grid(["Replicate", "Probability", "Levels", "End"], rows)
     note = (
         "Each replicate is an independent subset simulation. A tenth of the cases of each level reaches the next one. "
         "The standard error within one replicate is too small, since its cases are correlated. "
@@ -131,16 +120,16 @@ def rare_section(subject: Subject) -> Section | None:
         + " Without an end at violations, the probability is that of the last level."
         + _continuity_note(result.decision.continuity)
     )
-    figure = svg_figure(
+    figure = section.svg_figure(
         _draw_levels(result.replicates, parameters.max_probability),
         "rare-levels",
         "Probability that the margin of a case is at most the value on the horizontal axis. Each line is one "
         "replicate; a violation is a margin below 0. Dashed: limit of the probability.",
     )
-    blocks = (Block("Replicates", figures=[figure], grid=grid, note=note),)
+    blocks = (section.Block("Replicates", figures=[figure], grid=grid, note=note),)
     names = ("requirement", "max_probability", "method")
     data = convert_to_json(asdict(result)) | {name: getattr(parameters, name) for name in names}
-    return Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
+    return section.Section("rare", "Rare violation", "Probability of a rare violation", blocks, data)
 
 
 def _continuity_note(continuity: ContinuityCheck | None) -> str:
@@ -153,22 +142,25 @@ def _continuity_note(continuity: ContinuityCheck | None) -> str:
     )
 
 
-@in_page_style
+@section.in_page_style
 def _draw_levels(replicates: Sequence[Replicate], max_probability: float) -> Figure:
     """Draw the probability of a margin at or below the threshold of each level, a line for each replicate.
 
     A replicate that reached a violation also has the point of margin 0: its estimated probability of a violation.
     """
-    figure, axes = new_axes(6.0, 3.4)
+    figure, axes = section.new_axes(6.0, 3.4)
     for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
         margins = [value for value in replicate.thresholds if math.isfinite(value)]
         # each level contains this fraction of the cases of the previous level
         probabilities = [LEVEL_FRACTION ** (level + 1) for level in range(len(margins))]
         if replicate.reached:
             margins, probabilities = [*margins, 0.0], [*probabilities, replicate.probability]
-        style: dict[str, Any] = {"color": SERIES[index % len(SERIES)], "marker": MARKERS[index % len(MARKERS)]}
+        style: dict[str, Any] = {
+            "color": section.SERIES[index % len(section.SERIES)],
+            "marker": section.MARKERS[index % len(section.MARKERS)],
+        }
         axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
-    axes.axhline(max_probability, color=REQUIREMENT, linestyle="--", linewidth=1.0)
+    axes.axhline(max_probability, color=section.REQUIREMENT, linestyle="--", linewidth=1.0)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: probability_text(value))
     axes.set(xlabel="margin (unit of the requirement's bound)", ylabel="probability of a margin at or below")

@@ -16,6 +16,8 @@ from marsyard.reports.traceability import Algorithm
 from marsyard.reports.verdicts import Verdict
 from marsyard.sim.cache import hide_folders
 
+#: Files of a report: the page, and its data.
+PAGE_FILE, REPORT_JSON = "report.html", "report.json"
 #: Version of the layout of `report.json`. A removed field, or a new meaning, increases the version.
 Schema = Literal[7]
 SCHEMA: Schema = 7

@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float, Int
 from marsyard.campaigns.errors import ENGINE_FAILURES
 from marsyard.reports import rates
 from marsyard.reports.explorer import ExploredRequirement
-from marsyard.reports.presentation import Cause, system_presentation, thumbnail, to_float
+from marsyard.reports.presentation import Cause, system_presentation
+from marsyard.reports.products import thumbnail, to_float
 from marsyard.reports.section import Grid, build_grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
@@ -183,7 +184,7 @@ class CaseFinder:
             for item in self._evaluated
         ]
 
-    def notable_cases(self, max_per_requirement: int) -> list[int]:
+    def worst_violations(self, max_per_requirement: int) -> list[int]:
         """Return the worst violations of each requirement, without repetition."""
         rows = [row for item in self._evaluated for row in item.violations[:max_per_requirement]]
         return list(dict.fromkeys(int(self._frame["case"].iloc[row]) for row in rows))
@@ -222,7 +223,7 @@ class CaseFinder:
         unusual = self._unusual_driver(row)
         parts = [self._describe_error(item, values, violates), "" if cause is None else cause.detail, unusual]
         sentence = "; ".join(part for part in parts if part)
-        image = thumbnail(self._run.products(case)) if case in self._run.showcases else ""
+        image = thumbnail(self._run.products(case)) if case in self._run.stored_cases else ""
         return ListedCase(
             case, violates, str(values.get("outcome", NOTHING)), f"{sentence[:1].upper()}{sentence[1:]}.", image
         )

@@ -83,7 +83,7 @@ class SamplingDesign:
         return describe_design(self.design, self.grids, nominal=self.nominal)
 
     @property
-    def no_probability(self) -> str:
+    def no_probability_reason(self) -> str:
         """Explanation why the cases allow no probability statement; empty for independent random samples."""
         if self.independent:
             return ""
@@ -98,7 +98,8 @@ class SamplingDesign:
     def with_open_end(self) -> SamplingDesign:
         """The design of a confirmation, which later confirmations extend.
 
-        All looks after the first use `SequentialTest`, also those that `--until-decided` has planned.
+        The open end changes all looks after the first, also those that `--until-decided` has planned: they use
+        `SequentialTest`, which is valid for any number of looks.
         """
         if self.max_cases is None:
             return self

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
+from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.results import SEARCH, FoundFailure
-from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.wording import NOTHING, count, number
 

@@ -37,7 +37,7 @@ class StoredRun:
     - all_cases: rows of all cases; only the columns of verdicts, outcomes, errors and axes of figures if the campaign
       has more than `MAX_FULL_CASES` cases
     - record: contents of `campaign.json`; empty if the file cannot be read
-    - showcases: numbers of the cases with stored products: first the case that the report shows, then the others in
+    - stored_cases: numbers of the cases with stored products: first the case that the report shows, then the others in
       increasing order
     - unverified: reason why the rows have no chain of hashes; empty if they were verified
     """
@@ -46,7 +46,7 @@ class StoredRun:
     frame: pd.DataFrame
     all_cases: pd.DataFrame
     record: Mapping[str, Any]
-    showcases: tuple[int, ...]
+    stored_cases: tuple[int, ...]
     unverified: str = ""
 
     @property

@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from marsyard.campaigns.json_numbers import Number
 from marsyard.reports.statistics.clusters import TerrainEvidence
-from marsyard.reports.statistics.number import Number
 from marsyard.reports.wording import count, format_fraction, percent, population_text
 
 #: Beginning of the statement of a requirement whose population the flight system cannot know.

@@ -47,16 +47,19 @@ class TerrainScenario(BaseScenario[ParametersType]):
 
     - max_stored_terrains: largest bank whose terrains can be stored on disk before the cases; each case on a larger
       bank builds its terrain in memory
+    - max_cached_grounds: number of terrains in the memory of a process, those of several campaigns or of a small bank
+      (12 MB each); 0 if the cases do not use `load_ground`
     - algorithm_table: path of the parameter table that selects the algorithms; by default the top level
     - part_keys: parameter keys that select custom parts, and the kind of each part; by default only scores
     """
 
     max_stored_terrains: int = 64
+    max_cached_grounds: int = 0
     algorithm_table: tuple[str, ...] = ()
     part_keys: Mapping[str, PartKind] = {"scores": SCORE}
 
-    def __init__(self, max_cached_grounds: int = 0) -> None:
-        self.load_ground: LoadGround = lru_cache(maxsize=max_cached_grounds)(SiteGround.from_bank)
+    def __init__(self) -> None:
+        self.load_ground: LoadGround = lru_cache(maxsize=self.max_cached_grounds)(SiteGround.from_bank)
 
     def location(self, p: ParametersType) -> BankLocation:
         """Return the terrain of the parameters; by default their table `location`."""

@@ -1,4 +1,8 @@
-"""Faults of a case, by name and size: their columns, and their injection into the detector and the images."""
+"""Faults of a case, by name and size: their columns, and their injection into the detector and the images.
+
+The parameters of each scenario derive a table of their own from `SizedFaults`, with the faults of its images and
+instruments.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,9 @@ from marsyard.sim.error_sources import DETECTOR, OPTICS
 from marsyard.sim.parameters import NonNegative, Parameters
 from marsyard.sim.sensor import DetectorParameters
 
+#: Path length for which the fault `haze` states an optical depth, m: about the height of the first image.
+HAZE_PATH_M = 2000.0
+Haze = Annotated[NonNegative, Field(le=10.0, description=f"optical depth of dusty air over {HAZE_PATH_M:g} m")]
 Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 

@@ -1,35 +1,15 @@
-"""Radiance of an image: the sun and the brightness of its light, the rendered view, and haze in dusty air."""
+"""Light of an image: the sun and the brightness of its light, and haze in dusty air."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float32
-from scipy.spatial.transform import RigidTransform
 
-from marsyard.scenarios.cameras import Optics
-from marsyard.sim.dynamics import State
 from marsyard.sim.frames import direction
-from marsyard.sim.render import Frame, Scene, Sun, process_renderer
-from marsyard.sim.render.backend import Backend
+from marsyard.sim.render import Frame, Sun
 from marsyard.sim.render.kernels.photometry import add_air_light
-from marsyard.sim.sensor import DetectorParameters, ImageMotion
+from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.terrain import Environment
-
-#: Path length for which the fault `haze` states an optical depth, m: about the height of the first image.
-HAZE_PATH_M = 2000.0
-
-
-def render_state(
-    backend: Backend, scene: Scene, optics: Optics, state: State, mounting: RigidTransform | None = None
-) -> tuple[Frame, ImageMotion]:
-    """Render the view of a camera at the body's origin, and compute the image motion during its exposure.
-
-    `mounting` rotates the camera in the body.
-    """
-    pose = state.world_from_body if mounting is None else state.world_from_body * mounting
-    frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
-    rate = state.attitude.apply(state.body_rate_rad_s)
-    return frame, ImageMotion.from_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
 
 
 def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> Float32[np.ndarray, "rows columns"]:

@@ -1,4 +1,4 @@
-"""Timeline of a case of velocity estimation: descent or field test."""
+"""Parts of the timelines that descents and the field test share: body, paths, images and velocities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes of a site for cameras: ground, visible rocks, light, and camera poses.
+"""Views of a site: scenes for cameras (ground, visible rocks, light), camera poses, and rendered images.
 
 A `SiteGround` is a terrain of the bank with its rocks, a `Viewpoint` the position and resolution of a camera;
 `site_scene` combines both into the scene for the renderer. All images near the viewpoint can use one scene, for example
@@ -15,11 +15,14 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.scenarios.cameras import Optics
 from marsyard.scenarios.horizon import hill_objects
+from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
-from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
+from marsyard.sim.render import DustySky, Frame, Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
+from marsyard.sim.render.backend import Backend
 from marsyard.sim.render.kernels.structs import MicroRelief
-from marsyard.sim.sensor import CameraDesign
+from marsyard.sim.sensor import CameraDesign, ImageMotion
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
 from marsyard.sim.terrain.microrelief import octave_heights
 from marsyard.sim.terrain.rocks.field import ROCK_ARRAYS, find_periods
@@ -136,6 +139,19 @@ class Viewpoint:
         return cls(
             east, north, height, rays.pixel_rad, float(np.arctan2(axis[0], axis[1])), half_width, float(max_distance_m)
         )
+
+
+def render_state(
+    backend: Backend, scene: Scene, optics: Optics, state: State, mounting: RigidTransform | None = None
+) -> tuple[Frame, ImageMotion]:
+    """Render the view of a camera at the body's origin, and compute the image motion during its exposure.
+
+    `mounting` rotates the camera in the body.
+    """
+    pose = state.world_from_body if mounting is None else state.world_from_body * mounting
+    frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
+    rate = state.attitude.apply(state.body_rate_rad_s)
+    return frame, ImageMotion.from_camera(optics.camera, frame.range_m, frame.world_from_body, state.velocity_m_s, rate)
 
 
 def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:

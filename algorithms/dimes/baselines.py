@@ -93,7 +93,7 @@ def find_common_square(
 
     Returns its centre (east, north), side (rectified pixels) and ground sample distance (m); None if it is too small.
     """
-    gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
+    gsd = float(second.centre[2]) * second.camera.pixel_angle_rad
     max_offset_m = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
     points_per_side = 2 * int(np.ceil(max_offset_m / (COARSE_STEP_PX * gsd))) + 1
     lattice = binning.ground_lattice(np.zeros(2), points_per_side, COARSE_STEP_PX * gsd)

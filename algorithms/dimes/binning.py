@@ -202,13 +202,6 @@ def inside_frame(
     return np.asarray(visible & in_frame & (off_nadir <= np.tan(max_off_nadir_rad)))
 
 
-def pixel_angle_rad(view: BinnedView) -> float:
-    """Mean angle of one pixel along columns and rows at the image centre."""
-    centre = (np.array(view.size) - 1) / 2.0
-    _, directions = view.camera.rays(centre + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
-    return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
-
-
 def square_lattice(half_m: float, per_side: int) -> Points2:
     """Lattice of `per_side` x `per_side` points (east, north) over a square of half side `half_m`."""
     steps = np.linspace(-half_m, half_m, per_side)

@@ -52,7 +52,7 @@ class SearchGeometry:
 
 def search_geometry(first: binning.BinnedView, second: binning.BinnedView, options: DimesOptions) -> SearchGeometry:
     """Compute the sizes of template and search window from the second view, the image interval and the options."""
-    gsd = float(second.centre[2]) * binning.pixel_angle_rad(second)
+    gsd = float(second.centre[2]) * second.camera.pixel_angle_rad
     max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
     search_px = int(np.ceil(max_displacement_m / gsd)) + options.search_margin_px
     return SearchGeometry(max_displacement_m, gsd, options.template_px, search_px)

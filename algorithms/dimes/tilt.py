@@ -6,15 +6,17 @@ by (t, t_z), the image of a point at (x, y) (position divided by the height) mov
 inclination from a velocity. The ground of a landing site is level except for its slope. Its inclination is therefore a
 measurement of the tilt.
 
-A maximum a posteriori fit to many tracks of both pairs estimates the inclination, the displacements, and errors of
-altitudes and of single attitudes. The part of the inclination that the priors assign to the attitudes corrects the
-velocity: a tilt makes part of the vertical velocity appear as horizontal velocity.
+A maximum a posteriori fit to many tracks of both pairs (first and second image, second and third image) estimates the
+inclination, the displacements, and errors of altitudes and of single attitudes. The part of the inclination that the
+priors assign to the attitudes corrects the velocity: a tilt makes part of the vertical velocity appear as horizontal
+velocity.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,7 +27,7 @@ from marsyard.algorithms.dimes import binning, overlap
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.registration import WindowSpline, register_template, spline_coefficients
 
-#: Unknowns of the fit: inclination (2), displacements (2 x 2), and corrections of altitudes (3) and attitudes (3 x 3).
+#: Unknowns of the fit; `Unknowns` names its parts.
 State = Float[np.ndarray, "18"]
 #: Distance of templates from the border of both images, pixels: range of the registration and support of its spline.
 MARGIN_PX = 4
@@ -137,13 +139,30 @@ class GroundFit:
         return _is_accepted(self.corrections)
 
 
+class Unknowns(NamedTuple):
+    """Parts of a state: inclination, horizontal displacement of each pair, corrections of each image's measurements.
+
+    Altitudes have relative corrections, attitudes rotation vectors (x, y, z).
+    """
+
+    inclination: Vector2
+    displacements_m: Float[np.ndarray, "2 2"]
+    altitudes: Vector3
+    attitudes_rad: Float[np.ndarray, "3 3"]
+
+    @classmethod
+    def unpack(cls, state: State) -> Unknowns:
+        """Return views of the parts of a state."""
+        inclination, displacements, altitudes, attitudes = np.split(state, (2, 6, 9))
+        return cls(inclination, displacements.reshape(2, 2), altitudes, attitudes.reshape(3, 3))
+
+
 def predict_matches(state: State, pair: int, tracks: GroundTracks) -> tuple[Points2, Vector3]:
     """Predict the second ground points of the tracks of a pair (0 or 1), and the displacement of the camera."""
-    heights = np.array(tracks.heights_m)
-    distances = heights * (1.0 + state[6 + pair : 8 + pair])  # from the plane, along its normal
-    rotations = state[9 + 3 * pair : 15 + 3 * pair].reshape(2, 3)
-    normal = np.array([*state[:2], 1.0]) / np.sqrt(1.0 + state[:2] @ state[:2])
-    horizontal = state[2 + 2 * pair : 4 + 2 * pair]
+    unknowns, heights, images = Unknowns.unpack(state), np.array(tracks.heights_m), slice(pair, pair + 2)
+    distances = heights * (1.0 + unknowns.altitudes[images])  # from the plane, along its normal
+    rotations, horizontal = unknowns.attitudes_rad[images], unknowns.displacements_m[pair]
+    normal = np.array([*unknowns.inclination, 1.0]) / np.sqrt(1.0 + unknowns.inclination @ unknowns.inclination)
     up = (distances[1] - distances[0] - normal[:2] @ horizontal) / normal[2]
     displacement = np.array([*horizontal, up])
     rays = _rotate(np.column_stack([tracks.first, np.full(len(tracks.first), -heights[0])]), rotations[0])
@@ -164,8 +183,9 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
     The standard deviation of the tracks is `DimesOptions.track_sd_px`, or that of the residuals (from their median) if
     it is larger. The fit is repeated without outliers. Each pair must have at least one track.
     """
-    inclination_sd = np.full(2, np.hypot(options.tilt_sd_rad, options.slope_sd_rad))
-    instrument_sd = np.repeat([options.altitude_sd, options.attitude_sd_rad], [3, 9])
+    inclination_sd = np.hypot(options.tilt_sd_rad, options.slope_sd_rad)
+    # the displacements have no prior
+    scale = np.repeat([inclination_sd, 1.0, options.altitude_sd, options.attitude_sd_rad], [2, 4, 3, 9])
 
     def track_residuals(state: State) -> list[Float[np.ndarray, "_ 2"]]:
         return [(pair.second - predict_matches(state, k, pair)[0]) / pair.gsd_m for k, pair in enumerate(pairs)]
@@ -173,13 +193,14 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
     def fit(start: State, inliers: Sequence[Bool[np.ndarray, "_"]], sd_px: float) -> State:
         def residuals(state: State) -> Vector:
             tracks = [r[kept].ravel() / sd_px for r, kept in zip(track_residuals(state), inliers, strict=True)]
-            return np.concatenate([*tracks, state[:2] / inclination_sd, state[6:] / instrument_sd])
+            prior = Unknowns.unpack(state / scale)
+            return np.concatenate([*tracks, prior.inclination, prior.altitudes, prior.attitudes_rad.ravel()])
 
-        scale = np.concatenate([inclination_sd, np.ones(4), instrument_sd])
         return np.asarray(optimize.least_squares(residuals, start, x_scale=scale, method="lm").x)
 
     start = np.zeros(18)
-    start[2:6] = np.ravel([velocity * pair.interval_s for velocity, pair in zip(velocities_m_s, pairs, strict=True)])
+    for part, velocity, pair in zip(Unknowns.unpack(start).displacements_m, velocities_m_s, pairs, strict=True):
+        part[:] = velocity * pair.interval_s
     state, inliers, sd_px = start, [np.ones(len(pair.first), dtype=bool) for pair in pairs], options.track_sd_px
     for _ in range(FITS):
         state = fit(state, inliers, sd_px)
@@ -189,7 +210,9 @@ def fit_ground(pairs: Sequence[GroundTracks], velocities_m_s: Sequence[Vector2],
         inliers = [np.hypot(*r.T) < OUTLIER_SIGMAS * sd_px for r in residuals]
     displacements = np.stack([predict_matches(state, k, pair)[1] for k, pair in enumerate(pairs)])
     counts = (int(inliers[0].sum()), int(inliers[1].sum()))
-    return GroundFit(state[:2], displacements, state[6:] / instrument_sd, counts)
+    fitted = Unknowns.unpack(state / scale)
+    corrections = np.concatenate([fitted.altitudes, fitted.attitudes_rad.ravel()])
+    return GroundFit(Unknowns.unpack(state).inclination, displacements, corrections, counts)
 
 
 def is_plausible(inclination: Vector2, options: DimesOptions) -> bool:

@@ -19,7 +19,8 @@ from marsyard.algorithms.exchange.files import (
     write_frame,
 )
 from marsyard.algorithms.exchange.forms import SITE_FORM, VELOCITY_FORM, AnswerForm, ProgramDetails, answer_time_s
-from marsyard.algorithms.exchange.process import PREFIXES, Command, ExecutableLimits, parse_command
+from marsyard.algorithms.exchange.limits import ExecutableLimits
+from marsyard.algorithms.exchange.process import PREFIXES, Command, parse_command
 from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 
 __all__ = ["EXCHANGE_VERSION", "PREFIXES", "SITE_FORM", "SITE_REQUESTS", "VELOCITY_FORM", "VELOCITY_REQUESTS"]

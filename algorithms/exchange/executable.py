@@ -23,7 +23,8 @@ from marsyard.algorithms.exchange.forms import (
     read_member,
     read_numbers,
 )
-from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command, ExecutableLimits
+from marsyard.algorithms.exchange.limits import ExecutableLimits
+from marsyard.algorithms.exchange.process import MAX_STDERR_CHARACTERS, Command
 from marsyard.algorithms.exchange.serving import KeptFolder, Session, run_once
 from marsyard.algorithms.exchange.values import encode
 from marsyard.algorithms.faults import AlgorithmError, bad_answer

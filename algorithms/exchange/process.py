@@ -19,11 +19,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Annotated
+from typing import IO
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
-
-from marsyard.algorithms.exchange.sandbox import find_problem, sandbox_words
+from marsyard.algorithms.exchange.limits import ExecutableLimits
+from marsyard.algorithms.exchange.sandbox import sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.processes import AwakeClock, descendants, end_with_parent, kill, resident_bytes
 
@@ -35,58 +34,8 @@ MAX_STDERR_CHARACTERS = 4000
 _EXIT_GRACE_S = 0.5
 #: Maximum number of bytes in one read or write of a pipe.
 _CHUNK_BYTES = 1 << 16
-#: Environment variables: number of a worker process, counted from 0, and device that a program may use.
-WORKER_NUMBER, DEVICE_VARIABLE = "MARSYARD_WORKER_NUMBER", "MARSYARD_DEVICE"
-#: Device without an accelerator.
-CPU = "cpu"
-
-
-class ExecutableLimits(BaseModel):
-    """Limits and isolation of an algorithm in a process of its own: a program, or a custom Python class.
-
-    The limits apply to one case or request; that of the files applies to all files that exist at one time.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time for an answer, s")] = 60.0
-    total_s: Annotated[
-        float, Field(gt=0.0, le=864000.0, description="wall-clock time for all answers to one case, s")
-    ] = 600.0
-    loading_s: Annotated[
-        float, Field(gt=0.0, le=86400.0, description="wall-clock time to import and construct a Python class, s")
-    ] = 300.0
-    memory_gb: Annotated[float, Field(gt=0.0, le=4096.0, description="resident memory of its process tree")] = 2.0
-    output_mb: Annotated[float, Field(gt=0.0, le=1000.0, description="size of its standard output and error")] = 1.0
-    files_mb: Annotated[float, Field(gt=0.0, le=1e6, description="size of the files in its temporary folder")] = 100.0
-    isolated: Annotated[
-        bool, Field(description="custom Python classes run in a process of their own; false: in the worker, to debug")
-    ] = True
-    devices: Annotated[
-        tuple[str, ...], Field(min_length=1, description="devices, such as cuda:0, given to the workers in turn")
-    ] = (CPU,)
-    sandbox: Annotated[
-        bool, Field(description="untrusted: without network, other processes, and files except its own (bubblewrap)")
-    ] = False
-    visible: Annotated[
-        tuple[str, ...], Field(description="further files and folders that it can read in the sandbox")
-    ] = ()
-
-    @model_validator(mode="after")
-    def _check_sandbox(self) -> ExecutableLimits:
-        if self.sandbox and (problem := find_problem()):
-            raise ValueError(f"this machine has no sandbox: {problem}")
-        if self.sandbox and set(self.devices) != {CPU}:
-            raise ValueError(f"devices are {', '.join(self.devices)}; allowed in the sandbox: {CPU}")
-        if self.sandbox and not self.isolated:
-            raise ValueError("isolated is false; allowed in the sandbox: true")
-        return self
-
-    @property
-    def device(self) -> str:
-        """Device of this worker process."""
-        number = int(os.environ.get(WORKER_NUMBER, "0"))
-        return self.devices[number % len(self.devices)]
+#: Environment variable: device that a program may use.
+DEVICE_VARIABLE = "MARSYARD_DEVICE"
 
 
 @dataclass(frozen=True)
@@ -199,8 +148,8 @@ class RunningProgram:
         self._checked_s = self._files_checked_s = 0.0
 
     @property
-    def loading_s(self) -> float:
-        """Limit of the time until the program is ready."""
+    def max_greeting_s(self) -> float:
+        """Limit of the time until the greeting line of a program with requests: that of an answer."""
         return self.limits.time_s
 
     @property

@@ -18,14 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.algorithms.exchange.files import EXCHANGE_VERSION
-from marsyard.algorithms.exchange.process import (
-    Command,
-    ExecutableLimits,
-    Output,
-    RunningProgram,
-    shorten,
-    temporary_folder,
-)
+from marsyard.algorithms.exchange.limits import ExecutableLimits
+from marsyard.algorithms.exchange.process import Command, Output, RunningProgram, shorten, temporary_folder
 from marsyard.algorithms.faults import AlgorithmError, Fault
 
 
@@ -96,7 +90,7 @@ def acquire_server(command: Command, limits: ExecutableLimits) -> Server:
         idle.child.left_s = limits.total_s
         return idle
     child = command.start(limits)
-    output = child.read_line(time_s=child.loading_s)
+    output = child.read_line(time_s=child.max_greeting_s)
     try:
         expected = {"exchange": EXCHANGE_VERSION, "ready": True}
         if parse_object(output) != expected:

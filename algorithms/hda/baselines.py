@@ -26,6 +26,7 @@ from marsyard.algorithms.hda.motion import (
     undistort,
 )
 from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.preparation import covering_camera
 from marsyard.algorithms.hda.tracking import Tracks
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.sim.camera import Cahv
@@ -145,14 +146,7 @@ def rectify_views(views: Views, second_from_first: RigidTransform) -> Rectificat
     low, high = np.floor(border_px.min(axis=0)), np.ceil(border_px.max(axis=0))
     if float((high - low).max()) > MAX_SIDE_DIAGONALS * float(np.hypot(*views[0].camera.size)):
         return None
-    camera = Cahv.from_axes(
-        (focal, focal),
-        (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1),
-        axis=(0.0, 0.0, 1.0),
-        right=(1.0, 0.0, 0.0),
-        image_centre=(-float(low[0]), -float(low[1])),
-    )
-    return Rectification(rectified_from_first, baseline, camera)
+    return Rectification(rectified_from_first, baseline, covering_camera(focal, low, high))
 
 
 def match_disparities(

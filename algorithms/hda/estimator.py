@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
-from marsyard.algorithms.hda import hazards
+from marsyard.algorithms.hda import footprints, hazards
 from marsyard.algorithms.hda.details import HdaDetails, MappedGround
 from marsyard.algorithms.hda.motion import (
     CameraMotion,
@@ -97,7 +97,7 @@ def find_site(
     details = details.end_stage(matches=matches)
     if len(matches.points) < options.min_points:
         return _report_failure(SiteOutcome.NO_STRUCTURE, scene, details)
-    resolution = hazards.map_resolution(motion, scene.views[0].focal_px, options)
+    resolution = footprints.map_resolution(motion, scene.views[0].focal_px, options)
     ground = map_ground(scene, matches.points, resolution, options)
     if ground is None:
         return _report_failure(SiteOutcome.NO_STRUCTURE, scene, details)
@@ -210,7 +210,7 @@ def world_from_surface(world_from_camera: Rotation, surface_from_first: Rotation
 
 
 def map_ground(
-    scene: LandingScene, points_camera: Points3, resolution: hazards.Resolution, options: HdaOptions
+    scene: LandingScene, points_camera: Points3, resolution: footprints.Resolution, options: HdaOptions
 ) -> MappedGround | None:
     """Compute the maps of `points_camera` (first camera's frame), and the site; None if the points cover no area."""
     first = scene.views[0]
@@ -223,7 +223,7 @@ def map_ground(
     elevation = hazards.fill_small_holes(elevation, options.narrowest_hazard * options.max_roughness_m)
     maps = hazards.hazard_maps(elevation, options)
     if options.check_footprints:
-        maps = replace(maps, safety=hazards.classify_footprints(elevation, resolution, options))
+        maps = replace(maps, safety=footprints.classify_footprints(elevation, resolution, options))
     to_world = world_from_surface(first.world_from_camera.rotation, to_surface)
     apriori = to_world.inv().apply(scene.apriori_site_world - first.world_from_camera.translation)
     apriori_cell = elevation.cells(apriori[:2])

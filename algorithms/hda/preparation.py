@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.hda.motion import CameraView, Views
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.sim.camera import Cahv
@@ -62,13 +63,7 @@ def resample_second(views: Views, second_from_first: RigidTransform, depth_m: fl
     centre = 0.5 * (border_px.min(axis=0) + border_px.max(axis=0))
     low = np.floor(np.maximum(border_px.min(axis=0), centre - limits))
     high = np.ceil(np.minimum(border_px.max(axis=0), centre + limits))
-    camera = Cahv.from_axes(
-        (focal, focal),
-        (int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1),
-        axis=(0.0, 0.0, 1.0),
-        right=(1.0, 0.0, 0.0),
-        image_centre=(-float(low[0]), -float(low[1])),
-    )
+    camera = covering_camera(focal, low, high)
     grid_rays = camera.rays(camera.pixel_grid())[1].reshape(-1, 3)
     # pixels behind the second camera are outside its image
     pixels = np.nan_to_num(second.camera.project(second_from_first.rotation.apply(grid_rays))[0], nan=-10.0)
@@ -77,6 +72,14 @@ def resample_second(views: Views, second_from_first: RigidTransform, depth_m: fl
     counts = cv2.remap(second.counts.astype(np.float32), grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     resampled = CameraView(np.rint(counts).astype(np.uint16), camera, second.world_from_camera)
     return (first, resampled), rigid(Rotation.identity(), origin)
+
+
+def covering_camera(focal_px: float, low_px: Vector2, high_px: Vector2) -> Cahv:
+    """Return the camera along z whose image covers the whole pixels `low_px` to `high_px` from its optical axis."""
+    columns, rows = (int(side) + 1 for side in high_px - low_px)
+    centre = (-float(low_px[0]), -float(low_px[1]))
+    axis, right = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+    return Cahv.from_axes((focal_px, focal_px), (columns, rows), axis=axis, right=right, image_centre=centre)
 
 
 def filter_view(view: CameraView) -> CameraView:

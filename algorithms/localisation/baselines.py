@@ -124,7 +124,7 @@ class FeatureEstimator(InertialEstimator):
             np.eye(3),
             None,
             # two pixels of the binned image, in normalised coordinates
-            reprojectionError=2.0 * image.pixel_angle_rad * image.camera.size[0] / scaled.camera.size[0],
+            reprojectionError=2.0 * image.camera.pixel_angle_rad * image.camera.size[0] / scaled.camera.size[0],
             iterationsCount=2000,
             confidence=0.999,
         )

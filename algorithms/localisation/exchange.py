@@ -12,14 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.exchange.files import (
-    EXCHANGE_VERSION,
-    check_version,
-    open_json,
-    read_detector_image,
-    write_image,
-    write_json,
-)
+from marsyard.algorithms.exchange import files
 from marsyard.algorithms.exchange.forms import AnswerForm
 from marsyard.algorithms.exchange.streams import StreamForm
 from marsyard.algorithms.exchange.values import decode, encode
@@ -38,17 +31,17 @@ _MAX_NORM_ERROR = 1e-3
 def write_map(folder: Path, map_product: MapProduct) -> None:
     """Write a map into an existing folder: two rasters of little-endian float32, row by row, and a table."""
     rows, columns = map_product.appearance.shape
-    content: dict[str, Any] = {"exchange": EXCHANGE_VERSION, "rows": rows, "columns": columns}
+    content: dict[str, Any] = {"exchange": files.EXCHANGE_VERSION, "rows": rows, "columns": columns}
     for name, raster in (("appearance", map_product.appearance), ("elevation", map_product.elevation_m)):
         content[name] = f"{name}.f32"
         raster.astype("<f4").tofile(folder / content[name])
-    write_json(folder / MAP_FILE, {**content, **encode(map_product, ["appearance", "elevation_m"])})
+    files.write_json(folder / MAP_FILE, {**content, **encode(map_product, ["appearance", "elevation_m"])})
 
 
 def read_map(folder: Path) -> MapProduct:
     """Read the map that `write_map` wrote. Raises ValueError if it is missing or has another version."""
-    with open_json(folder / MAP_FILE, "map") as content:
-        check_version(content)
+    with files.open_json(folder / MAP_FILE, "map") as content:
+        files.check_version(content)
         shape = content["rows"], content["columns"]
         appearance, elevation = (
             np.fromfile(folder / content[name], dtype="<f4").reshape(shape).astype(np.float32)
@@ -91,8 +84,8 @@ POSITION_FORM = AnswerForm(
 #: Exchange of position estimators.
 POSITION_STREAM = StreamForm(
     POSITION_FORM,
-    write_image,
-    read_detector_image,
+    files.write_image,
+    files.read_detector_image,
     _encode_start,
     lambda request: (decode(InitialState, request["initial"]), read_map(Path(request["map"]))),
 )

@@ -21,15 +21,9 @@ from jaxtyping import Bool, Float, Float32, Int
 from marsyard.algorithms.arrays import Points2, Points3, Vector, Vector3
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak
 from marsyard.algorithms.image.registration import MARGIN_PX, RegistrationLimits, register_template
+from marsyard.algorithms.localisation import map_sampling
 from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.landmarks import Landmarks, visible_landmarks
-from marsyard.algorithms.localisation.map_sampling import (
-    elevation_at,
-    inside_map,
-    intersect_elevation,
-    map_pixels,
-    sample_averages,
-)
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.pose_fit import PoseFit, fit_pose, pose_jacobian
 from marsyard.algorithms.localisation.posed_image import PosedImage, binning_factor
@@ -101,14 +95,14 @@ def match_landmarks(
 
     - position_sd_m: standard deviations of the estimated position (east, north, up), metres
     """
-    ground_m = elevation_at(map_product, image.position_m[:2])
+    ground_m = map_sampling.elevation_at(map_product, image.position_m[:2])
     height_m = max(float(image.world_camera.c[2]) - ground_m, 1.0)
     factor = binning_factor(image, height_m, map_product.pixel_m)
     # a prior with the state's attitude would remove the landmarks that show its error; the filter tests the attitude
     prior_sd = np.append(np.maximum(position_sd_m, 1e-3), np.full(3, options.fit_attitude_sd_rad))
     sigma_px = np.hypot(
-        float(np.max(position_sd_m)) / (height_m * image.pixel_angle_rad),
-        options.attitude_sd_rad / image.pixel_angle_rad,
+        float(np.max(position_sd_m)) / (height_m * image.camera.pixel_angle_rad),
+        options.attitude_sd_rad / image.camera.pixel_angle_rad,
     )
     half_px = options.search_sigmas_fine * float(sigma_px) / factor
     corrected, extra_binning = image, _acquisition_factor(image, factor, half_px, options)
@@ -155,7 +149,7 @@ def _search_landmarks(
     """
     working = image.bin(factor)
     camera = working.world_camera
-    ground_m = elevation_at(map_product, image.position_m[:2])
+    ground_m = map_sampling.elevation_at(map_product, image.position_m[:2])
     margin_px = options.template_px // 2 + half + 1
     count = options.acquisition_landmarks if acquisition else options.max_landmarks
     indices, predicted = visible_landmarks(
@@ -185,16 +179,16 @@ def render_templates(
     steps = np.arange(side, dtype=np.float64)
     pixels = corners[:, np.newaxis, np.newaxis, :] + np.stack(np.meshgrid(steps, steps), axis=-1)
     origins, directions = camera.rays(pixels.reshape(len(corners), side * side, 2))
-    ground = intersect_elevation(map_product, origins, directions, elevations_m[:, np.newaxis])
-    inside = np.asarray(np.all(inside_map(map_product, ground), axis=1))
-    positions = map_pixels(map_product, ground).reshape(len(corners), side, side, 2)
+    ground = map_sampling.intersect_elevation(map_product, origins, directions, elevations_m[:, np.newaxis])
+    inside = np.asarray(np.all(map_sampling.inside_map(map_product, ground), axis=1))
+    positions = map_sampling.map_pixels(map_product, ground).reshape(len(corners), side, side, 2)
     appearance = map_product.appearance
     if len(corners):
         cells = np.abs(np.diff(positions, axis=2)).max(axis=-1)
         # large cells: the map is averaged over a box, of odd side; the four samples average over the rest of the cell
         size = 2 * int(float(np.median(cells)) / 4.0) + 1
         appearance = cv2.blur(appearance, (size, size)) if size > 1 else appearance
-    return sample_averages(appearance, positions), inside
+    return map_sampling.sample_averages(appearance, positions), inside
 
 
 def _match_template(

@@ -99,7 +99,7 @@ def visible_landmarks(
     - border_px: minimum distance from the image's border
     """
     height = max(float(camera.c[2]) - ground_m, 1.0)
-    half_angle = min(image.pixel_angle_rad * 0.5 * max(camera.size), max_off_nadir_rad)
+    half_angle = min(image.camera.pixel_angle_rad * 0.5 * max(camera.size), max_off_nadir_rad)
     area = (2.0 * height * np.tan(half_angle)) ** 2
     level = int(np.floor(0.5 * np.log2(max(area / (_CANDIDATES_PER_LANDMARK * count * landmarks.cell_m**2), 1.0))))
     offsets = landmarks.points_m - camera.c

@@ -50,13 +50,6 @@ class PosedImage:
         """Camera model in the world frame at the estimated pose."""
         return self.camera.transform(rigid(self.world_from_body, self.position_m))
 
-    @property
-    def pixel_angle_rad(self) -> float:
-        """Mean angle of one pixel along columns and rows at the image centre."""
-        centre = (np.array(self.camera.size) - 1) / 2.0
-        _, directions = self.camera.rays(centre + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
-        return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
-
     def bin(self, factor: int) -> PosedImage:
         """Average blocks of `factor` x `factor` pixels; raises ValueError if the factor does not divide the size."""
         if factor == 1:
@@ -76,7 +69,7 @@ def binning_factor(image: PosedImage, height_m: float, ground_pixel_m: float) ->
 
     - height_m: height of the camera above the ground
     """
-    ratio = ground_pixel_m / (height_m * image.pixel_angle_rad)
+    ratio = ground_pixel_m / (height_m * image.camera.pixel_angle_rad)
     exponent = max(round(float(np.log2(ratio))), 0)
     while exponent and (image.camera.size[0] % 2**exponent or image.camera.size[1] % 2**exponent):
         exponent -= 1

@@ -13,7 +13,8 @@ from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
-from marsyard.scenarios.landing.images import measure, take_images
+from marsyard.scenarios.landing.images import take_images
+from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import map_row, motion_row
 from marsyard.scenarios.landing.world import LandingWorld

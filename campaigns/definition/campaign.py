@@ -14,17 +14,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
-from marsyard.campaigns.sampling.design import (
-    MIN_DRAW,
-    build_stratified_design,
-    compute_grid_quantiles,
-    correlate_uniform,
-    locate_case,
-)
+from marsyard.campaigns.sampling.correlation import MIN_DRAW, correlate_groups
+from marsyard.campaigns.sampling.design import build_stratified_design, compute_grid_quantiles, locate_case
 from marsyard.campaigns.sampling.dispersion_base import Dispersion
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixed, GridDispersion, Normal
 from marsyard.campaigns.sampling.study_points import StudyPoint, transform_to_uniform
@@ -120,14 +114,11 @@ class Campaign:
         position = locate_case(definition.design, definition.blocks, definition.grid_size, case)
         if position is None:
             return None
-        grid_point, first_case, case_count, index = position
         if definition.design.kind == "random":
             streams = self.streams(case)
             uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
-            numbers = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
-            for group in definition.correlations:
-                correlated = correlate_uniform(np.array([numbers[path] for path in group.parameters]), group.factor)
-                numbers.update(zip(group.parameters, correlated.tolist(), strict=True))
+            independent = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
+            numbers = correlate_groups(independent, definition.correlations)
         else:
             groups = tuple(
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
@@ -137,14 +128,14 @@ class Campaign:
                 definition.design.kind,
                 definition.seed,
                 definition.name,
-                first_case,
-                case_count,
+                position.first_case,
+                position.case_count,
                 tuple(map(stream_name, paths)),
                 groups,
             )
-            numbers = dict(zip(paths, design[index].tolist(), strict=True))
+            numbers = dict(zip(paths, design[position.design_index].tolist(), strict=True))
         grids = {path: len(grid.points) for path, grid in definition.grids.items()}
-        return {**numbers, **compute_grid_quantiles(grids, grid_point)}
+        return {**numbers, **compute_grid_quantiles(grids, position.grid_point)}
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:

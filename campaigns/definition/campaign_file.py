@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_a
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from marsyard.campaigns.errors import DefinitionError, Problem, suggest_similar
-from marsyard.campaigns.sampling.design import Correlation, Design
+from marsyard.campaigns.sampling.correlation import Correlation
+from marsyard.campaigns.sampling.design import Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, GridDispersion, Normal
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters, list_alternatives, list_models

@@ -11,19 +11,13 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from marsyard.campaigns.definition import campaign_file
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.campaign_file import (
-    CampaignDefinition,
-    Key,
-    key_text,
-    read_tables,
-    validation_problems,
-)
 from marsyard.campaigns.definition.checks import find_campaign_problems
 from marsyard.campaigns.definition.identity import find_scenario
 from marsyard.campaigns.definition.requirements import fill_requirements
 from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
-from marsyard.campaigns.sampling.design import MATRICES
+from marsyard.campaigns.sampling.correlation import MATRICES
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.systems import UnknownScenarioError, catalogue, scenario
 
@@ -69,7 +63,7 @@ def load_campaign(
     Raises DefinitionError with all problems: file (or option), key and allowed values.
     """
     path = find_campaign(name_or_path)
-    tables = read_tables(path)
+    tables = campaign_file.read_tables(path)
     options_by_key: dict[tuple[str, ...], str] = {}
     command = ["marsyard", "run", name_or_path]
     for override in overrides:
@@ -151,8 +145,10 @@ def replace_algorithms(campaign: Campaign, algorithms: Sequence[str]) -> Campaig
     try:
         parameters = selected.parameters_type.model_validate(values).model_dump(mode="json", round_trip=True)
     except ValidationError as error:
-        found = validation_problems(error, selected.parameters_type)
-        raise DefinitionError([Problem(source, key_text(("parameters", *key)), text) for key, text in found]) from error
+        found = campaign_file.validation_problems(error, selected.parameters_type)
+        raise DefinitionError(
+            [Problem(source, campaign_file.key_text(("parameters", *key)), text) for key, text in found]
+        ) from error
     dispersions = {path: item for path, item in definition.dispersions.items() if path not in paths}
     changed = definition.model_copy(update={"parameters": parameters, "dispersions": dispersions})
     return replace(campaign, definition=changed)
@@ -216,7 +212,7 @@ def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tu
     """Create a campaign from the tables of a file; missing parameters have default values."""
     problems: list[Problem] = []
 
-    def add_problems(new_problems: Iterable[tuple[Key, str]], prefix: Key = ()) -> None:
+    def add_problems(new_problems: Iterable[tuple[campaign_file.Key, str]], prefix: campaign_file.Key = ()) -> None:
         """Add problems at keys; their location is the file, or the command-line option that sets the key."""
         for key, message in new_problems:
             key, location = (*prefix, *key), source
@@ -225,20 +221,20 @@ def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tu
                 if common_length and key[:common_length] == path[:common_length]:
                     location = option
                     break
-            problems.append(Problem(location, key_text(key), message))
+            problems.append(Problem(location, campaign_file.key_text(key), message))
 
-    def validate(model: type[Model], tables: Mapping[str, Any], prefix: Key = ()) -> Model | None:
+    def validate(model: type[Model], tables: Mapping[str, Any], prefix: campaign_file.Key = ()) -> Model | None:
         try:
             return model.model_validate(tables)
         except ValidationError as error:
-            add_problems(validation_problems(error, model), prefix)
+            add_problems(campaign_file.validation_problems(error, model), prefix)
             return None
 
     tables, requirement_problems = fill_requirements(tables)
     add_problems(requirement_problems)
     if problems:
         raise DefinitionError(problems)
-    definition, selected_scenario, parameters = validate(CampaignDefinition, tables), None, None
+    definition, selected_scenario, parameters = validate(campaign_file.CampaignDefinition, tables), None, None
     try:
         if isinstance(name := tables.get("scenario"), str) and name:
             selected_scenario = scenario(name)

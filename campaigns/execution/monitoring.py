@@ -21,7 +21,7 @@ from typing import Any
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from marsyard.algorithms.exchange.process import WORKER_NUMBER
+from marsyard.algorithms.exchange.limits import WORKER_NUMBER
 from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.algorithms.processes import kill as kill_processes
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError

@@ -16,10 +16,10 @@ from typing import Any
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.lock import create_folder
 from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.products import CASES_FOLDER
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store, readable_store
+from marsyard.campaigns.store.temporary_files import create_folder
 from marsyard.sim.files import report_damage
 
 #: State of a campaign folder in which all cases of a shard have rows, and its key in the record.

@@ -8,14 +8,14 @@ a case (noise of the instruments, for example) have no coordinates; a point sele
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from scipy.special import ndtr
 
-from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW, Correlation, correlate_uniform
+from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW, Correlation, correlate_groups
 from marsyard.sim.streams import Blend
 
 #: Column of stored rows that contains the point of the case, as text.
@@ -61,11 +61,5 @@ def transform_to_uniform(
     coordinates: Sequence[float], paths: Sequence[str], correlations: Sequence[Correlation]
 ) -> dict[str, float]:
     """Transform independent standard normal numbers to the uniform numbers of the dispersions `paths`."""
-    uniform: Mapping[str, float] = dict(
-        zip(paths, np.clip(ndtr(np.asarray(coordinates, dtype=np.float64)), MIN_DRAW, MAX_DRAW).tolist(), strict=True)
-    )
-    numbers = dict(uniform)
-    for group in correlations:
-        correlated = correlate_uniform(np.array([uniform[path] for path in group.parameters]), group.factor)
-        numbers.update(zip(group.parameters, correlated.tolist(), strict=True))
-    return numbers
+    uniform = np.clip(ndtr(np.asarray(coordinates, dtype=np.float64)), MIN_DRAW, MAX_DRAW)
+    return correlate_groups(dict(zip(paths, uniform.tolist(), strict=True)), correlations)

@@ -1,4 +1,4 @@
-"""Lock of a campaign's folder, with a heartbeat for file systems without locks, and abandoned temporary files.
+"""Lock of a campaign's folder, with a heartbeat for file systems without locks.
 
 The kernel releases its lock when the process ends. File systems of clusters can be mounted without locks, or with locks
 that other machines do not see. Therefore, the process that uses a folder also updates the time of the lock file.
@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import glob
-import hashlib
 import os
 import platform
 import re
-import shutil
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.store.temporary_files import machine_id, process_exists, remove_abandoned
 
 #: Lock file of the process that uses the folder.
 _LOCK_FILE = "campaign.lock"
@@ -30,8 +28,6 @@ _LOCK_FILE = "campaign.lock"
 _BEAT_S, _SILENCE_S = 2.0, 15.0
 #: Errors of `flock` if another process has the lock; other errors mean that the file system has no locks.
 _LOCKED = (errno.EWOULDBLOCK, errno.EACCES)
-#: End of the names of temporary files, with machine and process.
-_PARTIAL = re.compile(r"\.([0-9a-f]{8})-(\d+)\.partial$")
 
 
 @contextmanager
@@ -52,7 +48,7 @@ def folder_lock(directory: Path) -> Iterator[None]:
         # a full disk is ignored, since the text is only used by other processes
         with suppress(OSError):
             file.truncate(0)
-            file.write(f"process {os.getpid()} on {platform.node()} ({_machine()})\n")
+            file.write(f"process {os.getpid()} on {platform.node()} ({machine_id()})\n")
             file.flush()
         _remove_abandoned(directory)
         ended = threading.Event()
@@ -99,7 +95,7 @@ def _read_holder(file: TextIO) -> str:
 def _is_dead(holder: str) -> bool:
     """Whether a holder was a process of this machine that has ended."""
     match = re.fullmatch(r"process (\d+) on .* \(([0-9a-f]+)\)", holder)
-    return match is not None and match[2] == _machine() and not _exists(int(match[1]))
+    return match is not None and match[2] == machine_id() and not process_exists(int(match[1]))
 
 
 def _has_heartbeat(path: Path) -> bool:
@@ -124,74 +120,6 @@ def _beat(path: Path, ended: threading.Event) -> None:
             os.utime(path)
 
 
-def _machine() -> str:
-    """Return a hash of this machine and its numbering of processes, which differs between containers."""
-    names = [platform.node()]
-    with suppress(OSError):
-        names.append(str(Path("/proc/self/ns/pid").readlink()))
-    with suppress(OSError):
-        names.append(Path("/proc/sys/kernel/random/boot_id").read_text())
-    return hashlib.sha256("\n".join(names).encode()).hexdigest()[:8]
-
-
-def _exists(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True
-
-
-def partial_suffix() -> str:
-    """Return the end of the names of this process's temporary files."""
-    return f".{_machine()}-{os.getpid()}.partial"
-
-
-@contextmanager
-def replace_file(path: Path) -> Iterator[Path]:
-    """Yield the name of a temporary file that replaces `path` at the end; after an exception it is removed."""
-    partial = path.with_name(path.name + partial_suffix())
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
 def _remove_abandoned(directory: Path) -> None:
     """Remove temporary files and folders of dead processes of this machine from a campaign's folder and its cases."""
     remove_abandoned((*directory.glob("*.partial"), *directory.glob("cases/*/*.partial")))
-
-
-def remove_abandoned(paths: Iterable[Path]) -> None:
-    """Remove those temporary files and folders (`partial_suffix`) whose processes, on this machine, have ended."""
-    for path in paths:
-        match = _PARTIAL.search(path.name)
-        if match is not None and match[1] == _machine() and not _exists(int(match[2])):
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
-
-
-@contextmanager
-def create_folder(directory: Path) -> Iterator[Path]:
-    """Yield a temporary folder that becomes the folder `directory` at the end; after an exception it is removed.
-
-    Raises StoreError if `directory` exists and is not empty, or cannot be written.
-    """
-    directory = directory.resolve()
-    temporary = directory.with_name(f".{directory.name}{partial_suffix()}")
-    with report_write_errors(directory):
-        directory.parent.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(directory.parent.glob(f".{glob.escape(directory.name)}.*.partial"))
-        temporary.mkdir()
-    try:
-        yield temporary
-        try:
-            temporary.rename(directory)  # succeeds if `directory` is missing or empty
-        except OSError as error:
-            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
-                raise StoreError(f"{directory} cannot be written: {error.strerror or error}") from error
-            raise StoreError(f"{directory} is not an empty folder; choose another folder with --out") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)

@@ -21,13 +21,15 @@ import numpy as np
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import StoreError, report_write_errors
-from marsyard.campaigns.store.lock import partial_suffix
+from marsyard.campaigns.store.temporary_files import partial_suffix
 from marsyard.sim.files import report_damage
 
 #: Key of a table in `products.json` that refers to an array by its name in `products.npz`.
 _ARRAY_KEY = "__array__"
 #: File of the products with references in place of their arrays.
 _OUTLINE_FILE = "products.json"
+#: Types of arrays that are written as images.
+_PIXEL_TYPES = (np.uint8, np.uint16)
 
 
 @dataclass(frozen=True)
@@ -141,6 +143,45 @@ def load_products(directory: Path) -> dict[str, Any]:
     with report_damage(directory, StoreError, "contains no products of a case"):
         files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
         return unpack_products(PackedProducts(*files))
+
+
+def write_stages(directory: Path, products: Mapping[str, Any]) -> int:
+    """Write each product to a separate file, numbered in the order of the stages; return the number of files.
+
+    An image (8 or 16 bits, 1 or 3 channels) is written as PNG with unchanged counts, other arrays as `.npy`, and other
+    values as JSON. A mapping or list with arrays is written as a folder. Raises StoreError.
+    """
+    with report_write_errors(directory):
+        return _write_products(directory, products)
+
+
+def _write_products(directory: Path, products: Mapping[str, Any]) -> int:
+    directory.mkdir(parents=True, exist_ok=True)
+    files = 0
+    for position, (name, value) in enumerate(products.items(), start=1):
+        path = directory / f"{position:02d}-{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}"
+        if isinstance(value, list) and any(isinstance(item, np.ndarray | Mapping) for item in value):
+            value = {str(number): item for number, item in enumerate(value)}
+        if isinstance(value, Mapping) and _contains_arrays(value):
+            files += _write_products(path, value)
+            continue
+        files += 1
+        if not isinstance(value, np.ndarray):
+            path.with_name(f"{path.name}.json").write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+        elif (value.ndim == 2 or value.shape[2:] == (3,)) and value.dtype in _PIXEL_TYPES and min(value.shape[:2]) > 1:
+            import cv2
+
+            cv2.imwrite(f"{path}.png", value)
+        else:
+            np.save(path.with_name(f"{path.name}.npy"), value, allow_pickle=False)
+    return files
+
+
+def _contains_arrays(value: Any) -> bool:
+    """Whether a product is an array, or contains arrays at any depth."""
+    if isinstance(value, Mapping):
+        return any(_contains_arrays(item) for item in value.values())
+    return isinstance(value, np.ndarray) or (isinstance(value, list) and any(_contains_arrays(item) for item in value))
 
 
 #: Folder of the stored products, with a folder for each case.

@@ -18,8 +18,8 @@ from typing import Any
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
-from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
+from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.sim.cache import hide_folders
 from marsyard.sim.kernel_cache import processor_features
 

@@ -25,7 +25,7 @@ from typing import Any
 
 from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError
 from marsyard.campaigns.store import chain
-from marsyard.campaigns.store.lock import replace_file
+from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.scenarios.columns import LEADING, TRAILING
 from marsyard.scenarios.interface import Scalar
 

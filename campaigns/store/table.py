@@ -20,10 +20,10 @@ import numpy as np
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.lock import replace_file
 from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.record import stored_definition
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, ROWS_FILE, TRAILING_COLUMNS, Row, RowStore, readable_store
+from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.sim.files import report_damage
 
 TABLE_FILE = "cases.parquet"

@@ -24,7 +24,7 @@ from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
-from marsyard.campaigns.sampling.design import MAX_DRAW, MIN_DRAW
+from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.studies.contributions import MIN_COMMON, compute_budget
 from marsyard.campaigns.studies.results import BUDGET, BudgetParameters, BudgetResult, SobolIndex

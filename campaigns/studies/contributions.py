@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.studies.bootstrap import studentized_intervals
-from marsyard.campaigns.studies.study_record import Number
 from marsyard.sim.error_sources import ErrorSource
 
 #: Minimum number of base cases whose error has a value in all variants.

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import t as student_t
 
-from marsyard.campaigns.studies.study_record import Number
+from marsyard.campaigns.json_numbers import Number
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from marsyard.campaigns.definition.margins import compute_margin, describe_margi
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
+from marsyard.campaigns.studies import subset
 from marsyard.campaigns.studies.importance import fit_density
 from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult, Replicate
@@ -42,15 +43,6 @@ from marsyard.campaigns.studies.runner import (
     continue_study,
     find_requirement,
     start_study,
-)
-from marsyard.campaigns.studies.subset import (
-    LEVEL_FRACTION,
-    NEW_STREAM,
-    Evaluated,
-    Proposals,
-    SubsetResult,
-    new_blend,
-    subset_simulation,
 )
 from marsyard.sim.streams import Streams
 
@@ -121,7 +113,7 @@ class _RareStudy:
     def run(self, observer: ProgressObserver) -> RareResult:
         """Run random cases, replicates and importance sampling; estimate the probability and decide."""
         parameters = self._parameters
-        results: list[SubsetResult] = []
+        results: list[subset.SubsetResult] = []
         violation_weights: list[float] | None = None
         shortfall = ""
         for block, (replicates, random_cases) in enumerate(
@@ -155,8 +147,8 @@ class _RareStudy:
     def _max_cases(self, replicates: int) -> int:
         """Compute the number of cases of replicates that reach their least likely level."""
         min_probability = MIN_PROBABILITY_FRACTION * self._parameters.max_probability
-        levels = math.ceil(math.log(min_probability) / math.log(LEVEL_FRACTION))
-        return math.ceil(replicates * self._parameters.samples * (1.0 + (1.0 - LEVEL_FRACTION) * levels))
+        levels = math.ceil(math.log(min_probability) / math.log(subset.LEVEL_FRACTION))
+        return math.ceil(replicates * self._parameters.samples * (1.0 + (1.0 - subset.LEVEL_FRACTION) * levels))
 
     def _run_random(self, block: int, count: int) -> None:
         """Run independent cases of the nominal distribution."""
@@ -165,23 +157,23 @@ class _RareStudy:
         for first in range(0, count, _RANDOM_BATCH):
             batch = coordinates[first : first + _RANDOM_BATCH]
             self._reserved_cases -= len(batch)
-            list(self._evaluate([Proposals(batch, [new_blend()] * len(batch), is_independent=True)]))
+            list(self._evaluate([subset.Proposals(batch, [subset.new_blend()] * len(batch), is_independent=True)]))
 
-    def _run_replicates(self, numbers: range) -> list[SubsetResult]:
+    def _run_replicates(self, numbers: range) -> list[subset.SubsetResult]:
         """Run subset simulations in parallel: the next cases of all of them are evaluated together."""
         parameters, dimension = self._parameters, len(self._campaign.drawn_paths)
         min_probability = MIN_PROBABILITY_FRACTION * parameters.max_probability
         simulations = {
-            number: subset_simulation(
+            number: subset.subset_simulation(
                 dimension, parameters.samples, min_probability, self._generator(f"subset simulation {number}")
             )
             for number in numbers
         }
         pending = {number: next(simulation) for number, simulation in simulations.items()}
-        results: dict[int, SubsetResult] = {}
+        results: dict[int, subset.SubsetResult] = {}
         while pending:
             evaluated_groups = self._evaluate(list(pending.values()))
-            next_pending: dict[int, Proposals] = {}
+            next_pending: dict[int, subset.Proposals] = {}
             for number, evaluated in zip(pending, evaluated_groups, strict=True):
                 try:
                     next_pending[number] = simulations[number].send(evaluated)
@@ -190,7 +182,7 @@ class _RareStudy:
             pending = next_pending
         return [results[number] for number in numbers]
 
-    def _run_importance(self, results: Sequence[SubsetResult]) -> list[float]:
+    def _run_importance(self, results: Sequence[subset.SubsetResult]) -> list[float]:
         """Sample cases around the violations of the replicates, from a fitted density.
 
         Returns the importance weight of each case that is a violation, and 0 for each other case. The mean of these
@@ -205,12 +197,12 @@ class _RareStudy:
         violation_weights: list[float] = []
         for first in range(0, case_count, _IMPORTANCE_BATCH):
             batch = slice(first, first + _IMPORTANCE_BATCH)
-            proposal = Proposals(coordinates[batch], [new_blend()] * len(coordinates[batch]))
+            proposal = subset.Proposals(coordinates[batch], [subset.new_blend()] * len(coordinates[batch]))
             (evaluated,) = self._evaluate([proposal])
             violation_weights += (weights[batch] * (evaluated.margins < 0.0)).tolist()
         return violation_weights
 
-    def _evaluate(self, proposals: Sequence[Proposals]) -> Iterator[Evaluated]:
+    def _evaluate(self, proposals: Sequence[subset.Proposals]) -> Iterator[subset.Evaluated]:
         """Evaluate several groups of proposed cases together; yield the margins of each group."""
         coordinates = np.concatenate([group.coordinates for group in proposals])
         blends = [blend for group in proposals for blend in group.blends]
@@ -223,7 +215,7 @@ class _RareStudy:
         margins = np.array([compute_margin(row, self._requirement) for row in rows])
         self._violations += int(np.sum(margins < 0.0))
         numbered = [
-            tuple((case if number == NEW_STREAM else number, weight) for number, weight in blend)
+            tuple((case if number == subset.NEW_STREAM else number, weight) for number, weight in blend)
             for case, blend in enumerate(blends, start=first)
         ]
         ends = np.cumsum([len(group.blends) for group in proposals])
@@ -233,14 +225,14 @@ class _RareStudy:
                 self._terrains += [
                     None if (name := row.get("terrain")) is None else str(name) for row in rows[start:end]
                 ]
-            yield Evaluated(numbered[start:end], margins[start:end])
+            yield subset.Evaluated(numbered[start:end], margins[start:end])
 
     def _generator(self, name: str) -> np.random.Generator:
         """Create a random generator of the study, which does not depend on the cases."""
         return Streams(self._campaign.definition.seed, self._campaign.definition.name, 0).generator(name)
 
     def _decide(
-        self, results: Sequence[SubsetResult], violation_weights: Sequence[float] | None, shortfall: str
+        self, results: Sequence[subset.SubsetResult], violation_weights: Sequence[float] | None, shortfall: str
     ) -> Decision:
         """Decide the verdict; a PASS becomes INSUFFICIENT on a seed from which the algorithm's options were set."""
         parameters, evidence = self._parameters, self._runner.evidence

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.studies.contributions import MIN_COMMON, Budget
 from marsyard.campaigns.studies.rare_decision import Decision, RareVerdict
-from marsyard.campaigns.studies.study_record import Number, StudyKind
+from marsyard.campaigns.studies.study_record import StudyKind
 
 #: Subset simulation alone, or with importance sampling around the violations that it found.
 METHODS = ("subset", "importance")

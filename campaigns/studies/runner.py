@@ -21,6 +21,7 @@ from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
 from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.running.compilation import compile_kernels
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.running.progress import ProgressObserver
@@ -37,7 +38,7 @@ from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
 from marsyard.campaigns.studies.results import BudgetResult, RareResult, SearchResult
-from marsyard.campaigns.studies.study_record import STUDY_KEY, StudyKind, convert_to_json
+from marsyard.campaigns.studies.study_record import STUDY_KEY, StudyKind
 from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.sim.streams import Blend
 

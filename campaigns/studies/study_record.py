@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
-from pydantic import BeforeValidator, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
 
 #: Key of a study's parameters and results in the record of its folder.
 STUDY_KEY = "study"
-#: Number in a result; null in the record, if it is not finite, is read as NaN.
-Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 
 Parameters = TypeVar("Parameters")
 Result = TypeVar("Result")
@@ -72,12 +69,3 @@ def read_study(directory: Path) -> dict[str, Any] | None:
     """Read the parameters and results of a study from the record of its folder; None for an ordinary campaign."""
     study = record.read(directory).get(STUDY_KEY)
     return study if isinstance(study, dict) else None
-
-
-def convert_to_json(value: Any) -> Any:
-    """Convert nested tables and lists to JSON types; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {name: convert_to_json(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [convert_to_json(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

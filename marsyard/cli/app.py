@@ -24,11 +24,11 @@ from marsyard.cli.export import dataset, export, score
 from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
 from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
+from marsyard.cli.render import gallery, render
 from marsyard.cli.replay import replay
 from marsyard.cli.report import compare, confirmations, dashboard, nightly, report
 from marsyard.cli.studies import budget, rare, search
 from marsyard.cli.terrain import app as terrain
-from marsyard.cli.terrain import gallery, render
 
 
 class _FlagsWithoutType:

@@ -31,7 +31,7 @@ def evidence_limits(campaign: Campaign) -> list[str]:
     if not requirements:
         return []
     if not design.independent:
-        return [design.no_probability]
+        return [design.no_probability_reason]
     strictest = max(requirements, key=lambda item: minimum_sample_size(item.probability, item.confidence))
     min_cases, cases = minimum_sample_size(strictest.probability, strictest.confidence), definition.total_cases
     requirement_text = f"{format_fraction(strictest.probability)} at {format_fraction(strictest.confidence)} confidence"

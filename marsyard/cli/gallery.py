@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from jaxtyping import Bool, Float64, UInt8
 
-from marsyard.reports.campaign import page_environment
+from marsyard.reports.page_environment import page_environment
 from marsyard.scenarios.terrain_files import SUFFIXES, is_terrain_file, load_site
 from marsyard.site_images import ImageRequest, render_images
 

@@ -17,10 +17,10 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.progress import ProgressObserver
+from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.cli.nightly_plan import Plan, PlannedCampaign, PlannedCheck, hash_definition
 from marsyard.cli.options import Exit
 from marsyard.cli.outcome import evaluate_and_store
-from marsyard.reports.campaign import write_atomic
 from marsyard.reports.comparison import list_metrics
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.history import Change, History, NightCampaign, format_night_page, list_comparisons

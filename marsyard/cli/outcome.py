@@ -22,17 +22,18 @@ from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.lock import is_locked, replace_file
+from marsyard.campaigns.store.lock import is_locked
 from marsyard.campaigns.store.products import case_directory, save_packed
 from marsyard.campaigns.store.record import stored_definition
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
+from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.cli.options import Exit
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
+from marsyard.reports.gallery import gallery_candidates
 from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.presentation import notable_cases
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Verdict
@@ -147,13 +148,13 @@ def print_page(directory: Path) -> Path:
     return target
 
 
-def rerun_notable_cases(directory: Path) -> None:
-    """Rerun notable cases without stored products and store their products; report rows that differ.
+def rerun_gallery_cases(directory: Path) -> None:
+    """Rerun the candidates of the gallery without stored products and store their products; report rows that differ.
 
     Raises CampaignError if the campaign's scenario or an algorithm cannot be imported.
     """
     run = read_run(directory)
-    missing = [case for case in notable_cases(run) if case not in run.showcases]
+    missing = [case for case in gallery_candidates(run) if case not in run.stored_cases]
     if not missing:
         return
     definition = stored_definition(directory)

@@ -52,8 +52,8 @@ def replay(
         replace_files,
         unpack_products,
         write_packed,
+        write_stages,
     )
-    from marsyard.cli.showing import write_stages
     from marsyard.reports.presentation import write_case_figures
 
     exports = _requested_exports(rerun, glb, rosbag)

@@ -10,24 +10,15 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from marsyard.cli import options
 from marsyard.cli.execution import make_executor, stop_on_signals
-from marsyard.cli.options import (
-    CONFIRMATIONS,
-    DirectoryArgument,
-    Exit,
-    JobsOption,
-    JsonOption,
-    TrustOption,
-    console,
-    handle_user_errors,
-)
 
 LOOPBACK_ADDRESS = "127.0.0.1"
 
 
-@handle_user_errors
+@options.handle_user_errors
 def report(
-    directory: DirectoryArgument,
+    directory: options.DirectoryArgument,
     requirements: Annotated[
         Path | None, Option(metavar="FILE", help="Requirements file to use instead of those of the campaign.")
     ] = None,
@@ -39,7 +30,7 @@ def report(
             "--gallery", help="First run some cases again to store their images: largest errors, no answer, and random."
         ),
     ] = False,
-    trust: TrustOption = False,
+    trust: options.TrustOption = False,
 ) -> None:
     """Evaluate the stored results of a campaign, and write its report; an interrupted campaign is also accepted.
 
@@ -54,14 +45,14 @@ def report(
     if trust:
         adopt(directory)
     if gallery:
-        outcome.rerun_notable_cases(directory)
+        outcome.rerun_gallery_cases(directory)
     applicable_requirements = None
     if requirements is not None:
         name = str(record.read(directory)["name"])
         applicable_requirements = select_applicable(read_requirements(requirements), name)
         if not applicable_requirements:
             raise CampaignError(f"{requirements}: no requirement lists the campaign '{name}' in its campaigns")
-    status = outcome.evaluate_and_report(directory, console(), applicable_requirements)
+    status = outcome.evaluate_and_report(directory, options.console(), applicable_requirements)
     if csv:
         typer.echo(f"rows: {outcome.write_csv(directory)}")
     if pdf:
@@ -69,11 +60,11 @@ def report(
     raise typer.Exit(status)
 
 
-@handle_user_errors
+@options.handle_user_errors
 def confirmations(
-    file: Annotated[Path, Argument(metavar="FILE", help="Record of the confirmations.")] = CONFIRMATIONS,
+    file: Annotated[Path, Argument(metavar="FILE", help="Record of the confirmations.")] = options.CONFIRMATIONS,
     create: Annotated[bool, Option("--create", help="Create an empty record, to be committed to git.")] = False,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """List confirmations: evaluations of frozen algorithms on unseen seeds (`run --confirm`), with their results."""
     from marsyard.campaigns.errors import CampaignError
@@ -91,15 +82,15 @@ def confirmations(
     if as_json:
         typer.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
     else:
-        console().print(confirmations_table(entries))
+        options.console().print(confirmations_table(entries))
         typer.echo(f"record: {find_registration_problem(file) or 'registered'}")
 
 
-@handle_user_errors
+@options.handle_user_errors
 def compare(
     first: Annotated[Path, Argument(metavar="DIR", help="Folder of the first campaign.")],
     second: Annotated[Path, Argument(metavar="DIR", help="Folder of the second campaign.")],
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compare two stored campaigns: success rate, availability and errors, with significance tests of the differences.
 
@@ -120,7 +111,7 @@ def compare(
         data = {"first": names[0], "second": names[1], "paired": is_paired, "same_terrains": have_same_terrains}
         typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(differences)}, indent=2))
         return
-    out = console()
+    out = options.console()
     out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
     terrains = "the same terrains: comparison by terrain" if have_same_terrains else "different terrains: unpaired"
@@ -128,7 +119,7 @@ def compare(
     out.print(f"Cases: {method}. p: two-sided, corrected for the number of metrics (Holm).", soft_wrap=True)
 
 
-@handle_user_errors
+@options.handle_user_errors
 def dashboard(
     directories: Annotated[
         list[Path], Argument(metavar="DIR...", help="Folders of campaigns, or their parent folders.")
@@ -173,7 +164,7 @@ def dashboard(
             typer.echo("stopped")
 
 
-@handle_user_errors
+@options.handle_user_errors
 def nightly(
     plan: Annotated[
         Path | None, Argument(metavar="PLAN.toml", help="Plan of campaigns; by default the built-in plan.")
@@ -181,7 +172,7 @@ def nightly(
     out: Annotated[Path, Option(metavar="DIR", help="Folder of history, runs, nightly.md and dashboard.")] = Path(
         "nightly"
     ),
-    jobs: JobsOption = None,
+    jobs: options.JobsOption = None,
 ) -> None:
     """Run the planned campaigns, compare each metric with previous nightly runs, write nightly.md and the dashboard.
 
@@ -205,7 +196,7 @@ def nightly(
         # write a first page in case this run is killed
         nightly_run.write_page(history, night, out, ())
         try:
-            with stop_on_signals(), campaign_progress(console(stderr=True)) as observer:
+            with stop_on_signals(), campaign_progress(options.console(stderr=True)) as observer:
                 run = nightly_run.NightlyRun(history, night, out, executor, plan_definition)
                 for entry in plan_definition.campaigns:
                     nightly_run.run_scheduled_campaign(run, entry, path.parent, observer)
@@ -214,10 +205,15 @@ def nightly(
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
             nightly_run.publish_page(history, night, out, ())
-            raise typer.Exit(Exit.INTERRUPTED) from None
+            raise typer.Exit(options.Exit.INTERRUPTED) from None
         changes = find_changes(list_comparisons(history, night))
         history.finish(night, FINISHED, changes)
         nightly_run.publish_page(history, night, out, changes)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}
-    statuses |= {int(Exit.FAILED) for change in changes if change.is_regression}
-    raise typer.Exit(next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET))
+    statuses |= {int(options.Exit.FAILED) for change in changes if change.is_regression}
+    raise typer.Exit(
+        next(
+            (status for status in (options.Exit.FAILED, options.Exit.INSUFFICIENT) if status in statuses),
+            options.Exit.MET,
+        )
+    )

@@ -29,7 +29,7 @@ def run_until_decided(
     definition = campaign.definition
     design = read_sampling_design(definition.model_dump(mode="json"))
     if not design.independent:
-        raise CampaignError(f"--until-decided: {design.no_probability}")
+        raise CampaignError(f"--until-decided: {design.no_probability_reason}")
     if all(requirement.decide_by == ESTIMATE for requirement in definition.requirements):
         raise CampaignError("--until-decided: the campaign has no requirement with a confidence level")
     max_cases = definition.total_cases

@@ -14,9 +14,10 @@ from typing import Any
 from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store.record import reject_links
-from marsyard.reports.campaign import REPORT_JSON, is_own_report, write_evaluation
+from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.report_file import CampaignReport, read_report
+from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
+from marsyard.reports.signature import is_own_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import format_tested_algorithms
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict

@@ -16,11 +16,14 @@ from typing import Any
 from markupsafe import Markup
 
 from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
-from marsyard.reports.campaign import PAGE_FILE, REPORT_JSON, VERIFICATION_FILE, page_environment, write_atomic
+from marsyard.campaigns.store.temporary_files import write_atomic
+from marsyard.reports.campaign import VERIFICATION_FILE
 from marsyard.reports.dashboard import entries as stored
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
 from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.page import embed_json, script_hash
+from marsyard.reports.page_environment import page_environment
+from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON
 from marsyard.reports.stored import read_cases
 from marsyard.reports.traceability import requirement_evidence, verification_csv
 from marsyard.reports.wording import NOTHING, percent

@@ -19,7 +19,7 @@ from matplotlib.transforms import Bbox
 from scipy import ndimage
 
 from marsyard.reports.images import DASHED, Image, Mark, Panel, draw_images, draw_panels, square
-from marsyard.reports.presentation import Products, check_shape, numeric_product, to_matrix
+from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
 
 #: Colours of templates, matches and search windows, and of the overlap and the zero-phase point.
 TEMPLATE, MATCH, WINDOW, HINT = "#ff4b3e", "#35d46b", "#4aa3ff", "#f2e35a"

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports.hda import products as stages
 from marsyard.reports.images import Mark, Panel, draw_panels, show_image
-from marsyard.reports.presentation import Products
+from marsyard.reports.products import Products
 from marsyard.reports.section import MUTED, in_page_style
 
 Product = TypeVar("Product")

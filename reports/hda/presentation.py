@@ -19,17 +19,8 @@ from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
 from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
 from marsyard.reports.images import draw_images
-from marsyard.reports.presentation import (
-    CaseFigure,
-    CaseKind,
-    CaseView,
-    Cause,
-    Presentation,
-    Products,
-    TableRow,
-    is_true,
-    to_float,
-)
+from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
+from marsyard.reports.products import Products, is_true, to_float
 from marsyard.reports.section import Section, Subject, create_section
 from marsyard.reports.wording import note_text, number
 

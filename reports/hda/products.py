@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from marsyard.reports.presentation import check_shape, numeric_product, read_arrays, to_matrix
+from marsyard.reports.products import check_shape, numeric_product, read_arrays, to_matrix
 
 MapArray = Float[np.ndarray, "rows columns"]
 Pixels = Float[np.ndarray, "n 2"]

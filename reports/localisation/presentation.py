@@ -27,19 +27,8 @@ from marsyard.reports.blocks import (
     scatter_block,
 )
 from marsyard.reports.images import Mark, Panel, draw_panels
-from marsyard.reports.presentation import (
-    CaseFigure,
-    CaseKind,
-    CaseView,
-    Cause,
-    Presentation,
-    Products,
-    TableRow,
-    check_shape,
-    read_arrays,
-    to_float,
-    to_matrix,
-)
+from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
+from marsyard.reports.products import Products, check_shape, read_arrays, to_float, to_matrix
 from marsyard.reports.rates import CaseFraction, fraction_of
 from marsyard.reports.section import (
     INK,

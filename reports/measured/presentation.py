@@ -12,31 +12,12 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from marsyard.reports import section
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
 from marsyard.reports.images import Image, show_image
-from marsyard.reports.presentation import (
-    CaseFigure,
-    CaseKind,
-    CaseView,
-    Presentation,
-    Products,
-    TableRow,
-    check_shape,
-    to_matrix,
-)
-from marsyard.reports.section import (
-    MARKERS,
-    MUTED,
-    SERIES,
-    Block,
-    Grid,
-    Section,
-    Subject,
-    in_page_style,
-    new_axes,
-    svg_figure,
-)
+from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Presentation, TableRow
+from marsyard.reports.products import Products, check_shape, to_matrix
 from marsyard.reports.wording import NOTHING, label, number, numbers
 
 MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"
@@ -65,7 +46,7 @@ _INERTIAL_NOTE = (
 _SAMPLING_NOTE = "Measured cases are not random samples, so these numbers are not probabilities."
 
 
-def agreement_section(subject: Subject) -> Section | None:
+def agreement_section(subject: section.Subject) -> section.Section | None:
     """Create the section on the agreement of images and poses; None if the cases are not measured cases."""
     frame = subject.frame
     if "measured_case" not in frame or MEDIAN not in frame:
@@ -86,30 +67,32 @@ def agreement_section(subject: Subject) -> Section | None:
     svg_figures = []
     if np.count_nonzero(np.isfinite(medians)) >= _MIN_CASES:
         svg_figures.append(
-            svg_figure(residual_figure(frame), "agreement", "Residuals of each case, in the order of their median.")
+            section.svg_figure(
+                residual_figure(frame), "agreement", "Residuals of each case, in the order of their median."
+            )
         )
     note = (_INERTIAL_NOTE if "inertial_difference_m_s" in names else "") + _SAMPLING_NOTE
-    grid = Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
+    grid = section.Grid(head, rows, max(0, len(frame) - _MAX_ROWS))
     data = {
         "cases": len(frame),
         "unmatched": int(np.count_nonzero(~np.isfinite(medians))),
         "median_of_medians_px": float(np.nanmedian(medians)) if np.isfinite(medians).any() else None,
         "differences": {name: float(np.nanmedian(numbers(frame, name))) for name in names if name in differences},
     }
-    blocks = [Block(text=_AGREEMENT_TEXT, figures=svg_figures, grid=grid, note=note)]
-    return Section("agreement", "Agreement", "Images compared with measured poses", blocks, data)
+    blocks = [section.Block(text=_AGREEMENT_TEXT, figures=svg_figures, grid=grid, note=note)]
+    return section.Section("agreement", "Agreement", "Images compared with measured poses", blocks, data)
 
 
-@in_page_style
+@section.in_page_style
 def residual_figure(frame: pd.DataFrame) -> Figure:
     """Draw the median and the 90 % quantile of the residuals of each case, ordered by the median."""
     medians, percentile_90 = numbers(frame, MEDIAN), numbers(frame, PERCENTILE_90)
     finite = np.flatnonzero(np.isfinite(medians))
     order = finite[np.argsort(medians[finite], kind="stable")]
     x = np.arange(1, order.size + 1)
-    figure, axes = new_axes(6.2, 3.2)
+    figure, axes = section.new_axes(6.2, 3.2)
     for values, name, index in ((percentile_90, "90 %", 1), (medians, "median", 0)):
-        axes.plot(x, values[order], MARKERS[index], color=SERIES[index], markersize=5.0, label=name)
+        axes.plot(x, values[order], section.MARKERS[index], color=section.SERIES[index], markersize=5.0, label=name)
     axes.set(xlabel="case, in order of the median", ylabel="residual (px)", ylim=(0.0, None))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(0.5, order.size + 0.5)
@@ -215,7 +198,7 @@ def read_matched_pairs(products: Products) -> list[MatchedPair]:
     return pairs
 
 
-@in_page_style
+@section.in_page_style
 def draw_pair(pair: MatchedPair) -> Figure:
     """Draw both images with the matches, coloured by their residuals, and the offsets."""
     figure = Figure(figsize=(12.0, 5.2), layout="constrained")
@@ -236,7 +219,7 @@ def draw_pair(pair: MatchedPair) -> Figure:
     axis_limit = max(_MAX_COLOUR_PX, 1.5 * float(np.quantile(finite, 0.9))) if finite.size else _MAX_COLOUR_PX
     scatter.scatter(*offsets.T, linewidths=0.0, **style)
     for line in (scatter.axhline, scatter.axvline):
-        line(0.0, color=MUTED, linewidth=0.8)
+        line(0.0, color=section.MUTED, linewidth=0.8)
     # rows increase downwards
     scatter.set(xlim=(-axis_limit, axis_limit), ylim=(axis_limit, -axis_limit), aspect="equal")
     scatter.set(xlabel="to the right (px)", ylabel="down (px)")

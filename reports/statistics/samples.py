@@ -31,8 +31,8 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy import stats
 
+from marsyard.campaigns.json_numbers import Number
 from marsyard.reports.statistics.clusters import count_sizes, event_scores, max_statistic, number_terrains
-from marsyard.reports.statistics.number import Number
 from marsyard.reports.statistics.proportions import Interval, check_confidence
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.

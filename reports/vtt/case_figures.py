@@ -23,7 +23,7 @@ from matplotlib.patches import Circle
 from scipy import ndimage
 
 from marsyard.reports.images import Image, Mark, Panel, box, draw_panels, square
-from marsyard.reports.presentation import Products, check_shape, numeric_product, to_matrix
+from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
 from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style
 
 Point = Float[np.ndarray, "2"]

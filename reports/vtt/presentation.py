@@ -7,17 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.algorithms.vtt.arm_target import HandOffOutcome
-from marsyard.reports.presentation import (
-    CaseFigure,
-    CaseKind,
-    CaseView,
-    Cause,
-    Presentation,
-    Products,
-    TableRow,
-    is_true,
-    to_float,
-)
+from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
+from marsyard.reports.products import Products, is_true, to_float
 from marsyard.reports.vtt import sections
 from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, read_rover_path, read_stops
 from marsyard.reports.vtt.goal import goal_section

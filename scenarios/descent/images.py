@@ -11,10 +11,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.cameras import Optics, add_calibration_error
 from marsyard.scenarios.cameras import camera_optics as shared_optics
+from marsyard.scenarios.case_faults import HAZE_PATH_M
 from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters, draw_clouds
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.heat_shield import HeatShield
-from marsyard.scenarios.radiance import HAZE_PATH_M, add_haze, render_state
+from marsyard.scenarios.radiance import add_haze
+from marsyard.scenarios.views import render_state
 from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.render import Frame

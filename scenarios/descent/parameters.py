@@ -10,7 +10,7 @@ from pydantic import Field, Tag, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.scenarios.case_faults import SizedFaults
+from marsyard.scenarios.case_faults import Haze, SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
 from marsyard.scenarios.meshes import MeshParameters
@@ -64,7 +64,7 @@ class DescentFaults(SizedFaults):
     cloud_cover: Annotated[
         NonNegative, CLOUDS, Field(le=0.9, description="fraction of the ground in cloud shadows")
     ] = 0.0
-    haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
+    haze: Haze = 0.0
     dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on the whole terrain")] = 0.0
     cable_bursts: Annotated[NonNegative, DETECTOR, Field(le=1e4, description="mean interference bursts per image")] = (
         0.0

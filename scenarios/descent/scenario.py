@@ -18,6 +18,7 @@ from marsyard.scenarios.cameras import Optics
 from marsyard.scenarios.case_evaluation import Score, evaluate_case
 from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
 from marsyard.scenarios.condition_columns import contrast_columns, hash_images, image_columns
+from marsyard.scenarios.descent import score
 from marsyard.scenarios.descent.flight import (
     DescentFlight,
     create_flight,
@@ -29,13 +30,6 @@ from marsyard.scenarios.descent.images import camera_optics, take_exposures
 from marsyard.scenarios.descent.measurement import DescentInstruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
-from marsyard.scenarios.descent.score import (
-    Images,
-    compute_touchdown,
-    conditions,
-    instrument_errors,
-    propagate_to_firing,
-)
 from marsyard.scenarios.descent.timeline import descent_timeline
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample
@@ -104,9 +98,9 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         descent = Descent.simulate(p, streams)
         shared = {
             **descent.overlap,
-            **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
+            **score.conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
             **contrast_columns(descent.images[0], p.detector),
-            **instrument_errors(descent.world, descent.states, descent.measurements),
+            **score.instrument_errors(descent.world, descent.states, descent.measurements),
             **descent.flight.row,
             **image_columns(p.render.backend, hash_images(descent.images)),
         }
@@ -138,7 +132,7 @@ class Descent:
     flight: DescentFlight
     instruments: DescentInstruments
     states: Sequence[State]
-    images: Images
+    images: score.Images
     measurements: DescentMeasurements
     overlap: Mapping[str, Scalar]
 
@@ -179,9 +173,11 @@ def _score_answer(descent: Descent, estimate: VelocityEstimate | None) -> Score:
     p, state_at_firing, measurements = descent.p, descent.at_firing, descent.measurements
     velocity = None if estimate is None else estimate.velocity_m_s
     truth = descent.truth((estimate and estimate.span_s) or measurements.last_interval_s)
-    propagated = propagate_to_firing(estimate, descent.instruments, state_at_firing.time_s, gravity_m_s2(p))
+    propagated = score.propagate_to_firing(estimate, descent.instruments, state_at_firing.time_s, gravity_m_s2(p))
     available_s, firing_truth = state_at_firing.time_s - descent.states[-1].time_s, state_at_firing.velocity_m_s[:2]
-    landing = compute_touchdown(p.landing, firing_truth, propagated, available_s, descent.streams.generator("landing"))
+    landing = score.compute_touchdown(
+        p.landing, firing_truth, propagated, available_s, descent.streams.generator("landing")
+    )
     row = {
         **velocity_row("velocity", velocity, truth),
         **consistency_row(estimate, truth),

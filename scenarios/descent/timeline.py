@@ -1,4 +1,4 @@
-"""Timeline of a descent."""
+"""Timeline of a descent, for its figure in the report and the exports of `marsyard replay`."""
 
 from __future__ import annotations
 

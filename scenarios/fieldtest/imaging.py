@@ -18,8 +18,8 @@ from jaxtyping import Float64, UInt16
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.cameras import camera_optics, draw_calibrated
 from marsyard.scenarios.fieldtest.parameters import CAMERA, FieldTestParameters, RunParameters
-from marsyard.scenarios.radiance import add_haze, render_state, sunlight_ratio
-from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene
+from marsyard.scenarios.radiance import add_haze, sunlight_ratio
+from marsyard.scenarios.views import SiteGround, Viewpoint, render_state, site_scene
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.dynamics.helicopter import HelicopterFlight

@@ -14,15 +14,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.base import LoadGround
+from marsyard.scenarios.fieldtest import imaging
 from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory, add_thermal_drift, solve_attitude
-from marsyard.scenarios.fieldtest.imaging import (
-    FlownRun,
-    RunKey,
-    build_start_scene,
-    field_camera,
-    run_ground,
-    take_image,
-)
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters
 from marsyard.scenarios.fieldtest.targets import Sightings, Targets, detect_targets, project_targets
 from marsyard.scenarios.fieldtest.triples import ImageMeasurements, Triple, draw_triples
@@ -59,7 +52,7 @@ class FieldRun:
     - triples: triples of the run, one per case
     """
 
-    flown: FlownRun
+    flown: imaging.FlownRun
     truth: Motion
     images: ImageMeasurements
     attitudes: Rotation
@@ -86,10 +79,10 @@ def simulate_elevation_model(
     return RegularGridInterpolator((x, y), ground + error)
 
 
-def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> FieldRun:
+def simulate_run(key: imaging.RunKey, load_ground: LoadGround = SiteGround.from_bank) -> FieldRun:
     """Simulate and process a run; the result depends only on the key."""
     p, run, generator = key.field_test, key.parameters, key.generator
-    ground = run_ground(key, load_ground)
+    ground = imaging.run_ground(key, load_ground)
     surface = ground.surface
     # flight line with random position and azimuth; heights refer to the mean ground below it
     rng = generator("flight")
@@ -101,7 +94,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     clouds = None
     if run.clouds is not None:
         clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
-    flown = FlownRun(key, clouds, flight)
+    flown = imaging.FlownRun(key, clouds, flight)
     interval = p.images.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
@@ -133,7 +126,7 @@ def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) ->
     )
 
 
-def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
+def _estimate_attitudes(run: imaging.FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
     p, flight, generator = run.key.field_test, run.flight, run.key.generator
     targets = Targets.draw(p.targets, ground.surface, flight.origin_m[:2], generator("targets"))
@@ -145,7 +138,7 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
         if p.targets.sightings == "rendered":
             centroids = render_and_detect_targets(run, ground, targets, times, fixes)
         else:
-            true_camera = p.detector.delivered_camera(field_camera())
+            true_camera = p.detector.delivered_camera(imaging.field_camera())
             centroids = project_targets(targets, true_camera, flight.motion(times), p.targets.centroid_px, noise)
         sightings.append(Sightings.from_centroids(targets, camera, tags, fixes, centroids))
         if (count := len(sightings[-1].times_s)) < _MIN_SIGHTINGS:
@@ -164,7 +157,7 @@ def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gp
 
 
 def render_and_detect_targets(
-    run: FlownRun,
+    run: imaging.FlownRun,
     ground: SiteGround,
     targets: Targets,
     times_s: Float64[np.ndarray, "images"],
@@ -172,7 +165,7 @@ def render_and_detect_targets(
 ) -> list[Float64[np.ndarray, "targets 2"]]:
     """Render the images of a pass over the targets and detect the targets in them; see `detect_targets`."""
     p, key = run.key.field_test, run.key
-    scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
+    scene = imaging.build_start_scene(run, ground, p.helicopter.fly_over_m)
     objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
     # more rays at edges than for rocks, because a side of a target is 2 pixels; at the targets, mesh lines are at most
     # one terrain sample apart, because coarser ground would hide some of the targets
@@ -184,6 +177,6 @@ def render_and_detect_targets(
     prior = Rotation.from_rotvec(prior_error) * Rotation.from_euler("z", 0.5 * np.pi - run.flight.azimuth_rad)
     centroids = []
     for time, position in zip(times_s.tolist(), gps_m, strict=True):
-        image, _ = take_image(run, scene, ground, run.flight.state(time), detector, noise)
+        image, _ = imaging.take_image(run, scene, ground, run.flight.state(time), detector, noise)
         centroids.append(detect_targets(image, targets, camera, position, prior, np.radians(p.targets.prior_deg)))
     return centroids

@@ -15,16 +15,10 @@ from jaxtyping import Float64, UInt16
 from pydantic import BaseModel
 
 from marsyard.algorithms.interface import VelocityEstimate
+from marsyard.scenarios import condition_columns
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.condition_columns import (
-    attitude_rate_deg_s,
-    hash_images,
-    image_columns,
-    off_nadir_deg,
-    sun_columns,
-)
 from marsyard.scenarios.fieldtest.imaging import FlownRun, RunKey, build_start_scene, run_ground, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import FieldRun, simulate_run
@@ -43,8 +37,8 @@ from marsyard.sim.terrain import Surface, TerrainBank
 
 #: Spacing of the grid on which cloud transmittance is evaluated, pixels.
 CLOUD_GRID_PX = 32
-#: Cache sizes of grounds, runs and scenes: large enough for all runs of the paper, because the cases alternate runs.
-_CACHED_GROUNDS, _CACHED_RUNS, _CACHED_SCENES = 3, 16, 5
+#: Cache sizes of runs and scenes: large enough for all runs of the paper, because the cases alternate runs.
+_CACHED_RUNS, _CACHED_SCENES = 16, 5
 
 
 @dataclass(frozen=True)
@@ -62,9 +56,10 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
     name = "fieldtest"
     parameters_type = FieldTestParameters
     task = VELOCITY
+    max_cached_grounds = 3
 
     def __init__(self) -> None:
-        super().__init__(_CACHED_GROUNDS)
+        super().__init__()
         self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(lambda key: simulate_run(key, self.load_ground))
         self._start_scene = lru_cache(maxsize=_CACHED_SCENES)(
             lambda key: build_start_scene(self._simulate_run(key).flown, run_ground(key, self.load_ground))
@@ -109,7 +104,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
             **_conditions(p, case, measurements, ground.surface),
             **{f"cloud_transmittance_{n}": float(np.nanmean(field)) for n, field in enumerate(transmittances, start=1)},
             **{f"cloud_change_{pair}": float(np.nanmean(change)) for pair, change in enumerate(changes, start=1)},
-            **image_columns(p.backend, hash_images(images)),
+            **condition_columns.image_columns(p.backend, condition_columns.hash_images(images)),
         }
 
         def evaluate(algorithm: str) -> AlgorithmRun[VelocityEstimate]:
@@ -209,7 +204,7 @@ def _conditions(
         "terrain": p.site_names.index(run.flown.parameters.site),
         "location_east_m": float(case.states[1].position_m[0]),
         "location_north_m": float(case.states[1].position_m[1]),
-        **sun_columns(measurements.sun_direction),
+        **condition_columns.sun_columns(measurements.sun_direction),
         "horizontal_speed_m_s": float(np.hypot(*case.states[1].velocity_m_s[:2])),
     }
     errors = []
@@ -220,14 +215,14 @@ def _conditions(
         row[f"pass_{number}"] = int(run.images.pass_number[indices[number - 1]])
         row[f"altitude_{number}_m"] = float(true_altitude)
         row[f"altitude_error_{number}_m"] = altitude.altitude_m - float(true_altitude)
-        row[f"off_nadir_{number}_deg"] = off_nadir_deg(state)
-        row[f"attitude_rate_{number}_deg_s"] = attitude_rate_deg_s(state)
+        row[f"off_nadir_{number}_deg"] = condition_columns.off_nadir_deg(state)
+        row[f"attitude_rate_{number}_deg_s"] = condition_columns.attitude_rate_deg_s(state)
         row[f"attitude_error_{number}_deg"] = float(np.degrees(np.linalg.norm(errors[-1])))
     for pair in (1, 2):
         row[f"attitude_change_{pair}_deg"] = float(np.degrees(np.linalg.norm(errors[pair] - errors[pair - 1])))
         row[f"interval_{pair}_s"] = abs(case.states[pair].time_s - case.states[pair - 1].time_s)
-    row["off_nadir_max_deg"] = max(off_nadir_deg(state) for state in case.states)
-    row["attitude_rate_max_deg_s"] = max(attitude_rate_deg_s(state) for state in case.states)
+    row["off_nadir_max_deg"] = max(condition_columns.off_nadir_deg(state) for state in case.states)
+    row["attitude_rate_max_deg_s"] = max(condition_columns.attitude_rate_deg_s(state) for state in case.states)
     return row
 
 

@@ -1,4 +1,4 @@
-"""Timeline of a triple of the field test."""
+"""Timeline of a triple of the field test, for its figure in the report and the exports of `marsyard replay`."""
 
 from __future__ import annotations
 

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from marsyard.algorithms.exchange.forms import read_member
-from marsyard.algorithms.exchange.process import Command, ExecutableLimits, RunningProgram, temporary_folder
+from marsyard.algorithms.exchange.limits import ExecutableLimits
+from marsyard.algorithms.exchange.process import Command, RunningProgram, temporary_folder
 from marsyard.algorithms.exchange.serving import acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
 from marsyard.algorithms.processes import children, processor_time_s
@@ -44,8 +45,8 @@ class PythonProgram(RunningProgram):
         )
 
     @property
-    def loading_s(self) -> float:
-        """See `RunningProgram`."""
+    def max_greeting_s(self) -> float:
+        """Limit of the time to import and construct the class."""
         return self.limits.loading_s
 
     def find_algorithm(self) -> int:

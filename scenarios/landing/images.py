@@ -1,4 +1,4 @@
-"""Images of a landing case and the other measurements of its algorithm."""
+"""Images of a landing case."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float64, UInt16
 
-from marsyard.scenarios.cameras import Optics, draw_calibrated
+from marsyard.scenarios.cameras import Optics
 from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.scenarios.meshes import add_meshes
-from marsyard.scenarios.radiance import render_state
-from marsyard.scenarios.views import Viewpoint, site_scene
-from marsyard.sim.measurements import DetectorImage, LandingMeasurements
+from marsyard.scenarios.views import Viewpoint, render_state, site_scene
+from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.render import Frame
 from marsyard.sim.sensor import Detector, auto_expose
-from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
 
 
@@ -81,25 +79,3 @@ def take_images(
         for image, state in zip(delivered_images, flight.states, strict=True)
     )
     return Pair((first, second), (frames[0], frames[1]))
-
-
-def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, streams: Streams) -> LandingMeasurements:
-    """Simulate the measurements of a case.
-
-    The a-priori site is the point on the first optical axis at the measured range, or at the commanded height if there
-    is no range.
-    """
-    unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-    reading = unit.readings(np.zeros(1), np.array([pair.range_along_m(unit.axis)]), streams.generator("laser noise"))
-    slant = float(add_range_faults(p.faults, reading.values, p.height_m)[0])
-    calibrated = draw_calibrated(p.optics, p.calibration, streams.generator("camera calibration"))
-    camera = p.detector.delivered_camera(calibrated)
-    first, second = (replace(image, camera=camera) for image in pair.images)
-    camera_to_site_m = (slant if np.isfinite(slant) else p.height_m) * camera.a
-    return LandingMeasurements(
-        images=(first, second),
-        poses=flight.poses,
-        slant_range_m=slant,
-        up_body=flight.up_body,
-        apriori_site_world=np.asarray(flight.poses[0].world_from_body.apply(camera_to_site_m)),
-    )

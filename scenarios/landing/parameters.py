@@ -294,5 +294,5 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
 
     @property
     def preset(self) -> Site:
-        """The site."""
+        """The site with the dust of the case."""
         return site(self.site).with_dust(self.dust_opacity)

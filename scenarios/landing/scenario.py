@@ -16,22 +16,12 @@ from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
+from marsyard.scenarios.landing import score
 from marsyard.scenarios.landing.ground_truth import RenderedFlight
-from marsyard.scenarios.landing.images import measure
+from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.score import (
-    conditions,
-    landing_row,
-    map_row,
-    motion_row,
-    outcome_row,
-    products,
-    simulate_touchdown,
-    site_row,
-    times_row,
-)
 from marsyard.scenarios.landing.timeline import landing_timeline
-from marsyard.scenarios.landing.world import MAX_GROUNDS
+from marsyard.scenarios.landing.touchdown import simulate_touchdown
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding
 from marsyard.sim.streams import Streams
@@ -43,9 +33,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     name = "landing"
     parameters_type = LandingScenarioParameters
     task = LANDING
-
-    def __init__(self) -> None:
-        super().__init__(MAX_GROUNDS)
+    max_cached_grounds = 4
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[ImageSample]:
         """Yield the two delivered images of a case with the ground truth of their pixels."""
@@ -70,23 +58,23 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         flight, truth = case.flight, case.truth
         measurements = measure(p, flight, case.pair, streams)
         provenance = image_columns(p.render.backend, hash_images(case.pair.counts))
-        shared = {**conditions(case, measurements), **provenance}
+        shared = {**score.conditions(case, measurements), **provenance}
 
         def run(algorithm: str) -> AlgorithmRun[SiteEstimate]:
             return run_on_measurements(partial(p.make, algorithm, streams.case), check_site, measurements)
 
-        def score(algorithm: str, runs: Runs[SiteEstimate]) -> Score:
+        def score_answer(algorithm: str, runs: Runs[SiteEstimate]) -> Score:
             # without an answer the helicopter lands at the a-priori site; NO_STRUCTURE stands for any failure
             answer = runs[algorithm].answer
             estimate = answer or SiteEstimate(SiteOutcome.NO_STRUCTURE, measurements.apriori_site_world)
             touchdown = simulate_touchdown(p, estimate, flight, truth, streams)
             row = {
-                **({} if answer is None else outcome_row(answer)),
-                **site_row(estimate, flight, truth),
-                **landing_row(touchdown, estimate, flight, truth),
-                **motion_row(estimate.details, flight, case.pair),
-                **map_row(p, estimate, flight, truth),
-                **times_row(estimate.details),
+                **({} if answer is None else score.outcome_row(answer)),
+                **score.site_row(estimate, flight, truth),
+                **score.landing_row(touchdown, estimate, flight, truth),
+                **score.motion_row(estimate.details, flight, case.pair),
+                **score.map_row(p, estimate, flight, truth),
+                **score.times_row(estimate.details),
             }
             scored = None
             if answer is not None:
@@ -99,6 +87,6 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 )
             is_converged = answer is not None and estimate.outcome.converged
             timeline = partial(landing_timeline, case, estimate, touchdown)
-            return Score(is_converged, row, products(case, estimate), scored, timeline)
+            return Score(is_converged, row, score.products(case, estimate), scored, timeline)
 
-        return evaluate_case(p, shared, run, score)
+        return evaluate_case(p, shared, run, score_answer)

@@ -16,17 +16,14 @@ from marsyard.scenarios.condition_columns import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth, RenderedFlight
-from marsyard.scenarios.landing.helicopter import Touchdown, horizontal_distance_m, land
 from marsyard.scenarios.landing.images import Pair
 from marsyard.scenarios.landing.map_errors import SampledMap, count_hazards, map_errors
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m
 from marsyard.scenarios.landing_site import motion_errors, stage_row
 from marsyard.sim.camera import camera_pose
-from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
-from marsyard.sim.sensor.ranging import RangingUnit
-from marsyard.sim.streams import Streams
 
 NAN = float("nan")
 #: Maximum distance of a correct track from the true pixel, px.
@@ -131,18 +128,6 @@ def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> d
     return {f"{name}_safe": bool(footprint.safe[0]), **dict(zip(columns, values, strict=True))}
 
 
-def simulate_touchdown(
-    p: LandingScenarioParameters, estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth, streams: Streams
-) -> Touchdown | None:
-    """Simulate the helicopter's landing at the reported site; None without a site, a helicopter or ground contact."""
-    relief = truth.relief
-    if flight.transit is None or estimate.site_world is None:
-        return None
-    ground = GroundPatch(np.array([relief.west_m, relief.south_m]), relief.spacing_m, relief.heights_m)
-    unit = RangingUnit.draw(p.laser, streams.generator("laser"))
-    return land(flight.transit, estimate.site_world, ground, unit, streams, stuck_range_m(p.faults, p.height_m))
-
-
 def landing_row(
     touchdown: Touchdown | None, estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth
 ) -> dict[str, Scalar]:
@@ -155,7 +140,7 @@ def landing_row(
     touchdown. `gps_solutions` is the number of averaged solutions; `gps_sd_north_m` and `gps_sd_east_m` are the
     means of the standard deviations that the receiver reports. `landing_after_s` is the time from the second image
     to touchdown. `landing_iterations` and `landing_path_change_m` are the number of iterations of flight and filter
-    and the change of the path in the last iteration (`marsyard.scenarios.landing.helicopter`). Without a touchdown,
+    and the change of the path in the last iteration (`marsyard.scenarios.landing.touchdown`). Without a touchdown,
     numbers are NaN, and `touchdown_safe` is missing.
     """
     site = estimate.site_world

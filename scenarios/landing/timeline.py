@@ -1,4 +1,4 @@
-"""Timeline of a landing."""
+"""Timeline of a landing, for its figure in the report and the exports of `marsyard replay`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from marsyard.algorithms.hda import HdaDetails, MappedGround, Safety
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import RenderedFlight
-from marsyard.scenarios.landing.helicopter import NavigatedLeg, Touchdown
+from marsyard.scenarios.landing.helicopter import NavigatedLeg
+from marsyard.scenarios.landing.touchdown import Touchdown
 from marsyard.scenarios.meshes import add_meshes
 from marsyard.scenarios.timeline import (
     CameraPose,

@@ -15,9 +15,6 @@ from marsyard.sim.render import Sun
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
-#: Maximum number of terrains in a worker's memory: those of several campaigns, or of a small bank; 12 MB each.
-MAX_GROUNDS = 4
-
 
 @dataclass(frozen=True)
 class LandingWorld:
@@ -33,12 +30,13 @@ class LandingWorld:
         cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank
     ) -> LandingWorld:
         """Create the world of a case."""
+        # the site without the dust of the case, so that cases share the cached terrain
         ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)
-        texture = p.preset.ground_texture
+        dusty_site = p.preset
+        texture, air = dusty_site.ground_texture, dusty_site.environment
         amplitudes = tuple(p.texture * amplitude for amplitude in texture.amplitudes)
         scaled_texture = SiteTexture(coarsest_m=texture.coarsest_m, amplitudes=amplitudes)
-        ground = replace(ground, site=p.preset.model_copy(update={"ground_texture": scaled_texture}))
-        air = p.preset.environment
+        ground = replace(ground, site=dusty_site.model_copy(update={"ground_texture": scaled_texture}))
         elevation_deg = raise_sun_deg(p.faults, p.sun.elevation_deg)
         sun = sun_at(air, p.sun.azimuth_deg, elevation_deg)
         return cls(ground, sun, p.meshes, sunlight_ratio(air, float(np.radians(elevation_deg)), p.detector))

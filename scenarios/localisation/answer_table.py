@@ -13,15 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from marsyard.algorithms.exchange.files import (
-    CASE_FILE,
-    EXCHANGE_VERSION,
-    check_version,
-    open_json,
-    read_image,
-    write_images,
-    write_json,
-)
+from marsyard.algorithms.exchange import files
 from marsyard.algorithms.exchange.values import decode, encode
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
@@ -33,16 +25,19 @@ from marsyard.scenarios.streamed import StreamAnswers
 def write_descent(folder: Path, measurements: LocalisationMeasurements) -> None:
     """Write the measurements of a descent into an existing folder. Raises OSError if that fails."""
     write_map(folder, measurements.map_product)
-    images = write_images(folder, measurements.images, "png")
+    images = files.write_images(folder, measurements.images, "png")
     content = encode(measurements, ["map_product", "images"])
-    write_json(folder / CASE_FILE, {"exchange": EXCHANGE_VERSION, "task": "localisation", **content, "images": images})
+    files.write_json(
+        folder / files.CASE_FILE,
+        {"exchange": files.EXCHANGE_VERSION, "task": "localisation", **content, "images": images},
+    )
 
 
 def read_descent(folder: Path) -> LocalisationMeasurements:
     """Read the descent that `write_descent` wrote. Raises ValueError if it is missing or has another version."""
-    with open_json(folder / CASE_FILE, "case") as content:
-        check_version(content)
-        images = tuple(read_image(folder, record) for record in content["images"])
+    with files.open_json(folder / files.CASE_FILE, "case") as content:
+        files.check_version(content)
+        images = tuple(files.read_image(folder, record) for record in content["images"])
         return decode(LocalisationMeasurements, content, map_product=read_map(folder), images=images)
 
 

@@ -9,17 +9,9 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.case_faults import SizedFaults
+from marsyard.scenarios.case_faults import Haze, SizedFaults
+from marsyard.scenarios.localisation import instruments
 from marsyard.scenarios.localisation.flight import ProfileParameters
-from marsyard.scenarios.localisation.instruments import (
-    IMAGE_CLOCK,
-    LANDER_DETECTOR,
-    RADAR,
-    ImageSchedule,
-    InitialErrors,
-    LanderCameraParameters,
-    check_clock,
-)
 from marsyard.scenarios.localisation.map_product import MapParameters
 from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
 from marsyard.scenarios.localisation.task import LOCALISATION
@@ -38,7 +30,7 @@ class LocalisationFaults(SizedFaults):
     heat_shield_deg: Annotated[
         NonNegative, Field(le=60.0, description="angular diameter of the falling heat shield in the first image")
     ] = 0.0
-    haze: Annotated[NonNegative, Field(le=10.0, description="optical depth of dusty air over 2000 m")] = 0.0
+    haze: Haze = 0.0
     lost_images: Annotated[NonNegative, Field(le=1.0, description="fraction of images that is not delivered")] = 0.0
     black_image: Annotated[int, bounded_field(0, 100, "image that is delivered black, from 1; 0: none")] = 0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
@@ -70,13 +62,13 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     dust_opacity: DustOpacity = None
     map: MapParameters = MapParameters()
     flight: ProfileParameters = ProfileParameters()
-    images: ImageSchedule = ImageSchedule()
-    camera: LanderCameraParameters = LanderCameraParameters()
-    detector: DetectorParameters = LANDER_DETECTOR
+    images: instruments.ImageSchedule = instruments.ImageSchedule()
+    camera: instruments.LanderCameraParameters = instruments.LanderCameraParameters()
+    detector: DetectorParameters = instruments.LANDER_DETECTOR
     imu_class: Annotated[ImuClass, Field(description="class of the inertial unit")] = "ln-200"
-    initial: InitialErrors = InitialErrors()
-    altimeter: RadarParameters = RADAR
-    clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = IMAGE_CLOCK
+    initial: instruments.InitialErrors = instruments.InitialErrors()
+    altimeter: RadarParameters = instruments.RADAR
+    clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = instruments.IMAGE_CLOCK
     exact_instruments: Annotated[
         bool, Field(description="estimators receive exact attitudes, altitudes, times, inertial data and camera")
     ] = False
@@ -118,8 +110,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
             raise ValueError(
                 "faults.wrong_map needs another terrain; all terrains with terrain.source contain the same DTM"
             )
-        check_clock("clock", self.clock)
-        check_clock("altimeter.clock", self.altimeter.clock)
+        instruments.check_clock("clock", self.clock)
+        instruments.check_clock("altimeter.clock", self.altimeter.clock)
         if self.faults.wrong_map and self.location.bank < 2:
             raise ValueError("faults.wrong_map needs another terrain; allowed: a location.bank of at least 2")
         return self

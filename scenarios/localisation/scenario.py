@@ -16,7 +16,7 @@ from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.case_faults import add_detector_faults
+from marsyard.scenarios.case_faults import HAZE_PATH_M, add_detector_faults
 from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.heat_shield import HeatShield
 from marsyard.scenarios.interface import CaseResult
@@ -35,8 +35,9 @@ from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.parts.named import PartKind
-from marsyard.scenarios.radiance import HAZE_PATH_M, add_haze, render_state
+from marsyard.scenarios.radiance import add_haze
 from marsyard.scenarios.streamed import StreamAnswers
+from marsyard.scenarios.views import render_state
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuIncrements
 from marsyard.sim.render.renderer import return_freed_memory

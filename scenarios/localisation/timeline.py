@@ -1,4 +1,4 @@
-"""Timeline of a descent with localisation on a map."""
+"""Timeline of a descent with a map, for its figure in the report and the exports of `marsyard replay`."""
 
 from __future__ import annotations
 

@@ -52,8 +52,8 @@ from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
-#: Cache sizes of a process: grounds, shared drives with their images, visibilities of targets along drives.
-MAX_GROUNDS, MAX_DRIVES, MAX_VISIBILITIES = 4, 1, 128
+#: Cache sizes of a process: shared drives with their images, visibilities of targets along drives.
+MAX_DRIVES, MAX_VISIBILITIES = 1, 128
 
 
 class VariantParameters(Parameters):
@@ -239,9 +239,7 @@ class RoverScenario(TerrainScenario[RoverScenarioParameters]):
     name = "rover"
     parameters_type = RoverScenarioParameters
     task = TRACKING
-
-    def __init__(self) -> None:
-        super().__init__(MAX_GROUNDS)
+    max_cached_grounds = 4
 
     def check_parameters(self, parameters: BaseModel) -> RoverScenarioParameters:
         """Return the parameters of the selected run. Raises TypeError for parameters of another scenario."""
@@ -289,9 +287,10 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
     task = TRACKING
     algorithm_table = ("drive",)
     part_keys: Mapping[str, PartKind] = {"drive.scores": SCORE}
+    max_cached_grounds = 4
 
     def __init__(self) -> None:
-        super().__init__(MAX_GROUNDS)
+        super().__init__()
         self._drive = lru_cache(maxsize=MAX_DRIVES)(partial(render_drive, load_ground=self.load_ground))
         self._visibility = lru_cache(maxsize=MAX_VISIBILITIES)(
             lambda key, point, options: evaluate_drive_visibility(key.drive, self._drive(key), point, options)

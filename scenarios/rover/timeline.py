@@ -1,4 +1,4 @@
-"""Timeline of a rover run."""
+"""Timeline of a rover run, for its figure in the report and the exports of `marsyard replay`."""
 
 from __future__ import annotations
 

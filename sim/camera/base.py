@@ -233,6 +233,13 @@ class CameraModel(ABC):
         """Return the unit direction of the ray through the middle of the frame."""
         return self.rays(np.array([(self.size[0] - 1) / 2, (self.size[1] - 1) / 2]))[1]
 
+    @property
+    def pixel_angle_rad(self) -> float:
+        """Mean angle of one pixel along columns and rows at the middle of the frame."""
+        centre = (np.array(self.size) - 1) / 2.0
+        _, directions = self.rays(centre + np.array([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]]))
+        return float(np.linalg.norm(directions[[1, 3]] - directions[[0, 2]], axis=1).mean())
+
     def border(self, steps: int) -> Float[np.ndarray, "pixels 2"]:
         """Return points (u, v) on the frame's outer edge, clockwise from the upper left, `steps` on each side."""
         right, bottom = self.size[0] - 0.5, self.size[1] - 0.5

@@ -3,6 +3,7 @@
 This module exports what all motions share; each vehicle has its own module.
 """
 
-from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory, Wind, WindParameters
+from marsyard.sim.dynamics.trajectory import Motion, Resting, State, Trajectory
+from marsyard.sim.dynamics.wind import Wind, WindParameters
 
 __all__ = ["Motion", "Resting", "State", "Trajectory", "Wind", "WindParameters"]

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from marsyard.sim.dynamics.kernels.swing import Chain
-from marsyard.sim.dynamics.trajectory import WindParameters
+from marsyard.sim.dynamics.wind import WindParameters
 from marsyard.sim.error_sources import SWING
 from marsyard.sim.parameters import bounded_field
 

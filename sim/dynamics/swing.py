@@ -51,11 +51,12 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.dynamics.kernels import swing as kernels
 from marsyard.sim.dynamics.kernels.swing import CANOPY, Chain
 from marsyard.sim.dynamics.pendulum import Modes, SwingParameters, build_chain
-from marsyard.sim.dynamics.trajectory import Motion, Trajectory, Wind, check_times
+from marsyard.sim.dynamics.trajectory import Motion, Trajectory, check_times
+from marsyard.sim.dynamics.wind import Wind
 
 Vector = Float64[np.ndarray, "3"]
 StateVector = Float64[np.ndarray, "22"]
-Constants = tuple[kernels.Array, kernels.Array]
+Constants = tuple[Float64[np.ndarray, "_"], Float64[np.ndarray, "_ 7"]]
 
 #: Distance of the camera below the thrusters' firing height at which the integration ends: more than a second later.
 BELOW_FIRING_M = 90.0

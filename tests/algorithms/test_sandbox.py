@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.algorithms.dimes import DimesOptions
-from marsyard.algorithms.exchange import ExecutableLimits, process, sandbox
+from marsyard.algorithms.exchange import ExecutableLimits, limits, sandbox
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.velocity import VELOCITY
@@ -109,6 +109,6 @@ def test_sandbox_without_bubblewrap_is_refused(monkeypatch: pytest.MonkeyPatch) 
 def test_settings_that_the_sandbox_cannot_enforce_are_refused(
     values: dict[str, object], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(process, "find_problem", lambda: "")
+    monkeypatch.setattr(limits, "find_problem", lambda: "")
     with pytest.raises(ValidationError, match=message):
         ExecutableLimits.model_validate({"sandbox": True, **values})

@@ -1,5 +1,6 @@
-"""Test that links between the Markdown pages lead to existing files and headings; `test_site` checks the built site."""
+"""Test that links in the Markdown pages, and code that they name, exist; `test_site` checks the built site."""
 
+import pydoc
 import re
 from pathlib import Path
 
@@ -40,3 +41,12 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
         if not path.exists() or not has_anchor:
             broken.append(target)
     assert broken == []
+
+
+def test_architecture_names_existing_code() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    # modules of a system are relative to `scenarios`
+    paths, modules = (re.findall(name, text) for name in (r"`(\w+/[\w/]+(?:\.py)?)`", r"\bmarsyard(?:\.\w+)+"))
+    assert min(len(paths), len(modules)) > 10
+    missing = [path for path in paths if not any((ROOT / parent / path).exists() for parent in (".", "scenarios"))]
+    assert missing + [name for name in set(modules) if pydoc.locate(name) is None] == []

@@ -55,6 +55,13 @@ def test_changes_accept_python_values() -> None:
     assert len(marsyard.draws(campaign, 3)) == 3
 
 
+def test_metric_of_a_case_without_the_column_is_missing() -> None:
+    results = [marsyard.CaseResult("VALID", True, {"error_m": 2.5}), marsyard.CaseResult("CRASHED", False, {})]
+    values = marsyard.collect_metric(results, "error_m")
+    assert (values.name, values.index.name, values[0]) == ("error_m", "case", 2.5)
+    assert values.isna().tolist() == [False, True]
+
+
 @pytest.mark.parametrize(
     "name", ["draw_and_plan.py", "custom_camera.py", pytest.param("run_one_case.py", marks=pytest.mark.slow)]
 )

@@ -22,7 +22,7 @@ from marsyard.cli.until_decided import run_until_decided
 from marsyard.reports.dashboard.server import create_server
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.evaluation import next_look
-from marsyard.reports.presentation import notable_cases
+from marsyard.reports.gallery import gallery_candidates
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.stored import read_run
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, write_campaign
@@ -158,16 +158,16 @@ def test_adaptive_campaign_reports_its_end(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_gallery_reruns_each_notable_case_once(tmp_path: Path) -> None:
+def test_gallery_reruns_each_gallery_candidate_once(tmp_path: Path) -> None:
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
     path, directory = write_campaign(tmp_path, dispersions=dispersions), tmp_path / "run"
     run_campaign(load_campaign(str(path), cases=12), directory, ExecutorConfig(jobs=1), RecordingWatch())
-    notable = set(notable_cases(read_run(directory)))
-    assert len(notable) >= 4
+    candidates = set(gallery_candidates(read_run(directory)))
+    assert len(candidates) >= 4
     _, out, err = marsyard("report", directory, "--gallery")
     stored_cases = {int(folder.name) for folder in (directory / "cases").iterdir()}
-    assert (notable - stored_cases, err) == (set(), "")
-    assert out.count("rerun for its images") == len(notable - {_read_record(directory)["showcase"]})
+    assert (candidates - stored_cases, err) == (set(), "")
+    assert out.count("rerun for its images") == len(candidates - {_read_record(directory)["showcase"]})
     # cases with stored images are not run again
     assert "rerun for" not in marsyard("report", directory, "--gallery")[1]
 

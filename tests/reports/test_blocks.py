@@ -172,7 +172,7 @@ def test_invalid_report_of_a_system_gives_a_warning(
     register_altitude_system(report)
     try:
         with pytest.warns(UserWarning, match=f"system 'altitude'.*{message}.*are omitted"):
-            assert presentations() == ()
+            assert presentations() == {}
     finally:
         presentations.cache_clear()
 

@@ -1,4 +1,4 @@
-"""Tests of the explorer (the interactive scatter plot), of the gallery (cases on the page) and of notable cases."""
+"""Tests of the explorer (the interactive scatter plot), of the gallery (cases on the page) and of its candidates."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from marsyard.reports.explorer import MAX_POINTS, ExploredRequirement, choose_points, explorer_data
+from marsyard.reports.gallery import gallery_candidates, gallery_cases
 from marsyard.reports.page import embed_json
-from marsyard.reports.presentation import gallery_cases, notable_cases
 from marsyard.reports.stored import read_run
 from tests.reports.synthetic_run import make_rows
 
@@ -61,9 +61,9 @@ def test_embedded_data_are_escaped() -> None:
     assert json.loads(text) == hostile
 
 
-def test_notable_cases_are_worst_unanswered_and_random_cases(make_run: Callable[..., Path]) -> None:
+def test_gallery_candidates_are_worst_unanswered_and_random_cases(make_run: Callable[..., Path]) -> None:
     frame = make_rows(60, n_crashed=2)
-    cases = notable_cases(read_run(make_run(frame)))
+    cases = gallery_candidates(read_run(make_run(frame)))
     errors = frame["velocity_error_m_s"]
     assert cases[:2] == errors.nlargest(2).index.tolist()
     unanswered_cases = frame.index[errors.isna() & ~frame["outcome"].eq("CRASHED")].tolist()
@@ -71,12 +71,12 @@ def test_notable_cases_are_worst_unanswered_and_random_cases(make_run: Callable[
     # two worst, two unanswered and two random cases
     assert len(cases) == len(set(cases)) == 6
     assert not set(cases) & set(frame.index[frame["outcome"].eq("CRASHED")])
-    assert notable_cases(read_run(make_run(frame.head(0), name="none"))) == []
+    assert gallery_candidates(read_run(make_run(frame.head(0), name="none"))) == []
 
 
 def test_gallery_starts_with_first_worst_and_unanswered_cases(make_run: Callable[..., Path]) -> None:
     frame = make_rows(40)
-    run = replace(read_run(make_run(frame)), showcases=(7, *(case for case in range(40) if case != 7)))
+    run = replace(read_run(make_run(frame)), stored_cases=(7, *(case for case in range(40) if case != 7)))
     cases = gallery_cases(run)
     assert cases[0] == 7
     # the selected case, two worst, two unanswered and two random cases
@@ -84,5 +84,5 @@ def test_gallery_starts_with_first_worst_and_unanswered_cases(make_run: Callable
     worst_cases = frame[METRIC].drop(7).sort_values(ascending=False).index[:2]
     assert cases[1:3] == worst_cases.tolist()
     assert frame[METRIC].iloc[cases[3:5]].isna().all()
-    assert gallery_cases(replace(run, showcases=(7,))) == [7]
-    assert gallery_cases(replace(run, showcases=())) == []
+    assert gallery_cases(replace(run, stored_cases=(7,))) == [7]
+    assert gallery_cases(replace(run, stored_cases=())) == []

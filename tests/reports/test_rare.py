@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.rare_decision import RareSample, decide_rare
 from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult
-from marsyard.campaigns.studies.study_record import convert_to_json
 from marsyard.campaigns.studies.subset import Level, SubsetEnd, SubsetResult
 from marsyard.reports.rare import rare_sentences
 

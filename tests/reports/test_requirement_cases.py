@@ -18,9 +18,11 @@ from marsyard.campaigns.definition.margins import compute_margin
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.gallery import gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.localisation.presentation import LOCALISATION
-from marsyard.reports.presentation import Cause, Presentation, gallery_cases, thumbnail
+from marsyard.reports.presentation import Cause, Presentation
+from marsyard.reports.products import thumbnail
 from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder, compute_margins
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.wording import label
@@ -189,8 +191,8 @@ def test_similar_violations_have_the_nearest_conditions(make_run: MakeRun) -> No
 
 def test_violations_precede_other_cases_of_the_gallery(make_run: MakeRun) -> None:
     evaluation = evaluate_run(make_run(make_rows(60, error_scale=4.0), [VELOCITY]))
-    run = replace(evaluation.run, showcases=tuple(range(60)))
-    violations = CaseFinder(run, evaluation.verdicts).notable_cases(2)
+    run = replace(evaluation.run, stored_cases=tuple(range(60)))
+    violations = CaseFinder(run, evaluation.verdicts).worst_violations(2)
     assert len(violations) == 2
     assert gallery_cases(run, violations)[:2] == violations
 

@@ -32,7 +32,7 @@ DESIGNS = [
 )
 def test_default_design_is_independent_draws(values: dict[str, Any]) -> None:
     assert read_sampling_design(values) == INDEPENDENT
-    assert INDEPENDENT.no_probability == ""
+    assert INDEPENDENT.no_probability_reason == ""
 
 
 @pytest.mark.parametrize(("definition", "message"), DESIGNS)

@@ -8,14 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.algorithms.hda import HdaOptions, Safety, hazard_maps, safe_site
+from marsyard.algorithms.hda.footprints import Resolution, classify_footprints, roughness_limit_m
 from marsyard.algorithms.hda.hazards import (
     ElevationMap,
-    Resolution,
-    classify_footprints,
     elevation_map,
     fill_small_holes,
     grassfire,
-    roughness_limit_m,
     safe_landing_map,
     smooth_surface,
 )

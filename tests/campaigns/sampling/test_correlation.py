@@ -8,7 +8,7 @@ from scipy import stats
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
-from marsyard.campaigns.sampling.design import Correlation
+from marsyard.campaigns.sampling.correlation import Correlation
 from tests.campaigns.fake_campaign import CampaignFile
 
 N_CASES = 4000

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store import lock, record
+from marsyard.campaigns.store import lock, record, temporary_files
 from marsyard.campaigns.store.lock import folder_lock, is_locked
 from marsyard.campaigns.store.products import load_products, pack_products, save_packed
 from marsyard.campaigns.store.rows import RowStore, create_store
@@ -272,7 +272,7 @@ def test_folder_lock_is_exclusive(tmp_path: Path) -> None:
 def test_temporary_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
     program = (
         "import os, sys, pathlib\n"
-        "from marsyard.campaigns.store.lock import replace_file, partial_suffix\n"
+        "from marsyard.campaigns.store.temporary_files import replace_file, partial_suffix\n"
         "folder = pathlib.Path(sys.argv[1])\n"
         "(folder / 'cases' / '3' / ('.x' + partial_suffix())).mkdir(parents=True)\n"
         "with replace_file(folder / 'cases.parquet') as partial:\n"
@@ -280,7 +280,7 @@ def test_temporary_files_of_dead_processes_are_removed(tmp_path: Path) -> None:
         "    os._exit(9)\n"
     )
     subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False)
-    own, foreign = tmp_path / f"own{lock.partial_suffix()}", tmp_path / "x.0123abcd-1.partial"
+    own, foreign = tmp_path / f"own{temporary_files.partial_suffix()}", tmp_path / "x.0123abcd-1.partial"
     own.touch()
     foreign.touch()
     assert len([*tmp_path.rglob("*.partial")]) == 4

@@ -16,7 +16,7 @@ from markupsafe import escape
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store import record
-from marsyard.reports import campaign
+from marsyard.reports import signature
 from marsyard.reports.campaign import write_report
 from marsyard.reports.dashboard.entries import (
     find_campaigns,
@@ -128,10 +128,10 @@ def test_reports_of_another_layout_are_written_again(
     write_report(directory)
     layout = tmp_path / "parts.html.j2"
     layout.write_text("layout of another version", encoding="utf-8")
-    monkeypatch.setattr(campaign, "_LAYOUT_FILES", (layout,))
-    assert not campaign.is_own_report(directory, directory)
+    monkeypatch.setattr(signature, "_LAYOUT_FILES", (layout,))
+    assert not signature.is_own_report(directory, directory)
     write_site(tmp_path / "site", [directory])
-    assert campaign.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
+    assert signature.is_own_report(next((tmp_path / "site" / "c").iterdir()), directory)
 
 
 def test_values_of_a_campaign_cannot_end_a_part_of_its_report() -> None:

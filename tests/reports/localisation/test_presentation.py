@@ -53,7 +53,7 @@ def _make_subject(frame: pd.DataFrame) -> Subject:
 
 
 def test_presentation_is_registered(products: dict[str, Any]) -> None:
-    assert LOCALISATION in presentations()
+    assert LOCALISATION in presentations().values()
     assert find_case_kind(products) is LOCALISATION.cases[0]
     assert not is_dimes_case(products)
     assert not is_hda_case(products)

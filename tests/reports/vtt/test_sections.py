@@ -290,7 +290,7 @@ def test_quantiles_without_enough_runs_are_omitted() -> None:
 
 def test_other_campaigns_have_no_tracking_section() -> None:
     """Rows of other systems have no columns of tracking."""
-    assert VTT in presentations()
+    assert VTT in presentations().values()
     sections = [*VTT.first, *VTT.sections]
     assert len(sections) == 7
     descent = pd.DataFrame({"case": [0, 1], "outcome": "VALID", "answered": True, "velocity_error_m_s": 1.0})

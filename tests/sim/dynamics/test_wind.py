@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import quad
 
 from marsyard.sim.dynamics import Wind, WindParameters
-from marsyard.sim.dynamics.trajectory import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
+from marsyard.sim.dynamics.wind import LONGEST_WAVE_SCALES, SHORTEST_WAVE_M
 
 #: Height of the ground, m; the wind depends on the height above it.
 GROUND_M = -1900.0

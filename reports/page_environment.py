@@ -1,0 +1,35 @@
+"""Environment of the templates of all pages: report, dashboard, and gallery of sites."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+
+def status_class(word: object) -> str:
+    """Return the name of the style of a verdict; a PASS with a qualification has that of MET BY RATE.
+
+    >>> [status_class(word) for word in ("PASS", "PASS (unregistered)", "NO REQUIREMENT")]
+    ['pass', 'met-by-rate', 'no-requirement']
+    """
+    text = str(word)
+    return "met-by-rate" if text.startswith("PASS (") else text.lower().replace(" ", "-")
+
+
+@cache
+def page_environment() -> Environment:
+    """Create a Jinja environment that escapes all values; its filter `code` marks words in backticks as code."""
+    environment = Environment(
+        autoescape=True,
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        lstrip_blocks=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
+    )
+    environment.filters["status_class"] = status_class
+    environment.filters["code"] = lambda text: Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))  # noqa: S704
+    return environment
