@@ -18,7 +18,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.scenarios.horizon import hill_objects
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Scene, Sun, Texture
-from marsyard.sim.render.kernels.structs import MicroRelief
+from marsyard.sim.render.texture import MicroRelief
 from marsyard.sim.sensor import CameraDesign
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
 from marsyard.sim.terrain.microrelief import octave_heights
