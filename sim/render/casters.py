@@ -10,7 +10,8 @@ cell of each body with a projection that contains the ray.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
@@ -21,6 +22,7 @@ from scipy.sparse import coo_array
 from marsyard.sim.render.device import (
     Array2f,
     Array2f64,
+    Array3f64,
     Array4f,
     Bool,
     Float,
@@ -29,7 +31,11 @@ from marsyard.sim.render.device import (
     Matrix3f64,
     UInt32,
     Values,
+    larger,
+    smaller,
     to_device,
+    to_host,
+    vectors_to_device,
 )
 
 #: Minimum u, v and s, then maximum u, v and s, of items.
@@ -39,6 +45,8 @@ Bounds = FloatArray[np.ndarray, "items 6"]
 TRIANGLES_PER_CELL, BODIES_PER_CELL, MAX_CELLS = 4, 4, 1024
 #: Margin of all bounds, metres; larger than rounding errors.
 SLACK_M = 1e-6
+#: Margin of an item in a grid, in cells; larger than the rounding errors of a position in single precision.
+CELL_MARGIN = 1e-3
 #: Twice the projected area of a triangle, square metres, below which it is edge-on and casts no shadow.
 MIN_DOUBLE_AREA_M2 = 1e-18
 
@@ -102,33 +110,34 @@ class Casters:
     body_top: Values
 
 
-def _bound(projected: np.ndarray) -> Bounds:
-    """Compute the bounds of projected triangles, with a margin."""
-    a, b, c = (projected[:, corner] for corner in range(3))
-    low, high = np.minimum(np.minimum(a, b), c) - SLACK_M, np.maximum(np.maximum(a, b), c) + SLACK_M
-    return np.concatenate([low, high], axis=1)
+def _project(corners: Values, axes: Values) -> tuple[list[Values], Values, Values]:
+    """Project triangles along the sun: u, v, s of their three corners, and their bounds with a margin."""
+    number = 3 * dr.arange(UInt32, len(corners.x) // 3)
+    a, b, c = (axes @ dr.gather(Array3f64, corners, number + k) for k in range(3))
+    low, high = smaller(smaller(a, b), c) - SLACK_M, larger(larger(a, b), c) + SLACK_M
+    return [a, b, c], low, high
 
 
-def _linear_functions(projected: np.ndarray, origins: np.ndarray) -> Float32[np.ndarray, "triangles 3 4"]:
+def _linear_functions(projected: list[Values], origin: Values) -> Values:
     """Compute the linear functions (`Casters`) of projected triangles, relative to origins; NaN if they are edge-on."""
-    u, v, s = (projected[:, 0] - origins).T
-    (u2, v2, s2), (u3, v3, s3) = ((projected[:, corner] - projected[:, 0]).T for corner in (1, 2))
+    (u, v, s), (u2, v2, s2), (u3, v3, s3) = (
+        projected[0] - origin, projected[1] - projected[0], projected[2] - projected[0]
+    )
     double_area = u2 * v3 - u3 * v2
-    double_area[np.abs(double_area) < MIN_DOUBLE_AREA_M2] = np.nan
-    second_u, second_v, third_u, third_v = (slope / double_area for slope in (v3, -u3, -v2, u2))
+    inverse = dr.select(dr.abs(double_area) < MIN_DOUBLE_AREA_M2, dr.nan, 1.0 / double_area)
+    second_u, second_v, third_u, third_v = (slope * inverse for slope in (v3, -u3, -v2, u2))
     plane_u, plane_v = second_u * s2 + third_u * s3, second_v * s2 + third_v * s3
-    functions = np.zeros((len(projected), 3, 4), dtype=np.float32)
+    functions, number = dr.empty(Float, 12 * len(u)), 3 * dr.arange(UInt32, len(u))
     slopes = ((0.0, second_u, second_v), (0.0, third_u, third_v), (s, plane_u, plane_v))
     for k, (value, slope_u, slope_v) in enumerate(slopes):
-        functions[:, k, 0], functions[:, k, 1], functions[:, k, 2] = value - slope_u * u - slope_v * v, slope_u, slope_v
+        at_origin = value - slope_u * u - slope_v * v
+        dr.scatter(functions, Array4f(at_origin, slope_u, slope_v, 0.0), number + k)
     return functions
 
 
 def _enclose(bounds: Bounds, first: Int64[np.ndarray, "groups"]) -> FloatArray[np.ndarray, "groups 6"]:
     """Compute the bounds of groups of successive items, which begin at `first`; no group may be empty."""
-    low, high = (
-        ufunc.reduceat(bounds[:, side], first) for ufunc, side in ((np.minimum, np.s_[:3]), (np.maximum, np.s_[3:]))
-    )
+    low, high = np.minimum.reduceat(bounds[:, :3], first), np.maximum.reduceat(bounds[:, 3:], first)
     return np.concatenate([low, high], axis=1)
 
 
@@ -138,91 +147,109 @@ def _choose_sides(items: np.ndarray) -> Int64[np.ndarray, "grids"]:
 
 
 def _list_in_grids(
-    bounds: Bounds,
-    grid_of_item: Int64[np.ndarray, "items"],
+    low: Values,
+    high: Values,
+    grid: Values,
     enclosing: FloatArray[np.ndarray, "grids 6"],
     sides: Int64[np.ndarray, "grids"],
-    numbers: Int64[np.ndarray, "items"] | None = None,
-) -> tuple[Grids, Int64[np.ndarray, "cells+1"], Int64[np.ndarray, "listed"]]:
-    """List items in the cells of grids over `enclosing` bounds; `numbers` replaces the numbers of the listed items.
+    numbers: Values,
+) -> Grids:
+    """List numbered items in the cells of grids over `enclosing` bounds.
 
-    Returns the grids, and on the host the start of each cell's list and the listed items.
+    `low` and `high` are the minimum and maximum u, v of the items, and `grid` the grid of each item.
     """
-    low = enclosing[:, :2]
-    cells_per_metre = sides[:, None] / (enclosing[:, 3:5] - low)
+    corner, extent = enclosing[:, :2], enclosing[:, 3:5] - enclosing[:, :2]
     first_cell = np.cumsum([0, *sides**2])
-    # cells at both corners of an item; positions outside the grid by rounding errors belong to its border cells
-    side = sides[grid_of_item, None]
-    corners = [
-        np.clip(((corner - low[grid_of_item]) * cells_per_metre[grid_of_item]).astype(np.int64), 0, side - 1)
-        for corner in (bounds[:, :2], bounds[:, 3:5])
-    ]
-    columns, rows = (corners[1] - corners[0] + 1).T
-    listed = np.repeat(np.arange(len(bounds)), columns * rows)
-    position = np.arange(len(listed)) - np.repeat(np.cumsum(columns * rows) - columns * rows, columns * rows)
-    row, column = np.divmod(position, columns[listed])
-    cell = (
-        first_cell[grid_of_item[listed]]
-        + (corners[0][listed, 1] + row) * side[listed, 0]
-        + corners[0][listed, 0]
-        + column
-    )
-    lists = coo_array(
-        (np.ones(len(listed), dtype=np.int8), (cell, listed)), shape=(int(first_cell[-1]), len(bounds))
-    ).tocsr()
-    starts, items = np.asarray(lists.indptr), np.asarray(lists.indices)
+    cells = int(first_cell[-1])
     grids = Grids(
-        to_device(Float64, low),
-        to_device(Float, cells_per_metre),
+        to_device(Float64, corner),
+        to_device(Float, sides[:, None] / extent),
         to_device(Int32, sides),
         to_device(UInt32, first_cell[:-1]),
-        to_device(UInt32, starts),
-        to_device(UInt32, items if numbers is None else numbers[items]),
+        dr.zeros(UInt32, cells + 1),
+        UInt32(0),
     )
-    return grids, starts, items
+    side, first = dr.gather(Int32, grids.side, grid), dr.gather(UInt32, grids.first_cell, grid)
+    origin, per_metre = dr.gather(Array2f64, grids.low, grid), dr.gather(Array2f, grids.cells_per_metre, grid)
+    first_column, first_row, last_column, last_row = (
+        dr.maximum(dr.minimum(Int32(dr.floor(position)), side - 1), 0)
+        for bound, margin in ((low, -CELL_MARGIN), (high, CELL_MARGIN))
+        for position in (bound - origin) * per_metre + margin
+    )
+    columns = last_column - first_column + 1
+    count = UInt32(columns * (last_row - first_row + 1))
+
+    def visit_cells(visit: Callable[[Values, Values], None]) -> None:
+        """Call `visit` for all cells of each item."""
+
+        def step(k: Values, is_active: Values) -> tuple[Values, Values]:
+            row = Int32(k) // columns
+            visit(first + UInt32((first_row + row) * side + first_column + Int32(k) - row * columns), is_active)
+            return k + 1, is_active & (k + 1 < count)
+
+        dr.while_loop((UInt32(0), count > 0), lambda k, is_active: is_active, step)
+
+    visit_cells(lambda cell, is_active: dr.scatter_add(grids.starts, UInt32(1), cell, is_active))
+    starts = dr.prefix_sum(grids.starts)
+    items, listed = dr.zeros(UInt32, int(starts[cells])), dr.zeros(UInt32, cells + 1)
+
+    def list_item(cell: Values, is_active: Values) -> None:
+        position = dr.gather(UInt32, starts, cell, is_active) + dr.scatter_inc(listed, cell, is_active)
+        dr.scatter(items, numbers, position, is_active)
+
+    visit_cells(list_item)
+    dr.eval(items)
+    return replace(grids, starts=starts, items=items)
 
 
-def list_casters(triangles: np.ndarray, first_triangle: Int64[np.ndarray, "bodies+1"], axes: np.ndarray) -> Casters:
+def list_casters(
+    corners: Values, first_triangle: Int64[np.ndarray, "bodies+1"], axes: FloatArray[np.ndarray, "3 3"]
+) -> Casters:
     """Project the triangles along the sun's direction and list them in grids.
 
-    - triangles, first_triangle: corners; body b consists of the triangles `first_triangle[b]` to
+    - corners, first_triangle: corners, three for each triangle; body b consists of the triangles `first_triangle[b]` to
       `first_triangle[b + 1] - 1`
     - axes: rows are the unit vectors u, v and s; s points to the sun
     """
-    projected, counts = triangles @ axes.T, np.diff(first_triangle)
-    bounds, body_of_triangle = _bound(projected), np.repeat(np.arange(len(counts)), counts)
-    body_bounds = _enclose(bounds, first_triangle[:-1])
-    bodies, _, _ = _list_in_grids(bounds, body_of_triangle, body_bounds, _choose_sides(counts / TRIANGLES_PER_CELL))
-    functions = _linear_functions(projected, body_bounds[:, [0, 1, 5]][body_of_triangle])
-    all_bodies = _enclose(body_bounds, np.zeros(1, dtype=np.int64))
-    coarse_side = _choose_sides(np.array([len(counts)]))
-    coarse, starts, body_of_item = _list_in_grids(
-        body_bounds, np.zeros(len(counts), dtype=np.int64), all_bodies, coarse_side
+    matrix, counts = Matrix3f64(*axes.ravel().tolist()), np.diff(first_triangle)
+    # products with zeros would change the zeros of a matrix of constants
+    dr.make_opaque(matrix)
+    projected, low, high = _project(corners, matrix)
+    dr.eval(projected, low, high)
+    body_bounds = _enclose(np.concatenate([to_host(low), to_host(high)], axis=1), first_triangle[:-1])
+    body = to_device(UInt32, np.repeat(np.arange(len(counts)), counts))
+    triangle_sides = _choose_sides(counts / TRIANGLES_PER_CELL)
+    bodies = _list_in_grids(low.xy, high.xy, body, body_bounds, triangle_sides, dr.arange(UInt32, len(body)))
+    origins = vectors_to_device(Array3f64, body_bounds[:, [0, 1, 5]])
+    functions = _linear_functions(projected, dr.gather(Array3f64, origins, body))
+    all_bodies, coarse_side = _enclose(body_bounds, np.zeros(1, dtype=np.int64)), _choose_sides(np.array([len(counts)]))
+    body_low, body_high = (vectors_to_device(Array2f64, body_bounds[:, k : k + 2]) for k in (0, 3))
+    coarse = _list_in_grids(
+        body_low, body_high, UInt32(0), all_bodies, coarse_side, dr.arange(UInt32, len(counts))
     )
-    fine = _list_in_fine_grids(body_bounds, all_bodies[0], int(coarse_side[0]), starts, body_of_item)
-    matrix, top = Matrix3f64(*axes.ravel().tolist()), to_device(Float64, body_bounds[:, 5])
-    return Casters(matrix, to_device(Float, functions), coarse, fine, bodies, top)
+    fine = _list_in_fine_grids(body_bounds, all_bodies[0], int(coarse_side[0]), coarse)
+    return Casters(matrix, functions, coarse, fine, bodies, to_device(Float64, body_bounds[:, 5]))
 
 
-def _list_in_fine_grids(
-    body_bounds: Bounds, all_bodies: np.ndarray, coarse_side: int, starts: np.ndarray, body_of_item: np.ndarray
-) -> Grids:
+def _list_in_fine_grids(body_bounds: Bounds, all_bodies: np.ndarray, coarse_side: int, coarse: Grids) -> Grids:
     """List the bodies of each coarse cell in a grid over them; bodies are clipped to the coarse cell with a margin."""
-    cell = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    starts, bodies = to_host(coarse.starts).astype(np.int64), to_host(coarse.items)
+    counts = np.diff(starts)
+    cell, used = np.repeat(np.arange(len(counts)), counts), np.flatnonzero(counts)
     low, extent = all_bodies[:2], (all_bodies[3:5] - all_bodies[:2]) / coarse_side
     cell_low = low + extent * np.stack([cell % coarse_side, cell // coarse_side], axis=1)
-    clipped = body_bounds[body_of_item]
-    clipped[:, :2] = np.maximum(clipped[:, :2], cell_low - SLACK_M)
-    clipped[:, 3:5] = np.minimum(clipped[:, 3:5], cell_low + extent + SLACK_M)
-    used, counts = np.flatnonzero(np.diff(starts)), np.diff(starts)
+    margin, clipped = CELL_MARGIN * extent + SLACK_M, body_bounds[bodies]
+    clipped[:, :2] = np.maximum(clipped[:, :2], cell_low - margin)
+    clipped[:, 3:5] = np.minimum(clipped[:, 3:5], cell_low + extent + margin)
     enclosing = np.zeros((len(counts), 6))
     enclosing[:, 3:] = 1.0
     enclosing[used] = _enclose(clipped, starts[:-1][used])
     areas = np.bincount(cell, np.prod(clipped[:, 3:5] - clipped[:, :2], axis=1), len(counts))
     # cells smaller than the bodies would list each body many times
     area = np.prod(enclosing[:, 3:5] - enclosing[:, :2], axis=1)
-    wanted = np.minimum(counts / BODIES_PER_CELL, area * counts / np.maximum(areas, 1e-300))
-    return _list_in_grids(clipped, cell, enclosing, _choose_sides(wanted), body_of_item)[0]
+    sides = _choose_sides(np.minimum(counts / BODIES_PER_CELL, area * counts / np.maximum(areas, 1e-300)))
+    item_low, item_high = (vectors_to_device(Array2f64, clipped[:, k : k + 2]) for k in (0, 3))
+    return _list_in_grids(item_low, item_high, to_device(UInt32, cell), enclosing, sides, to_device(UInt32, bodies))
 
 
 def are_occluded(casters: Casters, position: Values, active: Values) -> Values:

@@ -9,6 +9,7 @@ import drjit as dr
 
 from marsyard.sim.render.device import (
     Array3f,
+    Array3f64,
     Bool,
     Float,
     Float64,
@@ -62,6 +63,18 @@ class _PixelGrid:
         inside_column = dr.maximum(dr.minimum(column, Int32(self.columns) - 1), 0)
         is_inside = (inside_row == row) & (inside_column == column)
         return UInt32(inside_row) * self.columns + UInt32(inside_column), is_inside
+
+
+@compiled
+def pixel_angles(directions: Values, pixel: Values, columns: Values, rows: Values) -> Values:
+    """Square root of each pixel's solid angle, radians; the sides of a pixel are differences of the unit vectors."""
+    grid, sides = _PixelGrid.of(pixel, columns, rows), []
+    for down, right in ((1, 0), (0, 1)):
+        (before, has_before), (after, has_after) = (grid.neighbour(sign * down, sign * right) for sign in (-1, 1))
+        steps = dr.maximum(dr.select(has_before, UInt32(1), 0) + dr.select(has_after, UInt32(1), 0), 1)
+        difference = dr.gather(Array3f64, directions, after) - dr.gather(Array3f64, directions, before)
+        sides.append(difference / Float64(steps))
+    return Float(dr.sqrt(dr.norm(dr.cross(*sides))))
 
 
 def _has_edge(grid: _PixelGrid, radiance: Values, distance: Values, body: Values, down: int) -> Values:

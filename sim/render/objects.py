@@ -147,10 +147,13 @@ class Objects:
         is_selected = np.zeros(len(self.triangles), dtype=np.bool_)
         is_selected[numbers] = True
         order = self._morton_order[is_selected[self._morton_order]]
-        return Hierarchy.build(self.triangles, self._corners, order, centre)
+        # near triangles first: a hit then excludes all farther ones
+        squared_distance = np.square(self.triangles[order, 0] - centre).sum(axis=1)
+        order = order[np.argsort(np.frexp(squared_distance)[1], kind="stable")]
+        return Hierarchy.build(self.corners, order, centre)
 
     @cached_property
-    def _corners(self) -> Values:
+    def corners(self) -> Values:
         """Corners of all triangles on the device."""
         return vectors_to_device(Array3f64, self.triangles.reshape(-1, 3))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
+import drjit as dr
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from scipy.spatial.transform import RigidTransform
@@ -13,7 +14,8 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.device import Array3f, Float, UInt32, Values, to_device, vectors_to_device
+from marsyard.sim.render.device import Array3f, Array3f64, Float, UInt32, Values, to_device, to_host, vectors_to_device
+from marsyard.sim.render.edges import pixel_angles
 from marsyard.sim.render.primary import Rays
 from marsyard.sim.render.scene import Cone
 
@@ -129,8 +131,10 @@ class PixelRays:
 
 def _pixel_angles(directions: Float64[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns"]:
     """Square root of each pixel's solid angle, radians; the sides of a pixel are differences of the unit vectors."""
-    along_column, along_row = (np.gradient(directions, axis=axis) for axis in (0, 1))
-    return np.sqrt(np.linalg.norm(np.cross(along_row, along_column), axis=-1)).astype(np.float32)
+    rows, columns = directions.shape[:2]
+    vectors = vectors_to_device(Array3f64, directions.reshape(-1, 3))
+    pixel = dr.arange(UInt32, rows * columns)
+    return to_host(pixel_angles(vectors, pixel, UInt32(columns), UInt32(rows))).reshape(rows, columns)
 
 
 def _max_image_radius(directions: Float64[np.ndarray, "rows columns 3"], view: Float64[np.ndarray, "3 3"]) -> float:

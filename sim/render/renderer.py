@@ -18,6 +18,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 from weakref import ref
 
+import drjit as dr
 import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32, Int64
@@ -147,7 +148,8 @@ class Renderer:
         highest_ray = np.arcsin(np.clip((rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
         is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
         # height bounds save time only for rays almost parallel to the ground
-        terrain, pose = scene.terrain(ceilings=is_grazing), Pose.of(rotation, position)
+        terrain = scene.terrain_with_ceilings if is_grazing else scene.terrain
+        pose = Pose.of(rotation, position)
         extent, tree, light = scene.extent, scene.objects.hierarchy(numbers, position), scene.light(time_s)
 
         def shade_hits(rays: Rays, hits: Hits) -> ShadedImage:
@@ -206,6 +208,7 @@ class Renderer:
         if self._last_scene is None or self._last_scene() is not scene:
             self._last_scene = ref(scene)
             self._scene_count += 1
+            dr.flush_malloc_cache()
             if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
                 return_freed_memory()
         # the visible ground lies between two horizontal planes: a ray ends at the lower one, or at the mesh's border

@@ -166,9 +166,15 @@ class Scene:
         highest = self.height_range_m[1] + ROUNDING_M
         return Extent(*map(Float64, (x - half_width, x + half_width, y - half_width, y + half_width, highest)))
 
-    def terrain(self, *, ceilings: bool) -> Terrain:
-        """Return the surface on the device, with or without the height bounds of its levels."""
-        return Terrain.of_surface(self.surface, ceilings=ceilings)
+    @cached_property
+    def terrain(self) -> Terrain:
+        """The surface on the device."""
+        return Terrain.of_surface(self.surface, ceilings=False)
+
+    @cached_property
+    def terrain_with_ceilings(self) -> Terrain:
+        """The surface on the device, with the height bounds of its levels."""
+        return Terrain.of_surface(self.surface, ceilings=True)
 
     @cached_property
     def height_range_m(self) -> tuple[float, float]:
@@ -287,7 +293,7 @@ def casters_towards(objects: Objects, sun: Sun) -> Casters | None:
     first_axis /= np.linalg.norm(first_axis)
     # the kernel's rays are exactly parallel to the third axis
     axes = np.stack([first_axis, np.cross(direction, first_axis), direction])
-    return list_casters(objects.triangles, objects.first_triangle, axes)
+    return list_casters(objects.corners, objects.first_triangle, axes)
 
 
 def potentially_visible(

@@ -1,7 +1,7 @@
 """A bounding volume hierarchy over triangles, and the intersection of rays with it.
 
-Triangles are sorted along a Morton curve. Groups of `LEAF` successive triangles are the leaves of a complete binary
-tree. The bounding boxes of its nodes are computed bottom-up. The tree is deterministic.
+Triangles are sorted along a Morton curve; they are the leaves of a complete binary tree. The bounding boxes of its nodes
+are computed bottom-up. The tree is deterministic.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from marsyard.sim.render.device import (
     Int32,
     UInt32,
     Values,
+    compiled,
     larger,
     smaller,
     to_device,
     to_host,
     vectors_to_device,
+    where,
 )
 from marsyard.sim.render.ground import Ray
 
 Triangles = FloatArray[np.ndarray, "triangles 3 3"]
-#: Triangles per leaf.
-LEAF = 4
 #: Relative margin of bounds and of triangles in single precision, larger than rounding errors.
 SLACK = 1e-6
 
@@ -71,14 +71,14 @@ def is_inside(u: Values, v: Values, slack: float) -> Values:
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
-    """A complete binary tree of bounding boxes over triangles along the Morton curve.
+    """A complete binary tree of bounding boxes over triangles along a Morton curve.
 
-    Node k has the children 2 k and 2 k + 1; the root is node 1. The leaves begin at node `first_leaf`. Boxes and
-    triangles have single precision and are relative to `centre`, which should be near the rays' origins.
+    Node k has the children 2 k and 2 k + 1; the root is node 1. The leaves are the triangles, from node `first_leaf`.
+    Boxes and leaves have single precision and are relative to `centre`, which should be near the rays' origins.
 
     - boxes: minimum x, y, z and 0, then maximum x, y, z and 0 of each node
-    - leaves: corners of the triangles of each leaf: x, y, z and 0 of each corner
-    - numbers: number of each triangle of the leaves; the last triangle fills the tree
+    - leaves: x, y, z and 0 of the three corners of each leaf
+    - numbers: number of the triangle of each leaf; the last triangle fills the tree
     - corners: corners of all triangles in world axes, double precision, three for each number
     """
 
@@ -91,36 +91,36 @@ class Hierarchy:
 
     @classmethod
     def build(
-        cls,
-        triangles: Triangles,
-        corners: Values,
-        order: Int64[np.ndarray, "listed"],
-        centre: FloatArray[np.ndarray, "3"],
+        cls, corners: Values, order: Int64[np.ndarray, "listed"], centre: FloatArray[np.ndarray, "3"]
     ) -> Hierarchy:
         """Build the tree over triangles in the given order; `corners` are those of all triangles on the device."""
-        leaves = 1
-        while leaves * LEAF < len(order):
-            leaves *= 2
-        padded = np.concatenate([order, np.full(leaves * LEAF - len(order), order[-1])])
-        points = np.zeros((len(padded), 3, 4), dtype=np.float32)
-        points[..., :3] = triangles[padded] - centre
-        sides = []
-        for smaller_of, margin in ((np.minimum, -1.0), (np.maximum, 1.0)):
-            side = smaller_of(smaller_of(points[:, 0], points[:, 1]), points[:, 2])
-            side += np.float32(margin * SLACK) * (1.0 + np.abs(side))
-            levels = [smaller_of(smaller_of(side[::4], side[1::4]), smaller_of(side[2::4], side[3::4]))]
+        count = 1 << (len(order) - 1).bit_length()
+        numbers = to_device(UInt32, np.concatenate([order, np.full(count - len(order), order[-1])]))
+        leaves, origin, sides = dr.empty(Float, 12 * count), Array3f64(*centre.tolist()), []
+        bounds = _copy_leaves(corners, numbers, dr.arange(UInt32, count), origin, leaves)
+        for side, smaller_of in zip(bounds, (np.minimum, np.maximum), strict=True):
+            levels = [to_host(side)]
             while len(levels[-1]) > 1:
                 levels.append(smaller_of(levels[-1][::2], levels[-1][1::2]))
             sides.append(np.concatenate([levels[-1], *levels[::-1]]))
-        boxes = np.stack(sides, axis=1)
-        return cls(
-            to_device(Float, boxes),
-            to_device(Float, points),
-            to_device(UInt32, padded),
-            corners,
-            Array3f64(*centre.tolist()),
-            UInt32(leaves),
-        )
+        return cls(to_device(Float, np.stack(sides, axis=1)), leaves, numbers, corners, origin, UInt32(count))
+
+
+@compiled
+def _copy_leaves(
+    corners: Values, numbers: Values, leaf: Values, centre: Values, leaves: Values
+) -> tuple[Values, Values]:
+    """Copy corners relative to a centre to `leaves` (see `Hierarchy`); return the minimum and maximum of each leaf.
+
+    The bounds have four components, and are rounded outwards.
+    """
+    low, high = Array4f(dr.inf), Array4f(-dr.inf)
+    for k in range(3):
+        x, y, z = Array3f(dr.gather(Array3f64, corners, 3 * numbers + k) - centre)
+        corner = Array4f(x, y, z, 0.0)
+        low, high = smaller(low, corner), larger(high, corner)
+        dr.scatter(leaves, corner, 3 * leaf + k)
+    return low - SLACK * (1.0 + dr.abs(low)), high + SLACK * (1.0 + dr.abs(high))
 
 
 def _entry_distance(boxes: Values, node: Values, ray: Ray, inverse: Values, active: Values) -> Values:
@@ -141,33 +141,29 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: Values, active: Values) -> 
     local = Ray(Array3f(ray.origin - tree.centre), Array3f(ray.direction))
     inverse = Array3f(*(1.0 / dr.select(dr.abs(d) > 1e-12, d, 1e-12) for d in local.direction))
 
-    def visit(node: Values, best: Values, leaf_entry: Values, is_active: Values) -> tuple[Values, ...]:
-        """Visit a node; `best` is the distance of the nearest hit, `leaf_entry` its triangle's index in the leaves."""
+    def visit(node: Values, best: Values, nearest: Values, is_active: Values) -> tuple[Values, ...]:
+        """Visit a node; `best` is the distance of the nearest hit, and `nearest` its leaf."""
         is_near = is_active & (_entry_distance(tree.boxes, node, local, inverse, is_active) < best)
-        is_leaf = is_near & (node >= tree.first_leaf)
+        is_leaf, leaf = is_near & (node >= tree.first_leaf), node - tree.first_leaf
 
-        def test(k: Values, best: Values, leaf_entry: Values, is_tested: Values) -> tuple[Values, ...]:
-            entry = (node - tree.first_leaf) * LEAF + k
-            a, b, c = (dr.gather(Array4f, tree.leaves, 3 * entry + corner, is_tested) for corner in range(3))
+        def distance() -> Values:
+            a, b, c = (dr.gather(Array4f, tree.leaves, 3 * leaf + corner, is_leaf) for corner in range(3))
             t, u, v = intersect(local, a.xyz, b.xyz, c.xyz)
-            is_nearer = is_tested & is_inside(u, v, SLACK) & (t > 0.0) & (t < best)
-            best, leaf_entry = dr.select(is_nearer, t, best), dr.select(is_nearer, entry, leaf_entry)
-            return k + 1, best, leaf_entry, is_tested & (k < LEAF - 1)
+            return dr.select(is_inside(u, v, SLACK) & (t > 0.0), t, dr.inf)
 
-        _, best, leaf_entry, _ = dr.while_loop(
-            (UInt32(0), best, leaf_entry, is_leaf), lambda k, best, leaf_entry, is_tested: is_tested, test
-        )
+        t = where(is_leaf, distance, Float(dr.inf))
+        nearest, best = dr.select(t < best, leaf, nearest), smaller(t, best)
         # depth first: the first child, or the next sibling of the node or of its nearest ancestor that has one
         ancestor, descends = node >> dr.tzcnt(~node), is_near & ~is_leaf
         node = dr.select(descends, 2 * node, ancestor + 1)
-        return node, best, leaf_entry, is_active & (descends | (ancestor != 0))
+        return node, best, nearest, is_active & (descends | (ancestor != 0))
 
     limit = Float(farthest)
-    _, best, leaf_entry, _ = dr.while_loop(
-        (UInt32(1), Float(limit), UInt32(0), Bool(active)), lambda node, best, leaf_entry, is_active: is_active, visit
+    _, best, nearest, _ = dr.while_loop(
+        (UInt32(1), Float(limit), UInt32(0), Bool(active)), lambda node, best, nearest, is_active: is_active, visit
     )
     is_hit = active & (best < limit)
-    number = dr.gather(UInt32, tree.numbers, leaf_entry, is_hit)
+    number = dr.gather(UInt32, tree.numbers, nearest, is_hit)
     t, u, v = intersect(ray, *(dr.gather(Array3f64, tree.corners, 3 * number + k, is_hit) for k in range(3)))
     return dr.select(is_hit, TriangleHit(t, Int32(number), u, v), no_hit(dr.inf))
 
@@ -178,7 +174,7 @@ def nearest_triangles(
     """Find the nearest triangle that the ray from each origin hits; number -1 if there is none."""
     corners = vectors_to_device(Array3f64, triangles.reshape(-1, 3))
     order = np.argsort(morton_codes(triangles), kind="stable")
-    tree = Hierarchy.build(triangles, corners, order, triangles.mean(axis=(0, 1)))
+    tree = Hierarchy.build(corners, order, triangles.mean(axis=(0, 1)))
     ray = Ray(vectors_to_device(Array3f64, origins), Array3f64(*direction.tolist()))
     return to_host(nearest_hit(tree, ray, Float64(dr.inf), Bool(True)).number).astype(np.int64)
 
@@ -193,10 +189,11 @@ def body_spheres(
     first, counts = first_triangle[:-1], np.diff(first_triangle)
     if len(first) == 0:
         return np.empty((0, 4))
-    low, high = (ufunc.reduceat(ufunc.reduce(triangles, axis=1), first) for ufunc in (np.minimum, np.maximum))
+    a, b, c = (triangles[:, corner] for corner in range(3))
+    low, high = (ufunc.reduceat(ufunc(ufunc(a, b), c), first) for ufunc in (np.minimum, np.maximum))
     centres = 0.5 * (low + high)
-    offsets = triangles - np.repeat(centres, counts, axis=0)[:, None]
-    squares = np.square(offsets).sum(axis=2).max(axis=1)
+    centre_of_triangle = np.repeat(centres, counts, axis=0)
+    squares = np.max([np.square(corner - centre_of_triangle).sum(axis=1) for corner in (a, b, c)], axis=0)
     return np.column_stack([centres, np.sqrt(np.maximum.reduceat(squares, first))])
 
 
@@ -207,28 +204,32 @@ def first_hits(
 
     All triangles are tested: for few rays, or triangles that are used only once.
     """
-    a = triangles[:, 0]
-    edge1, edge2, s = triangles[:, 1] - a, triangles[:, 2] - a, origin - a
-    q = np.cross(s, edge1)
-    p = np.cross(directions[:, None], edge2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = np.einsum("na,rna->rn", edge1, p)
-        u, v = np.einsum("na,rna->rn", s, p) / determinant, directions @ q.T / determinant
-        t = np.einsum("na,na->n", edge2, q) / determinant
-        is_hit = (np.abs(determinant) >= 1e-18) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
-    distances = np.where(is_hit, t, np.inf)
-    if len(a) == 0:
+    if len(triangles) == 0:
         return np.full(len(directions), np.inf), np.full(len(directions), -1)
-    numbers = distances.argmin(axis=1)
-    nearest = distances[np.arange(len(directions)), numbers]
-    return nearest, np.where(np.isfinite(nearest), numbers, -1)
+    corners = vectors_to_device(Array3f64, triangles.reshape(-1, 3))
+    ray = Ray(Array3f64(*origin.tolist()), vectors_to_device(Array3f64, directions))
+    distances, numbers = _search_all(corners, UInt32(len(triangles)), ray)
+    return to_host(distances), to_host(numbers).astype(np.int64)
+
+
+@compiled
+def _search_all(corners: Values, count: Values, ray: Ray) -> tuple[Values, Values]:
+    """Find the distance and the number of the nearest triangle on each ray by testing all triangles."""
+
+    def test(n: Values, best: Values, number: Values) -> tuple[Values, Values, Values]:
+        t, u, v = intersect(ray, *(dr.gather(Array3f64, corners, 3 * n + corner) for corner in range(3)))
+        is_nearer = is_inside(u, v, 0.0) & (t > 0.0) & (t < best)
+        return n + 1, dr.select(is_nearer, t, best), dr.select(is_nearer, Int32(n), number)
+
+    state = (UInt32(0), Float64(dr.inf), Int32(-1))
+    return dr.while_loop(state, lambda n, best, number: n < count, test)[1:]
 
 
 def morton_codes(triangles: Triangles) -> Int64[np.ndarray, "triangles"]:
     """Morton code of each triangle's centroid in the cube that contains all centroids, with 20 bits per axis."""
-    centroids = triangles.mean(axis=1)
-    if len(centroids) == 0:
+    if len(triangles) == 0:
         return np.empty(0, dtype=np.int64)
+    centroids = (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3.0
     low = centroids.min(axis=0)
     side = max(float((centroids - low).max()), 1e-12)
     codes = ((centroids - low) / side * 1048575.0).astype(np.int64)
