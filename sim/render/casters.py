@@ -15,9 +15,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 import numpy as np
-from jaxtyping import Float32, Int64
 from jaxtyping import Float64 as FloatArray
-from scipy.sparse import coo_array
+from jaxtyping import Int64
 
 from marsyard.sim.render.device import (
     Array2f,
@@ -121,7 +120,9 @@ def _project(corners: Values, axes: Values) -> tuple[list[Values], Values, Value
 def _linear_functions(projected: list[Values], origin: Values) -> Values:
     """Compute the linear functions (`Casters`) of projected triangles, relative to origins; NaN if they are edge-on."""
     (u, v, s), (u2, v2, s2), (u3, v3, s3) = (
-        projected[0] - origin, projected[1] - projected[0], projected[2] - projected[0]
+        projected[0] - origin,
+        projected[1] - projected[0],
+        projected[2] - projected[0],
     )
     double_area = u2 * v3 - u3 * v2
     inverse = dr.select(dr.abs(double_area) < MIN_DOUBLE_AREA_M2, dr.nan, 1.0 / double_area)
@@ -224,9 +225,7 @@ def list_casters(
     functions = _linear_functions(projected, dr.gather(Array3f64, origins, body))
     all_bodies, coarse_side = _enclose(body_bounds, np.zeros(1, dtype=np.int64)), _choose_sides(np.array([len(counts)]))
     body_low, body_high = (vectors_to_device(Array2f64, body_bounds[:, k : k + 2]) for k in (0, 3))
-    coarse = _list_in_grids(
-        body_low, body_high, UInt32(0), all_bodies, coarse_side, dr.arange(UInt32, len(counts))
-    )
+    coarse = _list_in_grids(body_low, body_high, UInt32(0), all_bodies, coarse_side, dr.arange(UInt32, len(counts)))
     fine = _list_in_fine_grids(body_bounds, all_bodies[0], int(coarse_side[0]), coarse)
     return Casters(matrix, functions, coarse, fine, bodies, to_device(Float64, body_bounds[:, 5]))
 

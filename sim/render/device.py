@@ -61,7 +61,7 @@ def clip(a: Values, low: Values, high: Values) -> Values:
 def where(condition: Values, compute: Callable[[], Values], otherwise: Values) -> Values:
     """Return `compute()` where a condition holds, else `otherwise`.
 
-    In contrast to `dr.select`, it is not computed for a group of neighbouring pixels in which the condition never holds.
+    In contrast to `dr.select`, it is not computed for a group of neighbouring pixels without the condition.
     """
     return dr.if_stmt((), condition, compute, lambda: otherwise)
 

@@ -188,7 +188,7 @@ def trace_subpixel_rays(
             is_next = (distance > last) & (distance < start)
             start, level = dr.select(is_next, distance, start), dr.select(is_next, its_level, level)
         # successive ranges on one level form one interval
-        change, stop, following = Float64(dr.inf), start, Float64(dr.inf)
+        change, stop = Float64(dr.inf), start
         for distance, its_level in zip(ranges, levels, strict=True):
             change = dr.select((distance > start) & (its_level != level), smaller(change, distance), change)
         for distance in ranges:

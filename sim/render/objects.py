@@ -119,7 +119,7 @@ class Objects:
         return numbers[normals @ apex - offsets + apex_radius_m * lengths > 0.0]
 
     @cached_property
-    def _planes(self) -> tuple[Float64[np.ndarray, "triangles 3"], Float64[np.ndarray, "triangles"], ...]:
+    def _planes(self) -> tuple[np.ndarray, ...]:
         """Normals of the triangles, their products with a corner, and their lengths."""
         a, b, c = (self.triangles[:, corner] for corner in range(3))
         normals = np.cross(b - a, c - a)

@@ -32,12 +32,15 @@ from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
 from marsyard.sim.render.device import Float, Float64, Int32, UInt32, to_device, to_host
 from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
+from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
 from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Pose, Rays, Views, trace_primary_rays
 from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays
 from marsyard.sim.render.scene import Scene
-from marsyard.sim.render.shading import ShadedImage, shade
-from marsyard.sim.render.shadows import visible_sun
+from marsyard.sim.render.shading import Light, ShadedImage, shade
+from marsyard.sim.render.shadows import Occluders, visible_sun
+from marsyard.sim.render.spline import Terrain
+from marsyard.sim.render.triangles import Hierarchy
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import Level
 
@@ -115,6 +118,48 @@ class Frame:
         return np.asarray(self.world_from_body.apply(points_body)).reshape(*distance.shape, 3)
 
 
+@dataclass(frozen=True, eq=False)
+class _Tracer:
+    """A scene and a camera in its pose, on the device."""
+
+    scene: Scene
+    rays: PixelRays
+    terrain: Terrain
+    extent: Extent
+    pose: Pose
+    tree: Hierarchy | None
+    light: Light
+    occluders: Occluders
+
+    def trace_pixels(self, views: Views, is_grazing: bool) -> Hits:
+        """Trace the ray of each pixel."""
+        geometry = self.terrain, self.extent, views, self.pose, self.rays.device, self.tree
+        return trace_primary_rays(*geometry, is_grazing)
+
+    def shade_hits(self, rays: Rays, hits: Hits) -> ShadedImage:
+        """Compute radiance, body and normal at the hits of rays."""
+        light, materials, geometry = self.light, self.scene.materials, (self.terrain, self.pose, rays, hits)
+        sun_fraction = visible_sun(*geometry, light.sun, light.sun_radius, self.occluders, materials.objects)
+        return shade(*geometry, light, sun_fraction, materials)
+
+    def smooth_edges(self, image: ShadedImage, hits: Hits, radiance: Float32[np.ndarray, "pixels"]) -> None:
+        """Replace the radiance of pixels at edges by the mean of several rays."""
+        columns, rows = map(UInt32, self.rays.size)
+        pixels = np.flatnonzero(to_host(mark_edges(image.radiance, hits.distance, image.body, columns, rows)))
+        if len(pixels) > 0:
+            rays, subpixel_hits = self.trace_subpixels(pixels, hits)
+            subpixel_radiance = to_host(self.shade_hits(rays, subpixel_hits).radiance)
+            radiance[pixels] = subpixel_radiance.reshape(len(pixels), -1).mean(axis=1)
+
+    def trace_subpixels(self, pixels: Int64[np.ndarray, "pixels"], hits: Hits) -> tuple[Rays, Hits]:
+        """Trace several rays in each of these pixels."""
+        columns, rows = map(UInt32, self.rays.size)
+        side = self.scene.edge_rays
+        rays, pixel = supersample_rays(self.rays, pixels, side), to_device(UInt32, np.repeat(pixels, side**2))
+        geometry = self.terrain, self.extent, self.pose, self.tree
+        return rays, trace_subpixel_rays(*geometry, columns, rows, pixel, rays, hits)
+
+
 class Renderer:
     """Renderer of scenes through cameras. Create one per process, in the process that uses it."""
 
@@ -149,36 +194,17 @@ class Renderer:
         is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
         # height bounds save time only for rays almost parallel to the ground
         terrain = scene.terrain_with_ceilings if is_grazing else scene.terrain
-        pose = Pose.of(rotation, position)
-        extent, tree, light = scene.extent, scene.objects.hierarchy(numbers, position), scene.light(time_s)
-
-        def shade_hits(rays: Rays, hits: Hits) -> ShadedImage:
-            sun, objects = (light.sun, light.sun_radius), scene.materials.objects
-            sun_fraction = visible_sun(terrain, pose, rays, hits, *sun, scene.occluders, objects)
-            return shade(terrain, pose, rays, hits, light, sun_fraction, scene.materials)
-
-        hits = trace_primary_rays(terrain, extent, views, pose, rays.device, tree, is_grazing)
-        image = shade_hits(rays.device, hits)
-        radiance = to_host(image.radiance)
-        columns, rows = rays.size
+        tree, light = scene.objects.hierarchy(numbers, position), scene.light(time_s)
+        pose, occluders = Pose.of(rotation, position), scene.occluders
+        tracer = _Tracer(scene, rays, terrain, scene.extent, pose, tree, light, occluders)
+        hits = tracer.trace_pixels(views, is_grazing)
+        image = tracer.shade_hits(rays.device, hits)
+        radiance, body, range_m = to_host(image.radiance), to_host(image.body), to_host(hits.distance)
         if scene.edge_rays > 1:
-            size = UInt32(columns), UInt32(rows)
-            pixels = np.flatnonzero(to_host(mark_edges(image.radiance, hits.distance, image.body, *size)))
-            if len(pixels) > 0:
-                subpixel_rays = supersample_rays(rays, pixels, scene.edge_rays)
-                pixel = to_device(UInt32, np.repeat(pixels, scene.edge_rays**2))
-                subpixel_hits = trace_subpixel_rays(terrain, extent, pose, tree, *size, pixel, subpixel_rays, hits)
-                subpixel_radiance = to_host(shade_hits(subpixel_rays, subpixel_hits).radiance)
-                radiance[pixels] = subpixel_radiance.reshape(len(pixels), -1).mean(axis=1)
-        shape = (rows, columns)
-        return Frame(
-            radiance.reshape(shape),
-            to_host(hits.distance).reshape(shape),
-            to_host(image.body).reshape(shape),
-            to_host(image.normal).reshape(*shape, 3),
-            world_from_body,
-            rays,
-        )
+            tracer.smooth_edges(image, hits, radiance)
+        columns, rows = rays.size
+        radiance, body, range_m = (layer.reshape(rows, columns) for layer in (radiance, body, range_m))
+        return Frame(radiance, range_m, body, to_host(image.normal).reshape(rows, columns, 3), world_from_body, rays)
 
     def close(self) -> None:
         """Delete the OpenGL contexts."""

@@ -285,7 +285,7 @@ def shadow_footprint(spheres: Spheres, sun: FloatArray[np.ndarray, "3"], min_hei
 
 
 def casters_towards(objects: Objects, sun: Sun) -> Casters | None:
-    """List the triangles that can cast shadows, in grids perpendicular to the direction of the sun; None without any."""
+    """List the triangles that can cast shadows, in grids perpendicular to the sun's direction; None without any."""
     if len(objects) == 0:
         return None
     direction = np.asarray(sun.direction, dtype=np.float64)
@@ -340,8 +340,8 @@ def ground_shadow(
     """Compute the shadow of the ground by a sweep along the axis nearest to the sun's azimuth; the sun must be up.
 
     `visible_m` contains minimum and maximum x, then y, of the ground whose shadow is needed; None for all ground. The
-    grid of the shadow is that of a terrain level. If it covers a part of the ground only, its period is shorter. Returns None
-    for a sun in the zenith.
+    grid of the shadow is that of a terrain level. If it covers a part of the ground only, its period is shorter.
+    Returns None for a sun in the zenith.
     """
     level = int(np.argmax([samples.shape[0] <= SHADOW_SIDE for samples in surface.levels]))
     field, spacing = surface.levels[level], surface.spacing_m * 2.0**level

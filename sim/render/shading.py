@@ -1,4 +1,4 @@
-"""The radiance of every pixel from the surface that its ray meets: geometry, texture, illumination, then reflectance."""
+"""The radiance of every pixel: sample the surface that its ray meets, then texture, illumination and reflectance."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ GROUND, SKY = -1, -2
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Illumination at one time: unit vector to the sun, its angular radius, reflectance law, sky, and what dims the sun.
+    """Illumination at one time: unit vector to the sun, its angular radius, reflectance law, sky, and clouds.
 
     `caster_diameter` is that of a round body at the camera, metres; None without one.
     """

@@ -1,7 +1,7 @@
 """A bounding volume hierarchy over triangles, and the intersection of rays with it.
 
-Triangles are sorted along a Morton curve; they are the leaves of a complete binary tree. The bounding boxes of its nodes
-are computed bottom-up. The tree is deterministic.
+Triangles are sorted along a Morton curve; they are the leaves of a complete binary tree. The bounding boxes of its
+nodes are computed bottom-up. The tree is deterministic.
 """
 
 from __future__ import annotations

@@ -91,7 +91,8 @@ class Surface:
     def levels(self) -> tuple[Float32[np.ndarray, "rows columns 2"], ...]:
         """Control values of height (metres) and albedo of each level.
 
-        Level l has samples every ``spacing_m * 2**l`` metres: row i lies at y = i * spacing, column j at x = j * spacing.
+        Level l has samples every ``spacing_m * 2**l`` metres: row i lies at y = i * spacing, column j at x = j *
+        spacing.
         """
         # the number of all samples is between side**2 and 4 / 3 side**2
         side = 1 << ((self.samples.size // 2).bit_length() - 1) // 2

@@ -149,9 +149,9 @@ def _find_crossings(
 ) -> np.ndarray:
     """Search the finest level of the ground along rays between two distances (m)."""
     ray = Ray(vectors_to_device(Array3f64, origins), vectors_to_device(Array3f64, rays))
-    limits = (to_device(Float64, distance) for distance in (start, end))
-    terrain = Terrain.of_surface(surface, ceilings=use_ceilings)
-    return to_host(first_crossing(terrain, Int32(0), ray, *limits, Bool(True)))
+    start_m, end_m = (to_device(Float64, distance) for distance in (start, end))
+    ground = Terrain.of_surface(surface, ceilings=use_ceilings)
+    return to_host(first_crossing(ground, Int32(0), ray, start_m, end_m, Bool(True)))
 
 
 @pytest.mark.parametrize("use_ceilings", [True, False], ids=["by ceilings", "by steps"])

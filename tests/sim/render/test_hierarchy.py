@@ -95,7 +95,7 @@ def test_hierarchy_contains_the_listed_triangles_only() -> None:
 
 SIDE, SPACING_M = 64, 0.5
 SAMPLES = np.random.default_rng(3).normal(size=(SIDE, SIDE, 2)).astype(np.float32)
-SURFACE = Surface.from_samples(SAMPLES + np.float32([2000.0, 0.0]), SPACING_M)
+SURFACE = Surface.from_samples(SAMPLES + np.array([2000.0, 0.0], dtype=np.float32), SPACING_M)
 
 
 def test_spline_equals_the_surface() -> None:

@@ -54,7 +54,7 @@ def _add_slopes(x: np.ndarray, y: np.ndarray, footprint_m: np.ndarray, relief: M
 
 @pytest.fixture(scope="module")
 def flat() -> Surface:
-    return Surface.from_samples(np.broadcast_to(np.float32([0.0, 0.2]), (64, 64, 2)), 1.0)
+    return Surface.from_samples(np.broadcast_to(np.array([0.0, 0.2], dtype=np.float32), (64, 64, 2)), 1.0)
 
 
 def test_noise_has_the_specified_variances_and_derivatives() -> None:
