@@ -127,16 +127,17 @@ def split_rays(rays: Rays, columns: Values, rows: Values, pixel: Values, ray_in_
     v = (m + (count - k - 0.5) / count) / count - 0.5
 
     def interpolate(vectors: Values) -> Values:
-        value = dr.gather(Array3f, vectors, pixel)
+        value = Array3f64(dr.gather(Array3f, vectors, pixel))
         for fraction, (down, right) in ((u, (0, 1)), (v, (1, 0))):
             (before, has_before), (after, has_after) = (grid.neighbour(sign * down, sign * right) for sign in (-1, 1))
             steps = dr.maximum(dr.select(has_before, UInt32(1), 0) + dr.select(has_after, UInt32(1), 0), 1)
-            difference = dr.gather(Array3f, vectors, after) - dr.gather(Array3f, vectors, before)
-            value += fraction / Float(steps) * difference
+            first, last = (Array3f64(dr.gather(Array3f, vectors, end)) for end in (before, after))
+            value += Float64(fraction) / Float64(steps) * (last - first)
         return value
 
-    origins = None if rays.origins is None else interpolate(rays.origins)
-    return Rays(dr.normalize(interpolate(rays.directions)), origins, dr.gather(Float, rays.pixel_angles, pixel))
+    # a unit vector is rounded once: near the sun an error of its length is an error of the angle
+    origins = None if rays.origins is None else Array3f(interpolate(rays.origins))
+    return Rays(Array3f(dr.normalize(interpolate(rays.directions))), origins, dr.gather(Float, rays.pixel_angles, pixel))
 
 
 @compiled

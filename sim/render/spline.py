@@ -88,8 +88,8 @@ def _weighted_sum(weights: list[Values], values: list[Values]) -> Values:
 def evaluate(terrain: Terrain, level: Values, x: Values, y: Values, active: Values = True) -> Sample:
     """Evaluate the terrain at positions on levels.
 
-    Weights and slopes have single precision. The height is the sum of a control point and of differences from it, so it
-    has the precision of the control points.
+    Weights and slopes have single precision. Height and albedo are the sum of a control point and of differences from
+    it, so they have the precision of the control points.
     """
     spacing = terrain.spacing_at(level)
     grid_x, grid_y = x / spacing, y / spacing
@@ -103,15 +103,16 @@ def evaluate(terrain: Terrain, level: Values, x: Values, y: Values, active: Valu
     columns = [UInt32((column + offset) & last) for offset in (-1, 0, 1, 2)]
     lines = [first + (UInt32((row + offset) & last) << log2_side) for offset in (-1, 0, 1, 2)]
     points = [[dr.gather(Array2f, terrain.samples, line + j, active) for j in columns] for line in lines]
-    base = points[1][1].x
-    rises = [[point.x - base for point in line] for line in points]
+    base = points[1][1]
+    changes = [[point - base for point in line] for line in points]
+    rises = [[change.x for change in line] for line in changes]
     lines_rise = [_weighted_sum(weights_x, line) for line in rises]
     lines_slope = [_weighted_sum(derivatives_x, line) for line in rises]
-    lines_albedo = [_weighted_sum(weights_x, [point.y for point in line]) for line in points]
+    lines_albedo = [_weighted_sum(weights_x, [change.y for change in line]) for line in changes]
     per_metre = Float(1.0 / spacing)
     return Sample(
-        Float64(base) + Float64(_weighted_sum(weights_y, lines_rise)),
+        Float64(base.x) + Float64(_weighted_sum(weights_y, lines_rise)),
         per_metre * _weighted_sum(weights_y, lines_slope),
         per_metre * _weighted_sum(derivatives_y, lines_rise),
-        _weighted_sum(weights_y, lines_albedo),
+        base.y + _weighted_sum(weights_y, lines_albedo),
     )

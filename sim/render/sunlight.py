@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import numpy as np
@@ -50,13 +51,14 @@ class Grid:
         columns = [UInt32((column + offset) & last) for offset in (0, 1)]
         lines = [UInt32((row + offset) & last) << self.log2_side for offset in (0, 1)]
         values = [dr.gather(type(self.values), self.values, line + j, active) for line in lines for j in columns]
-        return values, Float(grid_x - floor_x), Float(grid_y - floor_y)
+        return values, grid_x - floor_x, grid_y - floor_y
 
-    def interpolate(self, x: Values, y: Values, active: Values = True) -> Values:
-        """Interpolate the grid bilinearly at positions, metres."""
-        (south_west, south_east, north_west, north_east), fx, fy = self.neighbours(x, y, active)
-        south, north = dr.lerp(south_west, south_east, fx), dr.lerp(north_west, north_east, fx)
-        return dr.lerp(south, north, fy)
+    def interpolate(self, x: Values, y: Values, active: Values = True, kind: Any = Float) -> Values:
+        """Interpolate the grid bilinearly at positions, metres, with single or double precision."""
+        corners, fraction_x, fraction_y = self.neighbours(x, y, active)
+        south_west, south_east, north_west, north_east = map(kind, corners)
+        fx, fy = kind(fraction_x), kind(fraction_y)
+        return dr.lerp(dr.lerp(south_west, south_east, fx), dr.lerp(north_west, north_east, fx), fy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +180,7 @@ class Clouds:
         """Fraction of direct sunlight that reaches positions through the layer."""
         path = larger(self.height - position.z, 0.0) / sun.z
         x, y = position.x + path * sun.x - self.east, position.y + path * sun.y - self.north
-        return 1.0 - Float(self.opacity) * self.cover.interpolate(x, y)
+        return Float(1.0 - self.opacity * self.cover.interpolate(x, y, kind=Float64))
 
 
 @dataclass(frozen=True, eq=False)
