@@ -9,25 +9,35 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from marsyard.sim.cache import cache_directory
+from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.terrain.surface import ALIGNMENT_BYTES
 
-#: Environment variable with the device: the processor's vector units, or a graphics processor.
+#: Environment variable with the device: the processor's vector units, or a graphics processor of NVIDIA.
 DEVICE_VARIABLE = "MARSYARD_RENDER_DEVICE"
-DEVICES = ("llvm", "cuda")
-DEVICE = os.environ.get(DEVICE_VARIABLE, DEVICES[0])
+#: What each device needs.
+DEVICES = {
+    "llvm": "the LLVM library (sudo apt-get install libllvm15, or set DRJIT_LIBLLVM_PATH)",
+    "cuda": "a graphics processor of NVIDIA with its driver",
+}
 
-with suppress(OSError):  # without a writable folder Dr.Jit uses its default folder
-    os.environ.setdefault("DRJIT_CACHE_DIR", str(cache_directory("drjit")))
 
-import drjit as dr  # noqa: E402  (it reads the variable when it is imported)
+def select_device() -> str:
+    """Return the device of the variable ``MARSYARD_RENDER_DEVICE``, by default llvm; RenderingError if unavailable."""
+    device = os.environ.get(DEVICE_VARIABLE, "llvm").lower()
+    if device not in DEVICES:
+        raise RenderingError(f"{DEVICE_VARIABLE} is '{device}'; allowed: {', '.join(DEVICES)}")
+    if not dr.has_backend(getattr(dr.JitBackend, device.upper())):
+        raise RenderingError(f"the device {device} of {DEVICE_VARIABLE} does not work; it needs {DEVICES[device]}")
+    return device
 
+
+DEVICE = select_device()
 _types = getattr(dr, DEVICE)
 Bool, UInt8, Int32, UInt32 = _types.Bool, _types.UInt8, _types.Int32, _types.UInt32
 Float, Float64 = _types.Float, _types.Float64
@@ -41,6 +51,12 @@ dr.set_thread_count(int(os.environ.get("NUMBA_NUM_THREADS") or os.cpu_count() or
 #: Decorator of a function over arrays: it is traced for the first arguments, and for later ones only if their types
 #: differ. Numbers are arguments of the compiled program, not constants in it.
 compiled = dr.freeze(auto_opaque=False, warn_after=1000)
+
+
+def description() -> str:
+    """Return the versions of Dr.Jit and of the compiler of the device."""
+    version = dr.detail.llvm_version() if DEVICE == "llvm" else dr.detail.cuda_version()
+    return f"Dr.Jit {dr.__version__}, {DEVICE} {'.'.join(map(str, version))}"
 
 
 def larger(a: Values, b: Values) -> Values:

@@ -137,7 +137,9 @@ def split_rays(rays: Rays, columns: Values, rows: Values, pixel: Values, ray_in_
 
     # a unit vector is rounded once: near the sun an error of its length is an error of the angle
     origins = None if rays.origins is None else Array3f(interpolate(rays.origins))
-    return Rays(Array3f(dr.normalize(interpolate(rays.directions))), origins, dr.gather(Float, rays.pixel_angles, pixel))
+    return Rays(
+        Array3f(dr.normalize(interpolate(rays.directions))), origins, dr.gather(Float, rays.pixel_angles, pixel)
+    )
 
 
 @compiled

@@ -30,7 +30,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
-from marsyard.sim.render.device import Float, Float64, Int32, UInt32, to_device, to_host
+from marsyard.sim.render.device import Float, Float64, Int32, UInt32, description, to_device, to_host
 from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
@@ -172,8 +172,8 @@ class Renderer:
         keep_freed_memory()
 
     def description(self) -> str:
-        """Renderer and version strings of OpenGL."""
-        return self._view_renderer(VIEW_SIDE_PX).description()
+        """Renderer and version strings of OpenGL, and the version of the compiler of the device."""
+        return f"{self._view_renderer(VIEW_SIDE_PX).description()} / {description()}"
 
     def render(self, scene: Scene, rays: PixelRays, world_from_body: RigidTransform, time_s: float = 0.0) -> Frame:
         """Render the scene through a camera in the body frame, with the clouds at their positions at this time.
