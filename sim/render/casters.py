@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float64 as FloatArray
 from jaxtyping import Int64
 
+from marsyard.sim.render.arrays import Values, larger, smaller, to_device, to_host, vectors_to_device
 from marsyard.sim.render.device import (
     Array2f,
     Array2f64,
@@ -29,12 +30,6 @@ from marsyard.sim.render.device import (
     Int32,
     Matrix3f64,
     UInt32,
-    Values,
-    larger,
-    smaller,
-    to_device,
-    to_host,
-    vectors_to_device,
 )
 
 #: Minimum u, v and s, then maximum u, v and s, of items.

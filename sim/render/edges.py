@@ -7,20 +7,8 @@ from itertools import pairwise, product
 
 import drjit as dr
 
-from marsyard.sim.render.device import (
-    Array3f,
-    Array3f64,
-    Bool,
-    Float,
-    Float64,
-    Int32,
-    UInt32,
-    Values,
-    compiled,
-    larger,
-    smaller,
-    where,
-)
+from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.ground import Extent, first_crossing, refine
 from marsyard.sim.render.primary import Hits, Pose, Rays
 from marsyard.sim.render.spline import Terrain

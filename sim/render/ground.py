@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import drjit as dr
 
-from marsyard.sim.render.device import Bool, Float, Float64, Int32, UInt32, Values, larger, smaller
+from marsyard.sim.render.arrays import Values, larger, smaller
+from marsyard.sim.render.device import Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 

@@ -10,7 +10,8 @@ from itertools import product
 
 import drjit as dr
 
-from marsyard.sim.render.device import Float, Int32, UInt32, Values
+from marsyard.sim.render.arrays import Values
+from marsyard.sim.render.device import Float, Int32, UInt32
 
 #: Odd factors of the lattice coordinates and of the seed in the hash of a lattice point.
 _HASH_FACTORS, _HASH_SEED = (0x8DA6B343, 0xD8163841, 0xCB1AB31F), 0x9E3779B1

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from marsyard.sim.render.device import Array3f64, Values, vectors_to_device
+from marsyard.sim.render.arrays import Values, vectors_to_device
+from marsyard.sim.render.device import Array3f64
 from marsyard.sim.render.triangles import Hierarchy, body_spheres, morton_codes
 
 #: Triangle numbers are rendered as 24-bit colours; 0 is the ground.

@@ -15,22 +15,8 @@ import numpy as np
 from jaxtyping import Float32
 from jaxtyping import Int32 as IntArray
 
-from marsyard.sim.render.device import (
-    Array3f,
-    Array3f64,
-    Bool,
-    Float,
-    Float64,
-    Int32,
-    Matrix3f64,
-    UInt32,
-    Values,
-    compiled,
-    larger,
-    smaller,
-    to_device,
-    where,
-)
+from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, where
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
 from marsyard.sim.render.ground import MAX_CHANGE, Extent, Ray, refine, search_grazing_ray
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.render.triangles import Hierarchy, TriangleHit, intersect, is_inside, nearest_hit, no_hit

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
 
-from marsyard.sim.render.device import Array3f, Float, Float64, Values, clip, compiled, larger, to_device, to_host
+from marsyard.sim.render.arrays import Values, clip, compiled, larger, to_device, to_host
+from marsyard.sim.render.device import Array3f, Float, Float64
 
 #: Sine of the elevation below which the sky's brightness is constant.
 MIN_ELEVATION_SINE = 1e-3

@@ -29,8 +29,9 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import rotation_matrix
+from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import Backend, DepthRenderer, RenderingError
-from marsyard.sim.render.device import Float, Float64, Int32, UInt32, description, to_device, to_host
+from marsyard.sim.render.device import Float, Float64, Int32, UInt32, description
 from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull

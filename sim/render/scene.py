@@ -13,18 +13,9 @@ from jaxtyping import Float64 as FloatArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import brentq
 
+from marsyard.sim.render.arrays import to_device, vectors_to_device
 from marsyard.sim.render.casters import Casters, list_casters
-from marsyard.sim.render.device import (
-    Array3f,
-    Array3f64,
-    Bool,
-    Float,
-    Float64,
-    Int32,
-    UInt32,
-    to_device,
-    vectors_to_device,
-)
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.sweep import height_range, heights_in_rows, max_rises, sweep_shadow
 from marsyard.sim.render.objects import Objects, spheres_in_cone

@@ -6,19 +6,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from marsyard.sim.render.device import (
-    Array3f,
-    Bool,
-    Float,
-    Float64,
-    Int32,
-    UInt32,
-    Values,
-    compiled,
-    larger,
-    smaller,
-    where,
-)
+from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
+from marsyard.sim.render.device import Array3f, Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.primary import Hits, Points, Pose, Rays, locate
 from marsyard.sim.render.reflectance import Angles, Law, Sky
 from marsyard.sim.render.shadows import ObjectSurfaces

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import drjit as dr
 
+from marsyard.sim.render.arrays import Values, compiled, larger, where
 from marsyard.sim.render.casters import Casters, are_occluded
-from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, UInt32, Values, compiled, larger, where
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, UInt32
 from marsyard.sim.render.primary import Hits, Pose, Rays, locate
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.render.sunlight import COARSE_GRID_MARGIN, Footprint, GroundShadow, disc_above, march_to_sun

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from marsyard.sim.render.device import Array2f, Float, Float64, Int32, UInt32, Values, to_device
+from marsyard.sim.render.arrays import Values, to_device
+from marsyard.sim.render.device import Array2f, Float, Float64, Int32, UInt32
 from marsyard.sim.terrain import Surface
 
 

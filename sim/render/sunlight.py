@@ -8,19 +8,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from marsyard.sim.render.device import (
-    Bool,
-    Float,
-    Float64,
-    Int32,
-    UInt8,
-    UInt32,
-    Values,
-    clip,
-    larger,
-    smaller,
-    to_device,
-)
+from marsyard.sim.render.arrays import Values, clip, larger, smaller, to_device
+from marsyard.sim.render.device import Bool, Float, Float64, Int32, UInt8, UInt32
 from marsyard.sim.render.kernels.sweep import CASTER_UNIT_ROWS
 from marsyard.sim.render.spline import Terrain, evaluate
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
 
-from marsyard.sim.render.device import Float, Float64, UInt32, Values, larger, smaller, to_device
+from marsyard.sim.render.arrays import Values, larger, smaller, to_device
+from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_plane, noise_in_space
 from marsyard.sim.render.sunlight import Grid
 from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE

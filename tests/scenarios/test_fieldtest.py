@@ -34,7 +34,7 @@ from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.dynamics import Resting
 from marsyard.sim.dynamics.helicopter import HelicopterParameters, draw_helicopter_flight
-from marsyard.sim.render.device import to_host
+from marsyard.sim.render.arrays import to_host
 from marsyard.sim.sensor.imu import true_increments
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.device import to_host
+from marsyard.sim.render.arrays import to_host
 from marsyard.sim.terrain import TerrainParameters, synthesise
 
 surface = synthesise(TerrainParameters(samples=256, rms_slope_deg=6.0, outer_scale_m=200.0), np.random.default_rng(1))

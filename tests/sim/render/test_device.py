@@ -12,20 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import clip, larger, smaller, to_device, to_host, vectors_to_device, where
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.device import (
-    Array3f,
-    Float,
-    Int32,
-    clip,
-    larger,
-    select_device,
-    smaller,
-    to_device,
-    to_host,
-    vectors_to_device,
-    where,
-)
+from marsyard.sim.render.device import Array3f, Float, Int32, select_device
 from marsyard.sim.render.primary import trace_primary_rays
 from marsyard.sim.render.shading import shade
 from marsyard.sim.terrain import Surface

@@ -11,7 +11,7 @@ from benchmarks.validation.motion import View, supersample
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.device import to_host
+from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.renderer import edge_pixels, supersample_rays
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters

@@ -10,8 +10,9 @@ from benchmarks.validation.raycast import Ground
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32, to_device, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
 from marsyard.sim.render.ground import Extent, Ray, first_crossing, skip_empty_blocks
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.terrain import Surface

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.device import Array3f64, Float, Float64, UInt32, to_device, to_host, vectors_to_device
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_plane
 from marsyard.sim.render.texture import (
     HEIGHT_VARIANCE,

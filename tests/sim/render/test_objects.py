@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, nadir_pose, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
+from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.render.device import Float64, to_device, to_host
+from marsyard.sim.render.device import Float64
 from marsyard.sim.render.kernels.views import depth_in_metres
 from marsyard.sim.render.renderer import cell_spans_in_hull, ground_mesh
 from marsyard.sim.render.scene import graded_offsets, shadow_footprint

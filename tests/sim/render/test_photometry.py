@@ -11,7 +11,8 @@ from scipy.stats import qmc
 from marsyard.sim.camera import Cahv, Cahvore, CameraModel
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.device import Array3f64, Bool, Float, Float64, UInt32, to_device, to_host, vectors_to_device
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Bool, Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_space
 from marsyard.sim.render.texture import MIN_CELLS, NOISE_VARIANCE, Octaves, log_relative_albedo
 from marsyard.sim.terrain import Surface, sites

@@ -11,8 +11,9 @@ from benchmarks.validation.raycast import Ground, cast_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import compiled, to_host, vectors_to_device
 from marsyard.sim.render.casters import Casters, are_occluded
-from marsyard.sim.render.device import Array3f64, Bool, compiled, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Bool
 from marsyard.sim.render.kernels.sweep import height_range
 from marsyard.sim.render.scene import casters_towards, ground_in_cones, ground_shadow, is_sun_above_slopes, slope_bounds
 from marsyard.sim.render.sunlight import GroundShadow

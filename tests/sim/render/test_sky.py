@@ -20,7 +20,8 @@ from marsyard.sim.render import (
     Scene,
     Sun,
 )
-from marsyard.sim.render.device import Float64, to_device, to_host
+from marsyard.sim.render.arrays import to_device, to_host
+from marsyard.sim.render.device import Float64
 from marsyard.sim.terrain import Surface
 from tests.sim.scenes import LAMBERT, descent_camera, flat_ground
 
