@@ -19,7 +19,16 @@ from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_crat
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
-from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE, UNIFORM, Surface, empty_aligned, level_sides
+from marsyard.sim.terrain.surface import (
+    ROUGHNESS,
+    TEXTURE,
+    UNIFORM,
+    Surface,
+    empty_aligned,
+    empty_pyramid,
+    level_sides,
+    split_levels,
+)
 
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py")
@@ -69,11 +78,12 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     if dtm is not None:
         blend_into_ground(ground, dtm, detail)
     relative_albedo = np.exp(ground.log_albedo, out=ground.log_albedo)
-    samples = np.empty((ground.side, ground.side, 2), dtype=np.float32)
+    pyramid = empty_pyramid(ground.side)
+    samples = split_levels(pyramid, level_sides(ground.side))[0]
     interleave_samples(
         ground.height, relative_albedo, p.albedo / float(relative_albedo.mean(dtype=np.float64)), samples
     )
-    return Surface.from_samples(samples, ground.spacing_m, factors)
+    return Surface.from_pyramid(pyramid, ground.spacing_m, factors)
 
 
 @cache

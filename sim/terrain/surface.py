@@ -41,6 +41,11 @@ def level_sides(side: int) -> list[int]:
     return [side >> level for level in range((side // SMALLEST_LEVEL).bit_length())]
 
 
+def empty_pyramid(side: int) -> Float32[np.ndarray, "values"]:
+    """Create the uninitialised control values of a pyramid with `side` samples along each side of level 0."""
+    return empty_aligned((2 * sum(samples**2 for samples in level_sides(side)),), np.float32)
+
+
 def split_levels(
     samples: Float32[np.ndarray, "values"], sides: list[int]
 ) -> tuple[Float32[np.ndarray, "rows columns 2"], ...]:
@@ -79,13 +84,22 @@ class Surface:
         if samples.shape[1] != side or side < SMALLEST_LEVEL or side & (side - 1):
             requirement = "a square with a power of two of at least 16 is needed"
             raise ValueError(f"terrain samples have shape {samples.shape}; {requirement}")
-        sides = level_sides(side)
-        pyramid = empty_aligned((2 * sum(side**2 for side in sides),), np.float32)
-        levels = split_levels(pyramid, sides)
-        levels[0][:] = samples
-        for fine, coarse in pairwise(levels):
+        pyramid = empty_pyramid(side)
+        split_levels(pyramid, level_sides(side))[0][:] = samples
+        return cls.from_pyramid(pyramid, spacing_m, factors)
+
+    @classmethod
+    def from_pyramid(
+        cls,
+        pyramid: Float32[np.ndarray, "values"],
+        spacing_m: float,
+        factors: Float32[np.ndarray, "side side 3"] = UNIFORM,
+    ) -> Surface:
+        """Compute the coarse levels of a pyramid of `empty_pyramid` from level 0, in place."""
+        surface = cls(pyramid.view(), spacing_m, factors)
+        for fine, coarse in pairwise(split_levels(pyramid, [len(level) for level in surface.levels])):
             coarse[:] = reduce_level(fine)
-        return cls(pyramid, spacing_m, factors)
+        return surface
 
     @cached_property
     def levels(self) -> tuple[Float32[np.ndarray, "rows columns 2"], ...]:
