@@ -34,7 +34,7 @@ CONTRAST = (
 IMAGES = (
     text("image_hash", "hash of the counts of all images", Kind.PROVENANCE),
     text("gl_backend", "OpenGL backend of the renderer", Kind.PROVENANCE),
-    text("gl_version", "OpenGL implementation of the renderer", Kind.PROVENANCE),
+    text("gl_version", "OpenGL implementation and compiler of the renderer", Kind.PROVENANCE),
     text("processor_features", "hash of the processor's features that compiled code uses", Kind.PROVENANCE),
 )
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from marsyard.sim.render.kernels.hierarchy import morton_codes, nearest_hits, node_boxes
+from marsyard.sim.render.triangles import nearest_triangles
 
 Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
@@ -168,7 +168,6 @@ def _contains(triangles: Float64[np.ndarray, "faces 3 3"], points: Float64[np.nd
 
     A ray from a point inside leaves the body through the first triangle that it hits.
     """
-    order = np.argsort(morton_codes(triangles), kind="stable")
-    numbers = nearest_hits((triangles, order, node_boxes(triangles, order)), points, _DIRECTION)
+    numbers = nearest_triangles(triangles, points, _DIRECTION)
     a, b, c = np.moveaxis(triangles[numbers], 1, 0)
     return bool(np.all(numbers >= 0) and np.all(np.cross(b - a, c - a) @ _DIRECTION > 0.0))

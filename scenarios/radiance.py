@@ -7,7 +7,7 @@ from jaxtyping import Float32
 
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Sun
-from marsyard.sim.render.kernels.photometry import add_air_light
+from marsyard.sim.render.reflectance import add_air_light
 from marsyard.sim.sensor import DetectorParameters
 from marsyard.sim.terrain import Environment
 
@@ -23,15 +23,15 @@ def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> F
         return frame.radiance
     transmission = np.multiply(frame.range_m, -extinction_m, dtype=np.float32, casting="same_kind")
     np.exp(transmission, out=transmission)
+    transmission[np.isinf(frame.range_m)] = 1.0
     # sunlight travels along -sun and is scattered along -direction, towards the camera
-    east, north, up = frame.world_from_body.rotation.inv().apply(sun.direction).astype(np.float32)
+    sun_body = frame.world_from_body.rotation.inv().apply(sun.direction)
     sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
     ambient = 0.5 * (sky + float(frame.radiance.mean()))
-    scattering = np.float32(air.single_scattering_albedo), np.float32(air.asymmetry), np.float32(ambient)
-    hazy = np.empty_like(frame.radiance)
-    flat_arrays = (array.reshape(-1) for array in (frame.radiance, frame.range_m, transmission))
-    add_air_light(*flat_arrays, frame.rays.directions, (east, north, up), scattering, hazy.reshape(-1))
-    return hazy
+    radiance, transmission = frame.radiance.reshape(-1), transmission.reshape(-1)
+    scattering = air.single_scattering_albedo, air.asymmetry, ambient
+    hazy = add_air_light(radiance, transmission, frame.rays.device.directions, sun_body, *scattering)
+    return hazy.reshape(frame.radiance.shape)
 
 
 def sun_at(air: Environment, azimuth_deg: float, elevation_deg: float) -> Sun:

@@ -21,7 +21,7 @@ from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Frame, Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend
-from marsyard.sim.render.kernels.structs import MicroRelief
+from marsyard.sim.render.texture import MicroRelief
 from marsyard.sim.sensor import CameraDesign, ImageMotion
 from marsyard.sim.terrain import RockField, RockMesh, Site, Surface, TerrainBank, TerrainParameters
 from marsyard.sim.terrain.microrelief import octave_heights

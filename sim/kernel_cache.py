@@ -1,7 +1,8 @@
-"""Cache folder of kernels compiled by numba: one folder per version of the kernel sources.
+"""Cache folders of compiled code: one folder per version of the kernel sources for numba, and one folder for Dr.Jit.
 
 numba recompiles a function when its file changes, but not when a function that it calls in another file changes. The
-cached function would then return outdated results. Therefore a change of any kernel source selects a new folder.
+cached function would then return outdated results. Therefore a change of any kernel source selects a new folder. Dr.Jit
+names its files by a hash of the compiled instructions, so one folder suffices.
 """
 
 from __future__ import annotations
@@ -31,8 +32,15 @@ def processor_features() -> str:
 _FOLDERS = ("sim", "algorithms", "scenarios")
 
 
-def set_cache_folder() -> None:
-    """Set NUMBA_CACHE_DIR to a folder named by the hash of the kernel sources, unless set; does not import numba."""
+def set_cache_folders() -> None:
+    """Set the cache folders of numba and Dr.Jit, unless they are set; imports neither."""
+    with suppress(OSError):  # without a writable folder Dr.Jit uses its default folder
+        os.environ.setdefault("DRJIT_CACHE_DIR", str(cache_directory("kernels") / "drjit"))
+    _set_numba_folder()
+
+
+def _set_numba_folder() -> None:
+    """Set NUMBA_CACHE_DIR to a folder named by the hash of the kernel sources, unless set."""
     if "NUMBA_CACHE_DIR" in os.environ:
         return
     root, digest = Path(__file__).parents[1], hashlib.sha256(sys.version.encode())

@@ -63,7 +63,8 @@ def render_reference(
     """Compute the radiance factor along the rays of a frame with Mitsuba, and whether the points are in cast shadow."""
     import mitsuba as mi
 
-    mi.set_variant("llvm_ad_mono")
+    # one ray at a time: the vector variants of Mitsuba 3.9 need LLVM 17
+    mi.set_variant("scalar_rgb")
     sun = np.asarray(view.scene.sun.direction, dtype=np.float64)
     points = frame.points_world().reshape(-1, 3)
     visible = points[np.isfinite(points).all(axis=1)]
@@ -88,14 +89,16 @@ def render_reference(
     pose, rays = frame.world_from_body, frame.rays
     starts = pose.apply(rays.centre + rays.origins.reshape(-1, 3)) - origin
     directions = pose.rotation.apply(rays.directions.reshape(-1, 3).astype(np.float64))
-    ray = mi.Ray3f(mi.Point3f(*starts.T.astype(np.float32)), mi.Vector3f(*directions.T.astype(np.float32)))
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
-    sampler.seed(1, len(starts))
+    sampler.seed(1)
     integrator = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0, "hide_emitters": True})
-    radiance = np.asarray(integrator.sample(scene, sampler, mi.RayDifferential3f(ray))[0]).reshape(-1)
-    hit = scene.ray_intersect(ray)
-    shadow = scene.ray_test(hit.spawn_ray(mi.Vector3f(sun.tolist())))
-    return radiance.reshape(frame.radiance.shape), np.asarray(shadow).reshape(frame.radiance.shape)
+    radiance, shadow = np.zeros(len(starts)), np.zeros(len(starts), dtype=np.bool_)
+    for number, (start, towards) in enumerate(zip(starts.tolist(), directions.tolist(), strict=True)):
+        ray = mi.Ray3f(start, towards)
+        radiance[number] = integrator.sample(scene, sampler, mi.RayDifferential3f(ray))[0][0]
+        hit = scene.ray_intersect(ray)
+        shadow[number] = hit.is_valid() and scene.ray_test(hit.spawn_ray(sun.tolist()))
+    return radiance.reshape(frame.radiance.shape), shadow.reshape(frame.radiance.shape)
 
 
 def _compare(name: str, view: View, sun: Sun) -> Iterator[Measure]:

@@ -17,7 +17,7 @@ from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 
 #: Note before the first compilation on a machine.
 COMPILATION_NOTE = (
-    "compiling numeric kernels once on this machine, about two minutes (to compile in advance: marsyard compile)"
+    "compiling numeric kernels once on this machine, about a minute (to compile in advance: marsyard compile)"
 )
 
 

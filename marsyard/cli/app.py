@@ -5,14 +5,16 @@ Commands import their dependencies when they run, so that ``--help`` is fast.
 
 from __future__ import annotations
 
+import importlib
 import json
+import os
 import sys
 import tomllib
 import traceback
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer import Option
@@ -138,13 +140,37 @@ def _print_version(is_requested: bool) -> None:
         raise typer.Exit
 
 
+#: Environment variable of the option `--render-device`.
+DEVICE_VARIABLE = "MARSYARD_RENDER_DEVICE"
+
+
 @app.callback()
 def _define_global_options(
     version: Annotated[
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
     ] = False,
+    render_device: Annotated[
+        Literal["llvm", "cuda"] | None,
+        Option(
+            envvar=DEVICE_VARIABLE,
+            help="Device that computes images: the processor (llvm, the default), or a graphics processor of NVIDIA.",
+        ),
+    ] = None,
 ) -> None:
-    pass
+    if render_device is not None:
+        _select_device(render_device)
+
+
+@handle_user_errors
+def _select_device(device: str) -> None:
+    """Select the device for this process and its workers, and check that it works."""
+    os.environ[DEVICE_VARIABLE] = device
+    from marsyard.campaigns.errors import CampaignError
+
+    try:
+        importlib.import_module("marsyard.sim.render.device")
+    except RuntimeError as error:  # its `RenderingError`, which cannot be imported if the device does not work
+        raise CampaignError(str(error)) from None
 
 
 #: Commands by help panel; the first word of a function's name is the command's name.

@@ -15,7 +15,7 @@ from marsyard.cli.options import JsonOption, console, handle_user_errors, size_t
 #: Kinds of cached files, and how they are rebuilt after removal.
 KINDS = {
     "terrain": "terrains of campaigns; rebuilt when a case needs one, seconds to minutes each",
-    "kernels": "compiled code; recompiled at the next run, about two minutes",
+    "kernels": "compiled code; recompiled at the next run, about a minute",
 }
 #: Kind of cached files with a size limit (MARSYARD_CACHE_GB).
 KIND_WITH_LIMIT = "terrain"

@@ -29,8 +29,8 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.parameters import NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.render import Frame, PixelRays, Scene, Sun, Texture, process_renderer
 from marsyard.sim.render.backend import Backend, RenderingError
-from marsyard.sim.render.kernels.shading import GROUND
 from marsyard.sim.render.rays import VIEW_SIDES_PX
+from marsyard.sim.render.shading import GROUND
 from marsyard.sim.terrain import Surface
 
 #: Spacing of the renderer's mesh at the centre, metres, and its relative growth per line. The mesh gives first guesses

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float64
 from marsyard.sim.dynamics.rover import RoverParameters, Stance
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render import Objects, may_cast_shadow
-from marsyard.sim.render.kernels.hierarchy import first_hits
 from marsyard.sim.render.rover import rover_objects, rover_sphere
+from marsyard.sim.render.triangles import first_hits
 
 Vector = Float64[np.ndarray, "3"]
 Triangles = Float64[np.ndarray, "triangles 3 3"]

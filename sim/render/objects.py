@@ -9,7 +9,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
-from marsyard.sim.render.kernels.hierarchy import Hierarchy, body_spheres, morton_codes, node_boxes, select_facing
+from marsyard.sim.render.arrays import Values, vectors_to_device
+from marsyard.sim.render.device import Array3f64
+from marsyard.sim.render.triangles import Hierarchy, body_spheres, morton_codes
 
 #: Triangle numbers are rendered as 24-bit colours; 0 is the ground.
 MAX_TRIANGLES = 2**24 - 2
@@ -99,7 +101,7 @@ class Objects:
     @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
         """Bounding sphere of each body, centred at the centre of its bounding box: centre and radius."""
-        return np.asarray(body_spheres(self.triangles, self.first_triangle))
+        return body_spheres(self.triangles, self.first_triangle)
 
     def in_cone(
         self,
@@ -113,7 +115,16 @@ class Objects:
         Returns their numbers; `apex_radius_m` is the maximum distance of that point from the apex.
         """
         is_selected = spheres_in_cone(self.spheres, apex, axis, half_angle_rad)
-        return np.asarray(select_facing(self.triangles, self._triangles_of(is_selected), *apex, apex_radius_m))
+        normals, offsets, lengths = (values[is_selected[self.body_of_triangle]] for values in self._planes)
+        numbers = self._triangles_of(is_selected)
+        return numbers[normals @ apex - offsets + apex_radius_m * lengths > 0.0]
+
+    @cached_property
+    def _planes(self) -> tuple[np.ndarray, ...]:
+        """Normals of the triangles, their products with a corner, and their lengths."""
+        a, b, c = (self.triangles[:, corner] for corner in range(3))
+        normals = np.cross(b - a, c - a)
+        return normals, np.einsum("na,na->n", normals, a), np.linalg.norm(normals, axis=1)
 
     def select(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
         """Return the selected bodies, renumbered."""
@@ -130,12 +141,22 @@ class Objects:
     def _triangles_of(self, is_selected: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "selected"]:
         return np.flatnonzero(np.repeat(is_selected, np.diff(self.first_triangle)))
 
-    def hierarchy(self, numbers: Int64[np.ndarray, "selected"]) -> Hierarchy:
-        """Build the bounding volume hierarchy of the triangles with these numbers."""
+    def hierarchy(self, numbers: Int64[np.ndarray, "selected"], centre: Float64[np.ndarray, "3"]) -> Hierarchy | None:
+        """Build the hierarchy of the triangles with these numbers for rays from near a centre; None without any."""
+        if len(numbers) == 0:
+            return None
         is_selected = np.zeros(len(self.triangles), dtype=np.bool_)
         is_selected[numbers] = True
         order = self._morton_order[is_selected[self._morton_order]]
-        return self.triangles, order, node_boxes(self.triangles, order)
+        # near triangles first: a hit then excludes all farther ones
+        squared_distance = np.square(self.triangles[order, 0] - centre).sum(axis=1)
+        order = order[np.argsort(np.frexp(squared_distance)[1], kind="stable")]
+        return Hierarchy.build(self.corners, order, centre)
+
+    @cached_property
+    def corners(self) -> Values:
+        """Corners of all triangles on the device."""
+        return vectors_to_device(Array3f64, self.triangles.reshape(-1, 3))
 
     @cached_property
     def _morton_order(self) -> Int64[np.ndarray, "triangles"]:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float as FloatArray
+from jaxtyping import Float32
 from pydantic import Field
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.render.kernels.photometry import scattered_irradiance
+from marsyard.sim.render.device import Float, Float64
+from marsyard.sim.render.reflectance import Law, Sky, scattered_irradiance
+from marsyard.sim.render.sunlight import Clouds, Grid
+from marsyard.sim.render.texture import Octaves
 
 #: Angular radius of the sun seen from Mars at 1.52 AU, radians (0.35 deg across).
 SUN_RADIUS_AT_MARS_RAD = 0.00305
@@ -23,7 +27,7 @@ SUN_RADIUS_AT_MARS_RAD = 0.00305
 class Sun:
     """Direct sunlight: unit vector towards the sun in world axes, and angular radius of its disc."""
 
-    direction: Float[np.ndarray, "3"]
+    direction: FloatArray[np.ndarray, "3"]
     angular_radius_rad: float = SUN_RADIUS_AT_MARS_RAD
 
     def __post_init__(self) -> None:
@@ -63,13 +67,14 @@ class DustySky:
                 "allowed: above 0, above 0 and at most 1, at least 0 and below 1"
             )
 
-    def coefficients(self, sun_z: float, sky_fraction: float) -> tuple[float, float, float, float]:
-        """Coefficients of `sky_brightness` (kernel): uniform radiance; factor, depth, asymmetry of scattered light."""
+    def model(self, sun_z: float, sky_fraction: float) -> Sky:
+        """Return the sky whose irradiance without the forward peak is `sky_fraction`."""
         depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
         scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
         without_peak = 1.0 - self.asymmetry**2
         scattered = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
-        return (max(sky_fraction - scattered, 0.0), scale * min(sky_fraction / scattered, 1.0), depth, self.asymmetry)
+        uniform, scattering = max(sky_fraction - scattered, 0.0), scale * min(sky_fraction / scattered, 1.0)
+        return Sky(*map(Float64, (uniform, scattering, depth, self.asymmetry)))
 
 
 @dataclass(frozen=True)
@@ -106,20 +111,17 @@ class Photometry:
         """Compute K of the law."""
         return 1.0 / _spherical_albedo(self.lunar_fraction, self.surge_amplitude, self.surge_width)
 
-    def law(self, sun: Sun, caster_diameter_m: float) -> Float64[np.ndarray, "8"]:
-        """Coefficients of the reflectance kernel (`marsyard.sim.render.kernels.structs.Light`).
-
-        `caster_diameter_m` is the diameter of a round body at the camera that casts a shadow; 0 for none.
-        """
+    def law(self, sun: Sun) -> Law:
+        """Return the reflectance law under a sun."""
         ground_light = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_fraction)
         law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation())
-        return np.array([*law, self.sky_fraction, ground_light, caster_diameter_m, sun.angular_radius_rad])
+        return Law(*map(Float, (*law, self.sky_fraction, ground_light)))
 
-    def sky_coefficients(self, sun: Sun) -> Float64[np.ndarray, "4"]:
-        """Coefficients of the kernel `sky_brightness`."""
+    def sky_model(self, sun: Sun) -> Sky:
+        """Return the sky in pixels without ground."""
         if self.sky is None:
-            return np.array([self.sky_radiance, 0.0, 0.0, 0.0])
-        return np.array(self.sky.coefficients(float(sun.direction[2]), self.sky_fraction))
+            return Sky(Float64(self.sky_radiance), None, Float64(0.0), Float64(0.0))
+        return self.sky.model(float(sun.direction[2]), self.sky_fraction)
 
 
 @dataclass(frozen=True)
@@ -133,9 +135,10 @@ class Texture:
     coarsest_m: float = 1.0
     amplitudes: tuple[float, ...] = ()
 
-    def arrays(self) -> tuple[float, Float64[np.ndarray, "octaves"]]:
-        """Arguments of the texture kernel."""
-        return float(self.coarsest_m), np.asarray(self.amplitudes, dtype=np.float64)
+    @property
+    def octaves(self) -> Octaves:
+        """The octaves on the device."""
+        return Octaves.of(self.coarsest_m, self.amplitudes)
 
 
 _scattered_irradiance = cache(scattered_irradiance)
@@ -209,7 +212,7 @@ class CloudLayer:
     so the cover does not depend on the sun's elevation.
 
     - height_m: height of the layer above z = 0
-    - cover: cloud fraction of each cell, read-only; y increases with the row, and cells are `cell_m` apart
+    - cover: cloud fraction of each cell; y increases with the row, and cells are `cell_m` apart
     """
 
     parameters: CloudParameters
@@ -227,7 +230,7 @@ class CloudLayer:
         """
         noise = np.fft.rfft2(rng.standard_normal((CELLS, CELLS)))
         if parameters.cover == 0.0:
-            return cls(parameters, ground_m + parameters.base_m, _read_only(np.zeros((CELLS, CELLS))))
+            return cls(parameters, ground_m + parameters.base_m, np.zeros((CELLS, CELLS), dtype=np.float32))
         # squared wavenumbers of the real transform's terms, rad2/m2
         spacing = parameters.size_m * PERIOD_SIZES / CELLS
         y, x = 2.0 * np.pi * np.fft.fftfreq(CELLS, spacing), 2.0 * np.pi * np.fft.rfftfreq(CELLS, spacing)
@@ -248,43 +251,37 @@ class CloudLayer:
         smoothed = np.fft.irfft2(
             np.fft.rfft2(cloud_fraction) * np.exp(-0.5 * squared_k * parameters.edge_m**2), s=(CELLS, CELLS)
         )
-        return cls(parameters, ground_m + parameters.base_m, _read_only(np.clip(smoothed, 0.0, 1.0)))
+        return cls(parameters, ground_m + parameters.base_m, np.clip(smoothed, 0.0, 1.0).astype(np.float32))
 
     @property
     def cell_m(self) -> float:
         """Distance between cell centres, metres."""
         return self.parameters.size_m * PERIOD_SIZES / CELLS
 
-    def coefficients(self, sun: Sun, time_s: float) -> Float64[np.ndarray, "5"]:
-        """Coefficients of the kernel: cells per metre, height, drift to east and north, opacity of a cloud."""
+    def at_time(self, sun: Sun, time_s: float) -> Clouds:
+        """Return the clouds at their positions at a time."""
         p = self.parameters
-        drift = p.wind_east_m_s * time_s, p.wind_north_m_s * time_s
-        return np.array([1.0 / self.cell_m, self.height_m, *drift, 1.0 - p.direct_transmittance(sun)])
+        numbers = (self.height_m, p.wind_east_m_s * time_s, p.wind_north_m_s * time_s, p.direct_transmittance(sun))
+        height, east, north, transmittance = map(Float64, numbers)
+        return Clouds(self._cover_grid, height, east, north, 1.0 - transmittance)
+
+    @cached_property
+    def _cover_grid(self) -> Grid:
+        return Grid.of(self.cover, 1.0 / self.cell_m)
 
     def transmittance(
-        self, points: Float[np.ndarray, "*batch 3"], sun: Sun, time_s: float
-    ) -> Float64[np.ndarray, "*batch"]:
+        self, points: FloatArray[np.ndarray, "*batch 3"], sun: Sun, time_s: float
+    ) -> FloatArray[np.ndarray, "*batch"]:
         """Fraction of direct sunlight that reaches world points (metres) through the layer; NaN for NaN points.
 
         Ground truth of an image: ``clouds.transmittance(frame.points_world(), scene.sun, time_s)``.
         """
-        _cells, height, east, north, opacity = self.coefficients(sun, time_s)
-        direction = np.asarray(sun.direction, dtype=np.float64)
-        distance = np.maximum(height - points[..., 2], 0.0) / direction[2]
-        drifts = ((0, east), (1, north))
+        p, direction = self.parameters, np.asarray(sun.direction, dtype=np.float64)
+        opacity = 1.0 - p.direct_transmittance(sun)
+        distance = np.maximum(self.height_m - points[..., 2], 0.0) / direction[2]
+        drifts = ((0, p.wind_east_m_s * time_s), (1, p.wind_north_m_s * time_s))
         x, y = ((points[..., k] + distance * direction[k] - drift) / self.cell_m for k, drift in drifts)
         is_finite = np.isfinite(x) & np.isfinite(y)
         cells = np.where(is_finite, np.stack([y, x]), 0.0)
         cover = map_coordinates(self.cover.astype(np.float64), cells, order=1, mode="grid-wrap")
         return np.asarray(np.where(is_finite, 1.0 - opacity * cover, np.nan))
-
-
-def no_cover() -> Float32[np.ndarray, "one one"]:
-    """Return the cloud cover of a scene without clouds, with the same numba type as that of a cloud layer."""
-    return _read_only(np.zeros((1, 1)))
-
-
-def _read_only(cover: Float64[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
-    array = np.ascontiguousarray(cover, dtype=np.float32)
-    array.setflags(write=False)
-    return array

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 
+import drjit as dr
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rotation_matrix
+from marsyard.sim.render.arrays import Values, to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.structs import Rays
-from marsyard.sim.render.kernels.views import max_image_radius, min_component, pixel_angles, sum_of_vectors
+from marsyard.sim.render.device import Array3f, Array3f64, Float, UInt32
+from marsyard.sim.render.edges import pixel_angles
+from marsyard.sim.render.primary import Rays
 from marsyard.sim.render.scene import Cone
 
 #: Sizes of the pinhole views, samples along a side. A camera uses the smallest view that is at least `_SPARE_PX` larger
@@ -53,17 +56,23 @@ class PixelRays:
     focal_px: Float64[np.ndarray, "views"]
     view_of_pixel: UInt8[np.ndarray, "pixels"]
 
-    @property
-    def rays(self) -> Rays:
-        """The rays as a struct for kernels."""
-        return Rays(self.origins, self.directions, self.pixel_angles)
+    @cached_property
+    def device(self) -> Rays:
+        """The rays on the device."""
+        origins = vectors_to_device(Array3f, self.origins) if self.origin_radius_m > 0.0 else None
+        return Rays(vectors_to_device(Array3f, self.directions), origins, to_device(Float, self.pixel_angles))
+
+    @cached_property
+    def device_view_of_pixel(self) -> Values:
+        """The view of each pixel on the device."""
+        return to_device(UInt32, self.view_of_pixel)
 
     @cached_property
     def axis(self) -> Float64[np.ndarray, "3"]:
         """Mean direction of all rays, unit vector in body axes."""
-        mean = np.array(sum_of_vectors(self.directions))
+        mean = self.directions.sum(axis=0, dtype=np.float64)
         mean /= np.linalg.norm(mean)
-        return mean
+        return np.asarray(mean)
 
     @cached_property
     def pixel_rad(self) -> float:
@@ -73,7 +82,7 @@ class PixelRays:
     @cached_property
     def half_angle_rad(self) -> float:
         """Maximum angle between a ray and the axis."""
-        return float(np.arccos(np.clip(min_component(self.directions, self.axis), -1.0, 1.0)))
+        return float(np.arccos(np.clip((self.directions @ self.axis).min(), -1.0, 1.0)))
 
     @cached_property
     def origin_radius_m(self) -> float:
@@ -100,7 +109,7 @@ class PixelRays:
         side = next((size for size in VIEW_SIDES_PX if longest <= size - _SPARE_PX), VIEW_SIDE_PX)
         # focal lengths with which the rays fill the views
         focal = [
-            float((side / 2.0 - MARGIN_PX) / max_image_radius(directions[part], part_axes))
+            float((side / 2.0 - MARGIN_PX) / _max_image_radius(directions[part], part_axes))
             for part, part_axes in zip(parts, axes, strict=True)
         ]
         if ray_origins.strides[:2] == (0, 0):
@@ -113,12 +122,26 @@ class PixelRays:
             origins=origins,
             directions=directions.reshape(-1, 3).astype(np.float32),
             size=(columns, rows),
-            pixel_angles=pixel_angles(directions).ravel(),
+            pixel_angles=_pixel_angles(directions).ravel(),
             view_side_px=side,
             view_from_body=np.stack(axes),
             focal_px=np.array(focal),
             view_of_pixel=view_of_pixel.ravel(),
         )
+
+
+def _pixel_angles(directions: Float64[np.ndarray, "rows columns 3"]) -> Float32[np.ndarray, "rows columns"]:
+    """Square root of each pixel's solid angle, radians; the sides of a pixel are differences of the unit vectors."""
+    rows, columns = directions.shape[:2]
+    vectors = vectors_to_device(Array3f64, directions.reshape(-1, 3))
+    pixel = dr.arange(UInt32, rows * columns)
+    return to_host(pixel_angles(vectors, pixel, UInt32(columns), UInt32(rows))).reshape(rows, columns)
+
+
+def _max_image_radius(directions: Float64[np.ndarray, "rows columns 3"], view: Float64[np.ndarray, "3 3"]) -> float:
+    """Maximum absolute image coordinate (x or y) of rays at a focal length of 1; the rows of `view` are its axes."""
+    components = directions @ view.T
+    return float(np.abs(components[..., :2] / components[..., 2:]).max())
 
 
 def _divide_field_of_view(

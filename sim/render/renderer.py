@@ -15,31 +15,37 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from weakref import ref
 
+import drjit as dr
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int, Int32, Int64
-from numba import config
-from numpy.typing import NDArray
+from jaxtyping import Float as FloatArray
+from jaxtyping import Float32, Int64
+from jaxtyping import Float64 as Float64Array
+from jaxtyping import Int as IntArray
+from jaxtyping import Int32 as Int32Array
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.frames import rotation_matrix
+from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import Backend, RenderingError
-from marsyard.sim.render.kernels.edges import mark_edges, split_rays, trace_subpixel_rays
-from marsyard.sim.render.kernels.primary import MAX_GRAZING_SINE, trace_primary_rays
-from marsyard.sim.render.kernels.shading import shade
-from marsyard.sim.render.kernels.strips import STRIP
-from marsyard.sim.render.kernels.structs import Array32, Extent, Ground, Hits, Light, Pose, Rays, ShadedImage, Views
+from marsyard.sim.render.device import Float, Float64, Int32, UInt32, description
+from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
+from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
+from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Pose, Rays, Views, trace_primary_rays
 from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays
 from marsyard.sim.render.scene import Scene
+from marsyard.sim.render.shading import Light, ShadedImage, shade
+from marsyard.sim.render.shadows import Occluders, visible_sun
+from marsyard.sim.render.spline import Terrain
+from marsyard.sim.render.triangles import Hierarchy
 from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.kernels import Level
 
 if TYPE_CHECKING:
     import trimesh
@@ -49,10 +55,6 @@ if TYPE_CHECKING:
 #: Number of terrain levels (resolutions) in a kernel call: kernels are compiled for a fixed number of arrays. A terrain
 #: with 2**15 samples along a side has 12 levels.
 LEVELS = 12
-#: Infinite height bound, which disables block skipping where it does not save time.
-NO_CEILING = np.full((1, 1), np.inf, dtype=np.float32)
-#: Minimum number of pixels for multithreading.
-MIN_PIXELS = 20_000
 #: Options of glibc's mallopt (malloc.h).
 _M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD = -3, -1
 #: Size from which memory is mapped separately: terrains are larger, images are smaller.
@@ -67,24 +69,21 @@ _PROBES = 9
 
 def edge_pixels(
     radiance: Float32[np.ndarray, "rows columns"],
-    distance: Float64[np.ndarray, "rows columns"],
-    body: Int32[np.ndarray, "rows columns"],
+    distance: Float64Array[np.ndarray, "rows columns"],
+    body: Int32Array[np.ndarray, "rows columns"],
 ) -> Int64[np.ndarray, "pixels"]:
     """Flat indices of the pixels on both sides of visible edges."""
-    is_edge = np.zeros(radiance.shape, dtype=np.bool_)
-    mark_edges(radiance, distance, body, is_edge)
-    return np.flatnonzero(is_edge)
+    rows, columns = radiance.shape
+    layers = (to_device(Float, radiance), to_device(Float64, distance), to_device(Int32, body))
+    return np.flatnonzero(to_host(mark_edges(*layers, UInt32(columns), UInt32(rows))))
 
 
 def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> Rays:
     """Compute `side` x `side` rays in each of these pixels, with the pixel angle of the pixel."""
     columns, rows = rays.size
-    count = len(pixels) * side**2
-    origins, directions = np.zeros((count, 3), dtype=np.float32), np.empty((count, 3), dtype=np.float32)
-    if rays.origin_radius_m > 0.0:
-        split_rays(rays.origins, (rows, columns), pixels, side, False, origins)
-    split_rays(rays.directions, (rows, columns), pixels, side, True, directions)
-    return Rays(origins, directions, np.repeat(rays.pixel_angles[pixels], side**2))
+    pixel = to_device(UInt32, np.repeat(pixels, side**2))
+    ray_in_pixel = to_device(UInt32, np.tile(np.arange(side**2), len(pixels)))
+    return split_rays(rays.device, UInt32(columns), UInt32(rows), pixel, ray_in_pixel, UInt32(side))
 
 
 #: Index of rows and columns of an image.
@@ -103,13 +102,13 @@ class Frame:
     """
 
     radiance: Float32[np.ndarray, "rows columns"]
-    range_m: Float64[np.ndarray, "rows columns"]
-    body: Int32[np.ndarray, "rows columns"]
+    range_m: Float64Array[np.ndarray, "rows columns"]
+    body: Int32Array[np.ndarray, "rows columns"]
     normal: Float32[np.ndarray, "rows columns 3"]
     world_from_body: RigidTransform
     rays: PixelRays
 
-    def points_world(self, pixels: PixelIndex = np.s_[:, :]) -> Float64[np.ndarray, "*selected 3"]:
+    def points_world(self, pixels: PixelIndex = np.s_[:, :]) -> Float64Array[np.ndarray, "*selected 3"]:
         """Return the world points, metres, that the selected pixels see; NaN for the sky.
 
         `pixels` is an index of rows and columns: slices, or arrays of row and column numbers.
@@ -124,6 +123,48 @@ class Frame:
         return np.asarray(self.world_from_body.apply(points_body)).reshape(*distance.shape, 3)
 
 
+@dataclass(frozen=True, eq=False)
+class _Tracer:
+    """A scene and a camera in its pose, on the device."""
+
+    scene: Scene
+    rays: PixelRays
+    terrain: Terrain
+    extent: Extent
+    pose: Pose
+    tree: Hierarchy | None
+    light: Light
+    occluders: Occluders
+
+    def trace_pixels(self, views: Views, is_grazing: bool) -> Hits:
+        """Trace the ray of each pixel."""
+        geometry = self.terrain, self.extent, views, self.pose, self.rays.device, self.tree
+        return trace_primary_rays(*geometry, is_grazing)
+
+    def shade_hits(self, rays: Rays, hits: Hits) -> ShadedImage:
+        """Compute radiance, body and normal at the hits of rays."""
+        light, materials, geometry = self.light, self.scene.materials, (self.terrain, self.pose, rays, hits)
+        sun_fraction = visible_sun(*geometry, light.sun, light.sun_radius, self.occluders, materials.objects)
+        return shade(*geometry, light, sun_fraction, materials)
+
+    def smooth_edges(self, image: ShadedImage, hits: Hits, radiance: Float32[np.ndarray, "pixels"]) -> None:
+        """Replace the radiance of pixels at edges by the mean of several rays."""
+        columns, rows = map(UInt32, self.rays.size)
+        pixels = np.flatnonzero(to_host(mark_edges(image.radiance, hits.distance, image.body, columns, rows)))
+        if len(pixels) > 0:
+            rays, subpixel_hits = self.trace_subpixels(pixels, hits)
+            subpixel_radiance = to_host(self.shade_hits(rays, subpixel_hits).radiance)
+            radiance[pixels] = subpixel_radiance.reshape(len(pixels), -1).mean(axis=1)
+
+    def trace_subpixels(self, pixels: Int64[np.ndarray, "pixels"], hits: Hits) -> tuple[Rays, Hits]:
+        """Trace several rays in each of these pixels."""
+        columns, rows = map(UInt32, self.rays.size)
+        side = self.scene.edge_rays
+        rays, pixel = supersample_rays(self.rays, pixels, side), to_device(UInt32, np.repeat(pixels, side**2))
+        geometry = self.terrain, self.extent, self.pose, self.tree
+        return rays, trace_subpixel_rays(*geometry, columns, rows, pixel, rays, hits)
+
+
 class Renderer:
     """Renderer of scenes through cameras. Create one per process, in the process that uses it."""
 
@@ -136,48 +177,39 @@ class Renderer:
         keep_freed_memory()
 
     def description(self) -> str:
-        """Renderer and version strings of OpenGL."""
-        return self._view_renderer(VIEW_SIDE_PX).description()
+        """Renderer and version strings of OpenGL, and the version of the compiler of the device."""
+        return f"{self._view_renderer(VIEW_SIDE_PX).description()} / {description()}"
 
     def render(self, scene: Scene, rays: PixelRays, world_from_body: RigidTransform, time_s: float = 0.0) -> Frame:
         """Render the scene through a camera in the body frame, with the clouds at their positions at this time.
 
         Raises RenderingError if the camera is at or below the ground.
         """
-        pose = Pose(rotation_matrix(world_from_body), world_from_body.apply(rays.centre))
-        clearance = pose.position[2] - float(scene.surface.height(pose.position[0], pose.position[1]))
+        rotation, position = rotation_matrix(world_from_body), world_from_body.apply(rays.centre)
+        clearance = position[2] - float(scene.surface.height(position[0], position[1]))
         if clearance <= 0.0:
-            raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {pose.position}")
+            raise RenderingError(f"the camera is {-clearance:.2f} m below the ground at {position}")
         # a margin of one pixel for the subpixel rays of the pixels at the image's border
         half_angle_rad = rays.half_angle_rad + rays.pixel_rad
         numbers = scene.objects.in_cone(
-            pose.position, pose.rotation @ rays.axis, half_angle_rad, apex_radius_m=rays.origin_radius_m
+            position, rotation @ rays.axis, half_angle_rad, apex_radius_m=rays.origin_radius_m
         )
-        views = self._draw_views(scene, rays, pose, clearance, numbers)
-        columns, rows = rays.size
-        highest_ray = np.arcsin(np.clip((pose.rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
+        views = self._draw_views(scene, rays, rotation, position, clearance, numbers)
+        highest_ray = np.arcsin(np.clip((rotation @ rays.axis)[2], -1.0, 1.0)) + rays.half_angle_rad
         is_grazing = bool(np.sin(min(highest_ray, 0.5 * np.pi)) > -MAX_GRAZING_SINE)
         # height bounds save time only for rays almost parallel to the ground
-        ground = ground_struct(scene.surface, scene.extent_m, ceilings=is_grazing)
-        hits, light, tree = _empty_hits(rows * columns, scene), scene.light(time_s), scene.objects.hierarchy(numbers)
-
-        def trace_part(part: slice) -> None:
-            part_views = views._replace(view_of_pixel=rays.view_of_pixel[part])
-            part_rays, part_hits = Rays(*_slice_arrays(rays.rays, part)), Hits(*_slice_arrays(hits, part))
-            trace_primary_rays(ground, part_views, pose, part_rays, tree, part_hits)
-
-        run_in_parts(trace_part, rows * columns)
-        image = _shade(scene, ground, pose, rays.rays, hits, light)
-        radiance, body = image.radiance.reshape(rows, columns), image.body.reshape(rows, columns)
-        range_m, normal = hits.distance.reshape(rows, columns), image.normal.reshape(rows, columns, 3)
+        terrain = scene.terrain_with_ceilings if is_grazing else scene.terrain
+        tree, light = scene.objects.hierarchy(numbers, position), scene.light(time_s)
+        pose, occluders = Pose.of(rotation, position), scene.occluders
+        tracer = _Tracer(scene, rays, terrain, scene.extent, pose, tree, light, occluders)
+        hits = tracer.trace_pixels(views, is_grazing)
+        image = tracer.shade_hits(rays.device, hits)
+        radiance, body, range_m = to_host(image.radiance), to_host(image.body), to_host(hits.distance)
         if scene.edge_rays > 1:
-            pixels = edge_pixels(radiance, range_m, body)
-            subpixel_rays = supersample_rays(rays, pixels, scene.edge_rays)
-            subpixel_hits = _empty_hits(len(subpixel_rays.directions), scene)
-            trace_subpixel_rays(ground, pose, tree, columns, pixels, subpixel_rays, hits, subpixel_hits)
-            subpixel_radiance = _shade(scene, ground, pose, subpixel_rays, subpixel_hits, light).radiance
-            image.radiance[pixels] = subpixel_radiance.reshape(len(pixels), scene.edge_rays**2).mean(axis=1)
-        return Frame(radiance, range_m, body, normal, world_from_body, rays)
+            tracer.smooth_edges(image, hits, radiance)
+        columns, rows = rays.size
+        radiance, body, range_m = (layer.reshape(rows, columns) for layer in (radiance, body, range_m))
+        return Frame(radiance, range_m, body, to_host(image.normal).reshape(rows, columns, 3), world_from_body, rays)
 
     def close(self) -> None:
         """Delete the OpenGL contexts."""
@@ -192,22 +224,29 @@ class Renderer:
         return self._views[side_px]
 
     def _draw_views(
-        self, scene: Scene, rays: PixelRays, pose: Pose, clearance_m: float, numbers: Int64[np.ndarray, "triangles"]
+        self,
+        scene: Scene,
+        rays: PixelRays,
+        rotation: Float64Array[np.ndarray, "3 3"],
+        position: Float64Array[np.ndarray, "3"],
+        clearance_m: float,
+        numbers: Int64[np.ndarray, "triangles"],
     ) -> Views:
         """Draw the pinhole views by pyrender: the ground, and the triangles of objects with these numbers.
 
-        `clearance_m` is the height of the camera above the ground.
+        `rotation` and `position` are the camera's pose, `clearance_m` is the height of the camera above the ground.
         """
         if self._last_scene is None or self._last_scene() is not scene:
             self._last_scene = ref(scene)
             self._scene_count += 1
+            dr.flush_malloc_cache()
             if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
                 return_freed_memory()
         # the visible ground lies between two horizontal planes: a ray ends at the lower one, or at the mesh's border
         columns, rows = rays.size
         probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
-        directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ pose.rotation.T
-        position, (low, high) = pose.position, scene.height_range_m
+        directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ rotation.T
+        low, high = scene.height_range_m
         descent_rates = np.minimum(directions[:, 2], -1e-9)
         plane_z = (low, max(high, position[2]))
         end_distances = [
@@ -228,39 +267,15 @@ class Renderer:
         images = []
         for view_from_body, focal in zip(rays.view_from_body, rays.focal_px, strict=True):
             world_from_view = np.eye(4)
-            world_from_view[:3, :3] = pose.rotation @ view_from_body.T
-            world_from_view[:3, 3] = pose.position
+            world_from_view[:3, :3] = rotation @ view_from_body.T
+            world_from_view[:3, 3] = position
             # near plane at 5 % of the height above the ground: nearer surfaces are clipped; the depth is only a first
             # guess, so its low resolution at large distances has no effect on the image
             far = 2.0 * scene.mesh_half_width_m + clearance_m
             images.append(renderer.draw(world_from_view, float(focal), 0.05 * clearance_m, far))
         # a single view is not copied
         depth, ids = (maps[0][np.newaxis] if len(maps) == 1 else np.stack(maps) for maps in zip(*images, strict=True))
-        return Views(depth, ids, rays.focal_px, rays.view_from_body, rays.view_of_pixel)
-
-
-def _empty_hits(count: int, scene: Scene) -> Hits:
-    """Allocate the intersections of `count` rays; without objects there are no weights of triangle corners."""
-    weights = np.empty((count if len(scene.objects) > 0 else 0, 2), np.float32)
-    return Hits(np.empty(count), np.empty(count, np.int32), weights, np.empty(count, np.int8))
-
-
-def _slice_arrays(arrays: Iterable[NDArray[Any]], part: slice) -> list[NDArray[Any]]:
-    return [array[part] for array in arrays]
-
-
-def _shade(scene: Scene, ground: Ground, pose: Pose, rays: Rays, hits: Hits, light: Light) -> ShadedImage:
-    """Compute radiance, body and normal at the intersections, in threads."""
-    count = len(rays.directions)
-    image = ShadedImage(np.empty(count, np.float32), np.empty(count, np.int32), np.empty((count, 3), np.float32))
-    occluders, materials = scene.occluders, scene.materials
-
-    def shade_part(part: slice) -> None:
-        part_rays, part_hits, part_image = (_slice_arrays(arrays, part) for arrays in (rays, hits, image))
-        shade(ground, pose, Rays(*part_rays), Hits(*part_hits), light, occluders, materials, ShadedImage(*part_image))
-
-    run_in_parts(shade_part, count)
-    return image
+        return Views.of(depth, ids, rays.focal_px, rays.view_from_body, rays.device_view_of_pixel)
 
 
 def create_depth_renderer(side_px: int, backend: Backend) -> DepthRenderer:
@@ -298,26 +313,6 @@ def process_renderer(backend: Backend) -> Renderer:
     return Renderer(backend)
 
 
-def run_in_parts(process_part: Callable[[slice], None], pixels: int, threads: int | None = None) -> None:
-    """Call `process_part` on slices of all pixels in threads; the result does not depend on the number of threads.
-
-    The default of `threads` is numba's `NUMBA_NUM_THREADS` (1 in a campaign's worker). Kernels release the GIL.
-    """
-    count = config.NUMBA_NUM_THREADS if threads is None else threads
-    if count == 1 or pixels < MIN_PIXELS:
-        process_part(slice(0, pixels))
-        return
-    # align the slices with the kernels' pixel strips
-    size = -(-pixels // count // STRIP) * STRIP
-    parts = [slice(first, min(first + size, pixels)) for first in range(0, pixels, size)]
-    list(_pool(count).map(process_part, parts))
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="pixels")
-
-
 def keep_freed_memory() -> None:
     """Configure glibc to reuse the memory of freed images; this saves 4 % of the run time of a descent case."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
@@ -333,23 +328,16 @@ def return_freed_memory() -> None:
         malloc_trim(0)
 
 
-def pyramid(surface: Surface) -> tuple[Array32, ...]:
+def pyramid(surface: Surface) -> tuple[Level, ...]:
     """Return `LEVELS` levels of a surface; the last level is repeated."""
     return surface.levels + surface.levels[-1:] * (LEVELS - len(surface.levels))
 
 
-def ground_struct(surface: Surface, extent_m: Extent, *, ceilings: bool) -> Ground:
-    """Pack a surface for kernels, with or without the height bounds of its levels."""
-    bounds = surface.ceilings if ceilings else (NO_CEILING,)
-    bounds += bounds[-1:] * (LEVELS - len(bounds))
-    return Ground(pyramid(surface), bounds, len(surface.levels) - 1, surface.spacing_m, extent_m)
-
-
 def ground_mesh(
     surface: Surface,
-    x: Float[np.ndarray, "columns"],
-    y: Float[np.ndarray, "rows"],
-    spans: Int[np.ndarray, "strips 2"] | None = None,
+    x: FloatArray[np.ndarray, "columns"],
+    y: FloatArray[np.ndarray, "rows"],
+    spans: IntArray[np.ndarray, "strips 2"] | None = None,
 ) -> trimesh.Trimesh:
     """Triangulate the ground over a grid with lines at `x` and `y`, world coordinates.
 
@@ -369,13 +357,15 @@ def ground_mesh(
 
 
 def cell_spans_in_hull(
-    x: Float[np.ndarray, "columns"], y: Float[np.ndarray, "rows"], points: Float[np.ndarray, "points 2"]
-) -> Int[np.ndarray, "strips 2"]:
+    x: FloatArray[np.ndarray, "columns"], y: FloatArray[np.ndarray, "rows"], points: FloatArray[np.ndarray, "points 2"]
+) -> IntArray[np.ndarray, "strips 2"]:
     """Find the spans of cells, for `ground_mesh`, that overlap the convex hull of points (not all on a line)."""
     return np.asarray(spans_in_hull(x, y, points[ConvexHull(points).vertices]))
 
 
-def grid_lines_between(lines: Float[np.ndarray, "count"], low: float, high: float) -> Float[np.ndarray, "selected"]:
+def grid_lines_between(
+    lines: FloatArray[np.ndarray, "count"], low: float, high: float
+) -> FloatArray[np.ndarray, "selected"]:
     """Select the grid lines between two bounds, with a margin of two lines on each side; at least three lines."""
     first = max(int(np.searchsorted(lines, low)) - 2, 0)
     last = min(int(np.searchsorted(lines, high)) + 2, lines.size)

@@ -8,52 +8,45 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool as BoolArray
+from jaxtyping import Float64 as FloatArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import brentq
 
-from marsyard.sim.render.kernels.casters import Casters, list_casters
-from marsyard.sim.render.kernels.ground import height_range, max_rises
-from marsyard.sim.render.kernels.shading import Occluders
-from marsyard.sim.render.kernels.structs import Bounds, Extent, Footprint, GroundShadow, Light, Materials, MicroRelief
-from marsyard.sim.render.kernels.sun import heights_in_rows, sweep_shadow
+from marsyard.sim.render.arrays import to_device, vectors_to_device
+from marsyard.sim.render.casters import Casters, list_casters
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.ground import Extent
+from marsyard.sim.render.kernels.sweep import height_range, heights_in_rows, max_rises, sweep_shadow
 from marsyard.sim.render.objects import Objects, spheres_in_cone
-from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture, no_cover
+from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture
+from marsyard.sim.render.shading import Light, Materials
+from marsyard.sim.render.shadows import ObjectSurfaces, Occluders
+from marsyard.sim.render.spline import Terrain
+from marsyard.sim.render.sunlight import Footprint, Grid, GroundShadow
+from marsyard.sim.render.texture import MicroRelief, RoughGround
 from marsyard.sim.terrain import Surface
-from marsyard.sim.terrain.surface import UNIFORM
+from marsyard.sim.terrain.surface import UNIFORM, empty_aligned
 
 #: Rounding error of a mean of heights of a few km in single precision, metres.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 NO_RELIEF = MicroRelief(1.0, np.empty(0), UNIFORM, 0.0)
-NO_CLOUDS = (no_cover(), np.zeros(5))
 #: Cone: apex in world axes, unit vector along the axis, and half angle in radians.
-Cone = tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"], float]
+Cone = tuple[FloatArray[np.ndarray, "3"], FloatArray[np.ndarray, "3"], float]
 #: Centre and radius of a bounding sphere of each body, metres.
-Spheres = Float64[np.ndarray, "bodies 4"]
+Spheres = FloatArray[np.ndarray, "bodies 4"]
 #: Maximum number of cells along a side of a shadow footprint (`shadow_footprint`).
 MAX_CELLS = 512
-#: Shadow footprint of objects that may shade all ground.
-ALL_GROUND = Footprint(np.ones((1, 1), dtype=np.bool_), 0.0, 0.0, 0.0)
+#: Minimum and maximum x, then y, metres.
+Bounds = tuple[float, float, float, float]
 #: Maximum number of samples along a side of the grid on which the ground's shadow is computed.
 SHADOW_SIDE = 4096
-#: Result of `ground_shadow` for ground without shadow.
-NO_SHADOW = GroundShadow(
-    np.full((1, 1), -np.inf, dtype=np.float32), np.zeros((1, 1), dtype=np.uint8), False, 1.0, 0, 1.0, 1.0, 0.0
-)
 #: Number of directions along the rim of a cone whose convex hull bounds the ground in the cone, and the fraction by
 #: which the hull is enlarged.
 _RIM_DIRECTIONS, _MARGIN = 64, 0.01
 #: Additional samples at each border of a grid that covers only the visible ground, for interpolation and rounding.
 _BORDER_SAMPLES = 4
-
-
-def _read_only(value: Any) -> Any:
-    """Return a read-only view of an array, for which numba has compiled the kernels; other values unchanged."""
-    if isinstance(value, np.ndarray):
-        value = value.view()
-        value.setflags(write=False)
-    return value
 
 
 @dataclass(frozen=True)
@@ -93,7 +86,7 @@ class Scene:
     visible_m: Bounds | None = None
 
     @cached_property
-    def mesh_offsets(self) -> Float64[np.ndarray, "lines"]:
+    def mesh_offsets(self) -> FloatArray[np.ndarray, "lines"]:
         """Offsets of the mesh lines from the centre, metres."""
         return graded_offsets(self.mesh_half_width_m, self.mesh_finest_m, self.mesh_lines)
 
@@ -157,11 +150,22 @@ class Scene:
         return self._keep_results(scene, "mesh_offsets", "height_range_m", "max_slopes")
 
     @property
-    def extent_m(self) -> Extent:
-        """Minimum and maximum x, then y, of the mesh, and maximum height of the surface, metres."""
+    def extent(self) -> Extent:
+        """Bounds of the mesh and of the height of the surface."""
         (x, y), half_width = self.centre_m, self.mesh_half_width_m
         # coarser levels are means of finer ones: none is higher, except for rounding
-        return x - half_width, x + half_width, y - half_width, y + half_width, self.height_range_m[1] + ROUNDING_M
+        highest = self.height_range_m[1] + ROUNDING_M
+        return Extent(*map(Float64, (x - half_width, x + half_width, y - half_width, y + half_width, highest)))
+
+    @cached_property
+    def terrain(self) -> Terrain:
+        """The surface on the device."""
+        return Terrain.of_surface(self.surface, ceilings=False)
+
+    @cached_property
+    def terrain_with_ceilings(self) -> Terrain:
+        """The surface on the device, with the height bounds of its levels."""
+        return Terrain.of_surface(self.surface, ceilings=True)
 
     @cached_property
     def height_range_m(self) -> tuple[float, float]:
@@ -175,47 +179,58 @@ class Scene:
         return slope_bounds(self.surface, self.sun)
 
     @cached_property
-    def shadow(self) -> GroundShadow:
-        """Shadow of the ground."""
+    def shadow(self) -> GroundShadow | None:
+        """Shadow of the ground; None if all ground is lit, or the sun is not up."""
         if not self.ground_shadows or self.sun.direction[2] <= 0.0 or is_sun_above_slopes(self.sun, self.max_slopes):
-            return NO_SHADOW
+            return None
         return ground_shadow(self.surface, self.sun, self.height_range_m, self.visible_m)
 
     @cached_property
-    def footprint(self) -> Footprint:
-        """Region of the ground that objects may shade."""
+    def footprint(self) -> Footprint | None:
+        """Region of the ground that objects may shade; None for all ground."""
         if self.among_objects:
-            return ALL_GROUND
+            return None
         sun = np.asarray(self.sun.direction, dtype=np.float64)
         return shadow_footprint(self.objects.spheres, sun, self.height_range_m[0])
 
     @cached_property
     def occluders(self) -> Occluders:
-        """Occluders of the sun, as input of the kernels."""
+        """Occluders of the sun."""
         return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint)
 
     @cached_property
     def materials(self) -> Materials:
-        """Relief, textures, normals and albedo, as input of the kernels."""
-        objects = self.objects
-        textures = self.ground_texture.arrays(), self.object_texture.arrays()
-        relief = MicroRelief(*map(_read_only, self.relief))
-        return Materials(relief, *textures, objects.normals, objects.body_of_triangle, objects.albedo)
+        """Relief, textures, normals and albedo."""
+        objects, surfaces = self.objects, None
+        if len(objects) > 0:
+            surfaces = ObjectSurfaces(
+                vectors_to_device(Array3f, objects.normals.reshape(-1, 3)),
+                to_device(Int32, objects.body_of_triangle),
+                to_device(Float, objects.albedo),
+            )
+        return Materials(
+            RoughGround.of(self.relief), self.ground_texture.octaves, self.object_texture.octaves, surfaces
+        )
 
     def light(self, time_s: float) -> Light:
-        """Return the illumination at a time, as input of the kernels."""
-        photometry, clouds = self.photometry, NO_CLOUDS
+        """Return the illumination at a time."""
+        photometry, clouds = self.photometry, None
         if self.clouds is not None:
             cloud_light = self.clouds.parameters.sky_light(self.sun)
             photometry = replace(photometry, sky_fraction=photometry.sky_fraction + cloud_light)
-            clouds = (self.clouds.cover, self.clouds.coefficients(self.sun, time_s))
+            clouds = self.clouds.at_time(self.sun, time_s)
         # clouds are not rendered, so they do not change the brightness of the sky
-        sky = self.photometry.sky_coefficients(self.sun)
-        sun = np.asarray(self.sun.direction, dtype=np.float64)
-        return Light(sun, photometry.law(self.sun, self.caster_diameter_m), sky, *clouds)
+        return Light(
+            Array3f64(*self.sun.direction.tolist()),
+            Float64(self.sun.angular_radius_rad),
+            photometry.law(self.sun),
+            self.photometry.sky_model(self.sun),
+            Float64(self.caster_diameter_m) if self.caster_diameter_m > 0.0 else None,
+            clouds,
+        )
 
 
-def graded_offsets(half_width_m: float, finest_m: float, count: int) -> Float[np.ndarray, "count"]:
+def graded_offsets(half_width_m: float, finest_m: float, count: int) -> FloatArray[np.ndarray, "count"]:
     """Compute increasing offsets ``a sinh(b i)`` from -half_width_m to half_width_m, with spacing `finest_m` at 0.
 
     The spacing grows in proportion to the distance, as the footprint of a pixel does. Raises ValueError if `count` is
@@ -232,14 +247,14 @@ def graded_offsets(half_width_m: float, finest_m: float, count: int) -> Float[np
     return np.asarray(finest_m / np.sinh(b) * np.sinh(b * steps))
 
 
-def shadow_footprint(spheres: Spheres, sun: Float64[np.ndarray, "3"], min_height_m: float) -> Footprint:
+def shadow_footprint(spheres: Spheres, sun: FloatArray[np.ndarray, "3"], min_height_m: float) -> Footprint | None:
     """Mark the cells of a grid where a body may hide the sun from ground with a height of at least `min_height_m`.
 
     The shadow of a sphere extends along the sun's azimuth from the point below its centre to the point where the ray
-    past its top meets the lowest ground.
+    past its top meets the lowest ground. Returns None without bodies or sun.
     """
     if len(spheres) == 0 or sun[2] <= 0.0:
-        return ALL_GROUND
+        return None
     starts = spheres[:, :2]
     lengths = np.maximum(spheres[:, 2] + spheres[:, 3] - min_height_m, 0.0) / sun[2]
     ends = starts - lengths[:, None] * sun[:2]
@@ -255,23 +270,26 @@ def shadow_footprint(spheres: Spheres, sun: Float64[np.ndarray, "3"], min_height
     column, row = np.floor((positions - corner) / cell).astype(int).T
     cells[row, column] = True
     cells = binary_dilation(cells, np.ones((3, 3), dtype=np.bool_))
-    return Footprint(cells, float(corner[0]), float(corner[1]), 1.0 / cell)
+    return Footprint(
+        to_device(Bool, cells), Int32(rows), Int32(columns), Float64(corner[0]), Float64(corner[1]), Float64(1.0 / cell)
+    )
 
 
-def casters_towards(objects: Objects, sun: Sun) -> Casters:
-    """List the triangles that can cast shadows, in grids perpendicular to the direction of the sun."""
+def casters_towards(objects: Objects, sun: Sun) -> Casters | None:
+    """List the triangles that can cast shadows, in grids perpendicular to the sun's direction; None without any."""
+    if len(objects) == 0:
+        return None
     direction = np.asarray(sun.direction, dtype=np.float64)
     first_axis = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
     first_axis /= np.linalg.norm(first_axis)
     # the kernel's rays are exactly parallel to the third axis
     axes = np.stack([first_axis, np.cross(direction, first_axis), direction])
-    casters: Casters = list_casters(objects.triangles, objects.first_triangle, axes)
-    return casters
+    return list_casters(objects.corners, objects.first_triangle, axes)
 
 
 def potentially_visible(
-    spheres: Spheres, sun: Float64[np.ndarray, "3"], min_height_m: float, cone: Cone
-) -> Bool[np.ndarray, "bodies"]:
+    spheres: Spheres, sun: FloatArray[np.ndarray, "3"], min_height_m: float, cone: Cone
+) -> BoolArray[np.ndarray, "bodies"]:
     """Select the bodies that are visible in a cone, or that may cast a visible shadow.
 
     The shadow of a body is inside a cylinder with the body's radius, from its centre away from the sun to the lowest
@@ -309,11 +327,12 @@ def _lower_edge_rise(sun: Sun) -> float:
 
 def ground_shadow(
     surface: Surface, sun: Sun, height_range_m: tuple[float, float], visible_m: Bounds | None = None
-) -> GroundShadow:
+) -> GroundShadow | None:
     """Compute the shadow of the ground by a sweep along the axis nearest to the sun's azimuth; the sun must be up.
 
     `visible_m` contains minimum and maximum x, then y, of the ground whose shadow is needed; None for all ground. The
     grid of the shadow is that of a terrain level. If it covers a part of the ground only, its period is shorter.
+    Returns None for a sun in the zenith.
     """
     level = int(np.argmax([samples.shape[0] <= SHADOW_SIDE for samples in surface.levels]))
     field, spacing = surface.levels[level], surface.spacing_m * 2.0**level
@@ -321,7 +340,7 @@ def ground_shadow(
     along_x = abs(east) > abs(north)
     along, across = (east, north) if along_x else (north, east)
     if along == 0.0:
-        return NO_SHADOW
+        return None
     # from one row to the next towards the sun, a ray rises by `drop` metres and moves by `shift` columns
     drop, shift = spacing * up / abs(along), across / abs(along)
     rows = columns = np.arange(len(field))
@@ -339,10 +358,17 @@ def ground_shadow(
             entries = np.arange(count)
             columns, rows = ((start + ((entries - start) & (count - 1))) & (len(field) - 1) for start in first)
     height = heights_in_rows(field, rows, columns, along_x)
-    shadow_height, caster_distance = sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows)
-    row_m, cos_elevation = spacing / abs(along), float(np.hypot(east, north))
+    shadow_height, caster_distance = (empty_aligned(height.shape, kind) for kind in (np.float32, np.uint8))
+    sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows, shadow_height, caster_distance)
     return GroundShadow(
-        shadow_height, caster_distance, along_x, spacing, level, row_m, cos_elevation, height_range_m[1]
+        Grid.of(shadow_height, 1.0 / spacing, share=True),
+        Grid.of(caster_distance, 1.0 / spacing, share=True),
+        along_x,
+        Float64(spacing),
+        UInt32(level),
+        Float64(spacing / abs(along)),
+        Float64(np.hypot(east, north)),
+        Float64(height_range_m[1]),
     )
 
 

@@ -19,7 +19,16 @@ from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_crat
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
-from marsyard.sim.terrain.surface import ROUGHNESS, SMALLEST_LEVEL, TEXTURE, UNIFORM, Surface
+from marsyard.sim.terrain.surface import (
+    ROUGHNESS,
+    TEXTURE,
+    UNIFORM,
+    Surface,
+    empty_aligned,
+    empty_pyramid,
+    level_sides,
+    split_levels,
+)
 
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py")
@@ -70,11 +79,12 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     if dtm is not None:
         blend_into_ground(ground, dtm, detail)
     relative_albedo = np.exp(ground.log_albedo, out=ground.log_albedo)
-    samples = np.empty((ground.side, ground.side, 2), dtype=np.float32)
+    pyramid = empty_pyramid(ground.side)
+    samples = split_levels(pyramid, level_sides(ground.side))[0]
     interleave_samples(
         ground.height, relative_albedo, p.albedo / float(relative_albedo.mean(dtype=np.float64)), samples
     )
-    return Surface.from_samples(samples, ground.spacing_m, factors)
+    return Surface.from_pyramid(pyramid, ground.spacing_m, factors)
 
 
 @cache
@@ -136,17 +146,17 @@ class TerrainBank:
     def _build_samples(self, number: int) -> np.ndarray:
         """Build the samples of a terrain, read-only, in the order of its file."""
         surface = self._build(number)
-        samples = np.concatenate([array.reshape(-1) for array in (*surface.levels, surface.factors)])
+        samples: np.ndarray = empty_aligned((self._size(),), np.float32)
+        np.concatenate([surface.samples, surface.factors.reshape(-1)], out=samples)
         samples.flags.writeable = False
         return samples
 
     def _surface(self, path: Path, samples: np.ndarray) -> Surface:
         """Create the surface from the samples of a terrain."""
         _IN_USE[path] = samples
-        sides, factor_side = self._sides(), self._factor_side()
-        *parts, factors = np.split(samples, np.cumsum([2 * side**2 for side in sides]))
-        levels = tuple(part.reshape(side, side, 2) for part, side in zip(parts, sides, strict=True))
-        return Surface(levels, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
+        factor_side = self._factor_side()
+        pyramid, factors = np.split(samples, [samples.size - 3 * factor_side**2])
+        return Surface(pyramid, self.parameters.spacing_m, factors.reshape(factor_side, factor_side, 3))
 
     def _build(self, number: int) -> Surface:
         """Synthesise a terrain, with the wind tails of its rocks."""
@@ -190,14 +200,9 @@ class TerrainBank:
         identity = f"{parameters} {self.seed} {number} {version} {self._hash_source()}"
         return cache_directory("terrain") / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.npy"
 
-    def _sides(self) -> list[int]:
-        """Return the side of each level, in samples."""
-        levels = (self.parameters.samples // SMALLEST_LEVEL).bit_length()
-        return [self.parameters.samples >> level for level in range(levels)]
-
     def _size(self) -> int:
         """Return the number of float32 values in the file of a terrain."""
-        return 2 * sum(side**2 for side in self._sides()) + 3 * self._factor_side() ** 2
+        return 2 * sum(side**2 for side in level_sides(self.parameters.samples)) + 3 * self._factor_side() ** 2
 
     def _factor_side(self) -> int:
         """Return the side of the grid of `Surface.factors`."""

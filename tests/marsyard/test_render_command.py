@@ -13,7 +13,7 @@ from marsyard.sim.camera import read_cahvor
 from marsyard.sim.kernel_cache import mark_ready
 from marsyard.sim.render import Objects, Sun, scene
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.casters import Casters
+from marsyard.sim.render.casters import Casters
 from marsyard.sim.render.scene import casters_towards
 from marsyard.site_images import SUFFIXES
 from tests.command import marsyard
@@ -134,7 +134,7 @@ def test_filled_holes_of_a_dtm_are_marked(tmp_path: Path, monkeypatch: pytest.Mo
     assert "25.0% of its posts have no height; allowed: up to 5.0%" in message
     calls: list[Sun] = []
 
-    def count_calls(objects: Objects, sun: Sun) -> Casters:
+    def count_calls(objects: Objects, sun: Sun) -> Casters | None:
         calls.append(sun)
         return casters_towards(objects, sun)
 

@@ -97,6 +97,22 @@ def _find_cache_folder(sources: Path, cache: Path, **environment: str) -> str:
     return result.stdout.strip()
 
 
+def test_compiled_programs_of_images_are_in_the_cache_of_kernels(tmp_path: Path) -> None:
+    program = """
+import os, marsyard.sim.render
+from marsyard.sim.render.device import Float
+print(os.environ["DRJIT_CACHE_DIR"], Float(1.0, 2.0) + 1.0)
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "DRJIT_CACHE_DIR"}
+    environment |= {"MARSYARD_CACHE": str(tmp_path), "HOME": str(tmp_path / "home")}
+    run = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert run.stdout.split()[0] == str(tmp_path / "kernels" / "drjit")
+    assert list((tmp_path / "kernels" / "drjit").glob("*.bin"))
+    assert not (tmp_path / "home").exists()
+
+
 @pytest.mark.parametrize("kernels", ["sim/terrain/kernels.py", "algorithms/hda/kernels/motion.py"])
 def test_changed_kernel_changes_the_cache_folder(kernels: str, tmp_path: Path) -> None:
     sources = tmp_path / "sources"

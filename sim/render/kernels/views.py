@@ -1,4 +1,4 @@
-"""Kernels that prepare the pinhole views drawn by OpenGL: angles of camera rays, depth conversion, ground mesh."""
+"""Kernels that prepare the pinhole views drawn by OpenGL: depth conversion and ground mesh."""
 
 from __future__ import annotations
 
@@ -8,70 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from marsyard.sim.render.kernels.structs import Array32, Longs
 from marsyard.sim.terrain.kernels import Array, Level, sample
 
-
-@njit(cache=True, error_model="numpy")
-def pixel_angles(directions: Array) -> Array32:
-    """Square root of each pixel's solid angle, radians, from the unit vectors along all rays, (rows, columns, 3).
-
-    The sides of a pixel are central differences of the unit vectors, one-sided differences at the border.
-    """
-    rows, columns = directions.shape[:2]
-    angles = np.empty((rows, columns), dtype=np.float32)
-    for i in range(rows):
-        above, below = max(i - 1, 0), min(i + 1, rows - 1)
-        row_step = float(below - above)
-        for j in range(columns):
-            left, right = max(j - 1, 0), min(j + 1, columns - 1)
-            column_step = float(right - left)
-            ax = (directions[i, right, 0] - directions[i, left, 0]) / column_step
-            ay = (directions[i, right, 1] - directions[i, left, 1]) / column_step
-            az = (directions[i, right, 2] - directions[i, left, 2]) / column_step
-            bx = (directions[below, j, 0] - directions[above, j, 0]) / row_step
-            by = (directions[below, j, 1] - directions[above, j, 1]) / row_step
-            bz = (directions[below, j, 2] - directions[above, j, 2]) / row_step
-            x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-            angles[i, j] = math.sqrt(math.sqrt(x * x + y * y + z * z))
-    return angles
-
-
-@njit(cache=True)
-def sum_of_vectors(directions: Array32) -> tuple[float, float, float]:
-    """Sum of vectors, shape (n, 3)."""
-    x, y, z = 0.0, 0.0, 0.0
-    for n in range(directions.shape[0]):
-        x += directions[n, 0]
-        y += directions[n, 1]
-        z += directions[n, 2]
-    return x, y, z
-
-
-@njit(cache=True)
-def min_component(directions: Array32, axis: Array) -> float:
-    """Minimum component of vectors, shape (n, 3), along an axis."""
-    lowest = math.inf
-    for n in range(directions.shape[0]):
-        lowest = min(lowest, directions[n, 0] * axis[0] + directions[n, 1] * axis[1] + directions[n, 2] * axis[2])
-    return lowest
-
-
-@njit(cache=True, error_model="numpy")
-def max_image_radius(directions: Array, view: Array) -> float:
-    """Maximum absolute image coordinate (x or y) of rays, shape (rows, columns, 3), at a focal length of 1.
-
-    The rows of `view` are the right, down and forward axes of the view.
-    """
-    largest = 0.0
-    for i in range(directions.shape[0]):
-        for j in range(directions.shape[1]):
-            x, y, z = directions[i, j, 0], directions[i, j, 1], directions[i, j, 2]
-            right = view[0, 0] * x + view[0, 1] * y + view[0, 2] * z
-            down = view[1, 0] * x + view[1, 1] * y + view[1, 2] * z
-            forward = view[2, 0] * x + view[2, 1] * y + view[2, 2] * z
-            largest = max(largest, abs(right / forward), abs(down / forward))
-    return largest
+Array32 = NDArray[np.float32]
+Longs = NDArray[np.int64]
 
 
 @njit(cache=True, error_model="numpy")

@@ -35,7 +35,7 @@ def test_missing_kernels_are_compiled_once(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(compilation, "compile_campaign", compile_campaign)
     compile_kernels(InlineExecutor(), "descent", notes.append)
     assert compiled == [("dimes-smoke", ("terrain.samples=512",))]
-    assert notes[0].startswith("compiling numeric kernels once on this machine, about two minutes")
+    assert notes[0].startswith("compiling numeric kernels once on this machine, about a minute")
     assert re.fullmatch(r"numeric kernels are compiled, \d+ s", notes[1])
     # neither compiled kernels nor a scenario without kernels of its own cause notes
     compile_kernels(InlineExecutor(), "descent", notes.append)

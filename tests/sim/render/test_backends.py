@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.kernels.structs import Pose
+from marsyard.sim.render.arrays import to_host
 from marsyard.sim.terrain import TerrainParameters, synthesise
 
 surface = synthesise(TerrainParameters(samples=256, rms_slope_deg=6.0, outer_scale_m=200.0), np.random.default_rng(1))
@@ -38,8 +38,9 @@ pose = rigid(Rotation.from_euler("zxy", [30.0, 20.0, 15.0], degrees=True), np.ar
 scene = Scene(surface, (10.0, 20.0), Sun(direction(1.0, 0.7)), Photometry())
 renderer = Renderer(sys.argv[1])
 frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
-camera_pose = Pose(pose.rotation.as_matrix(), pose.translation)
-depth = renderer._draw_views(scene, PixelRays.from_camera(camera), camera_pose, 1000.0, np.empty(0, np.int64)).depth
+camera_pose = pose.rotation.as_matrix(), pose.translation
+views = renderer._draw_views(scene, PixelRays.from_camera(camera), *camera_pose, 1000.0, np.empty(0, dtype=np.int64))
+depth = to_host(views.depth)
 np.savez(sys.argv[2], radiance=frame.radiance, distance=frame.range_m, depth=depth)
 """
 

@@ -11,6 +11,7 @@ from benchmarks.validation.motion import View, supersample
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.renderer import edge_pixels, supersample_rays
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockParameters
@@ -53,7 +54,7 @@ def test_subpixel_rays_are_evenly_distributed() -> None:
     rays = PixelRays.from_camera(camera)
     pixels = np.array([0, 17, 34])
     subpixel_rays = supersample_rays(rays, pixels, 3)
-    result, _ = camera.project(subpixel_rays.directions.astype(np.float64))
+    result, _ = camera.project(to_host(subpixel_rays.directions).astype(np.float64))
     centres = np.stack([pixels % 7, pixels // 7], axis=-1)
     positions = result.reshape(3, 9, 2) - centres[:, None]
     assert np.abs(positions.mean(axis=1)).max() < 1e-3

@@ -10,10 +10,11 @@ from benchmarks.validation.raycast import Ground
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.kernels.ground import entry_distance, exit_distance, intersect_ground, skip_empty_blocks
-from marsyard.sim.render.kernels.structs import GroundLevel, Ray
-from marsyard.sim.render.renderer import NO_CEILING
+from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
+from marsyard.sim.render.ground import Extent, Ray, first_crossing, skip_empty_blocks
+from marsyard.sim.render.spline import Terrain
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 from tests.sim.scenes import descent_camera
@@ -144,6 +145,16 @@ def test_rough_ground_ranges_match_independent_ray_cast(renderer: Renderer, terr
     assert np.abs(actual / expected - 1.0).max() < 1e-4
 
 
+def _find_crossings(
+    surface: Surface, origins: np.ndarray, rays: np.ndarray, start: np.ndarray, end: np.ndarray, *, use_ceilings: bool
+) -> np.ndarray:
+    """Search the finest level of the ground along rays between two distances (m)."""
+    ray = Ray(vectors_to_device(Array3f64, origins), vectors_to_device(Array3f64, rays))
+    start_m, end_m = (to_device(Float64, distance) for distance in (start, end))
+    ground = Terrain.of_surface(surface, ceilings=use_ceilings)
+    return to_host(first_crossing(ground, Int32(0), ray, start_m, end_m, Bool(True)))
+
+
 @pytest.mark.parametrize("use_ceilings", [True, False], ids=["by ceilings", "by steps"])
 def test_grazing_rays_intersect_the_first_occluding_crest(terrain: Surface, use_ceilings: bool) -> None:
     """Rays graze rough ground at distances of hundreds of samples. The reference marches in steps of 1/30 sample.
@@ -156,18 +167,13 @@ def test_grazing_rays_intersect_the_first_occluding_crest(terrain: Surface, use_
     angles = rng.uniform([-np.pi, 2.5], [np.pi, 5.0], (count, 2))
     rays = np.array([direction(azimuth, -np.radians(elevation_deg)) for azimuth, elevation_deg in angles])
     expected = ground.cast(origins, rays, 4000.0, 0.05)
-    level = GroundLevel(terrain.levels[0], terrain.ceilings[0] if use_ceilings else NO_CEILING, 1.0 / terrain.spacing_m)
     # With ceilings the search of the complete ray is fast. Without them it starts near the intersection.
-    begin = 0.0 if use_ceilings else 0.8
-    result = np.array(
-        [
-            intersect_ground(level, Ray(*origin, *ray), begin * distance_m, 1.25 * distance_m)
-            for origin, ray, distance_m in zip(origins, rays, expected, strict=True)
-        ]
-    )
+    begin = (0.0 if use_ceilings else 0.8) * expected
+    result = _find_crossings(terrain, origins, rays, begin, 1.25 * expected, use_ceilings=use_ceilings)
     assert np.median(expected) > 500.0 * terrain.spacing_m
     assert np.mean(np.abs(result / expected - 1.0) < 1e-4) > 0.99
     # The search ends within a thousandth of a sample of the ground. One Newton step then squares the error.
+    # The heights have the precision of the samples.
     assert np.abs(ground.clearance(origins, rays, result)).max() < 1e-5 * terrain.spacing_m
 
 
@@ -176,38 +182,51 @@ def test_search_returns_infinity_beyond_its_end(terrain: Surface, use_ceilings: 
     """Without ceilings a step can be longer than the remaining distance; the search must still stop at its end."""
     rng = np.random.default_rng(4)
     ground = Ground(terrain)
-    level = GroundLevel(terrain.levels[0], terrain.ceilings[0] if use_ceilings else NO_CEILING, 1.0 / terrain.spacing_m)
-    for azimuth, elevation in rng.uniform([-np.pi, np.radians(20.0)], [np.pi, np.radians(50.0)], (50, 2)):
-        origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), ground.highest + 80.0])
-        ray = direction(azimuth, -elevation)
-        range_m = float(ground.cast(origin[None], ray[None], 2000.0, 0.05)[0])
-        begin = range_m - 4.0 * terrain.spacing_m
-        assert intersect_ground(level, Ray(*origin, *ray), begin, range_m + 1e-3) == pytest.approx(range_m, rel=1e-6)
-        assert intersect_ground(level, Ray(*origin, *ray), begin, range_m - 1e-3) == np.inf
+    angles = rng.uniform([-np.pi, np.radians(20.0)], [np.pi, np.radians(50.0)], (50, 2))
+    origins = np.column_stack([rng.uniform(0.0, terrain.period_m, (50, 2)), np.full(50, ground.highest + 80.0)])
+    rays = np.array([direction(azimuth, -elevation) for azimuth, elevation in angles])
+    range_m = ground.cast(origins, rays, 2000.0, 0.05)
+    begin = range_m - 4.0 * terrain.spacing_m
+    beyond = _find_crossings(terrain, origins, rays, begin, range_m + 1e-3, use_ceilings=use_ceilings)
+    np.testing.assert_allclose(beyond, range_m, rtol=1e-6)
+    before = _find_crossings(terrain, origins, rays, begin, range_m - 1e-3, use_ceilings=use_ceilings)
+    np.testing.assert_array_equal(before, np.inf)
 
 
 def test_rays_enter_at_the_height_of_the_highest_ground_and_leave_at_the_extent() -> None:
     # Minimum and maximum x, then y, and maximum height.
-    extent = (-10.0, 10.0, -20.0, 20.0, 3.0)
-    assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, -0.1)) == pytest.approx(20.0)
-    assert entry_distance(extent, Ray(0.0, 0.0, 3.0, 1.0, 0.0, -0.1)) == 0.0
-    assert entry_distance(extent, Ray(0.0, 0.0, 1.0, 1.0, 0.0, 0.1)) == 0.0
-    assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.1)) == np.inf
-    assert entry_distance(extent, Ray(0.0, 0.0, 5.0, 1.0, 0.0, 0.0)) == np.inf
-    assert exit_distance(extent, Ray(2.0, -1.0, 0.0, 0.5, -0.1, 0.0)) == pytest.approx(16.0)
+    extent = Extent(*map(Float64, (-10.0, 10.0, -20.0, 20.0, 3.0)))
+
+    def ray(origin: tuple[float, float, float], towards: tuple[float, float, float]) -> Ray:
+        return Ray(Array3f64(*origin), Array3f64(*towards))
+
+    def entry_distance(height_m: float, dz: float) -> float:
+        return float(to_host(extent.entry_distance(ray((0.0, 0.0, height_m), (1.0, 0.0, dz))))[0])
+
+    assert entry_distance(5.0, -0.1) == pytest.approx(20.0)
+    assert entry_distance(3.0, -0.1) == 0.0
+    assert entry_distance(1.0, 0.1) == 0.0
+    assert entry_distance(5.0, 0.1) == np.inf
+    assert entry_distance(5.0, 0.0) == np.inf
+    exits = [((2.0, -1.0, 0.0), (0.5, -0.1, 0.0), 16.0), ((2.0, -1.0, 0.0), (0.0, -0.5, 0.0), 38.0)]
+    exits += [((0.0, 0.0, 0.0), (-2.0, 0.0, 0.5), 5.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), np.inf)]
+    for origin, towards, expected in exits:
+        assert to_host(extent.exit_distance(ray(origin, towards)))[0] == pytest.approx(expected)
 
 
 def test_blocks_below_a_ray_are_skipped(terrain: Surface) -> None:
     """Rays skip to the first block whose ceiling is above the ray, in all directions and across the period."""
     ceiling = terrain.ceilings[0]
-    level = GroundLevel(terrain.levels[0], ceiling, 1.0 / terrain.spacing_m)
+    device_terrain = Terrain.of_surface(terrain, ceilings=True)
     block = CEILING_BLOCK * terrain.spacing_m
     rng = np.random.default_rng(5)
     for azimuth in [*rng.uniform(-np.pi, np.pi, 60), 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi]:
         origin = np.array([*rng.uniform(0.0, terrain.period_m, 2), float(ceiling.max()) + 5.0])
         ray = direction(azimuth, -np.radians(rng.uniform(1.0, 20.0)))
         start = rng.uniform(0.0, 50.0)
-        skip_end_m = skip_empty_blocks(level, Ray(*origin, *ray), start, 5000.0)
+        device_ray = Ray(Array3f64(*origin.tolist()), Array3f64(*ray.tolist()))
+        limits = Float64(start), Float64(5000.0)
+        skip_end_m = to_host(skip_empty_blocks(device_terrain, Int32(0), device_ray, *limits, Bool(True)))[0]
         distances_m = np.arange(start, skip_end_m + 3.0 * block, 0.01 * block)
         positions = origin + distances_m[:, None] * ray
         block_row, block_column = (np.floor(positions[:, axis] / block).astype(int) % len(ceiling) for axis in (1, 0))

@@ -1,4 +1,4 @@
-"""Tests of the renderer's data structures: triangle hierarchy, levels of the ground, strips of pixels, freed memory."""
+"""Tests of the renderer's data structures: triangle hierarchy, levels of the ground, freed memory."""
 
 import subprocess
 import sys
@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from benchmarks.validation.raycast import cast_triangles
-from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects
-from marsyard.sim.render.kernels.hierarchy import list_in_beam, nearest_hit
-from marsyard.sim.render.kernels.strips import ROW, STRIP, allocate_cells, fetch_levels, spline
-from marsyard.sim.render.kernels.structs import Ray
-from marsyard.sim.render.renderer import LEVELS, NO_CEILING, ground_struct
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
+from marsyard.sim.render.ground import Ray
+from marsyard.sim.render.spline import Terrain, evaluate
+from marsyard.sim.render.triangles import first_hits, nearest_hit, nearest_triangles
 from marsyard.sim.terrain import Surface
-from marsyard.sim.terrain.kernels import sample
 
 EYE = np.array([0.3, -0.2, 1.1])
 
@@ -29,11 +28,6 @@ def _make_triangles(scale: float) -> Objects:
     return Objects.of_mesh(corners, np.zeros_like(corners), faces, np.zeros(1500, dtype=np.int32), albedo=0.1)
 
 
-@pytest.fixture(scope="module")
-def objects() -> Objects:
-    return _make_triangles(1.0)
-
-
 def _draw_rays(rng: np.random.Generator, count: int) -> np.ndarray:
     rays = rng.normal(size=(count, 3))
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
@@ -43,96 +37,85 @@ def test_nearest_triangle_equals_exhaustive_search() -> None:
     objects = _make_triangles(4.0)  # many rays hit several triangles
     rays = _draw_rays(np.random.default_rng(7), 800)
     expected = cast_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
-    tree = objects.hierarchy(np.arange(1500))
-    result = np.array([nearest_hit(tree, Ray(*EYE, *ray), np.inf).distance for ray in rays])
+    tree = objects.hierarchy(np.arange(1500), EYE)
+    assert tree is not None
+    ray = Ray(Array3f64(*EYE.tolist()), vectors_to_device(Array3f64, rays))
+    hit = nearest_hit(tree, ray, Float64(np.inf), Bool(True))
     assert 0.05 < np.mean(np.isfinite(expected)) < 0.9
-    np.testing.assert_allclose(result, expected, rtol=1e-9)
+    np.testing.assert_allclose(to_host(hit.t), expected, rtol=1e-9)
+    # the number is that of the triangle; the point is the weighted sum of its corners
+    number, second, third = (to_host(values) for values in (hit.number, hit.second, hit.third))
+    is_hit = np.isfinite(expected)
+    np.testing.assert_array_equal(number >= 0, is_hit)
+    a, b, c = objects.triangles[number[is_hit]].transpose(1, 0, 2)
+    points = a + second[is_hit, None] * (b - a) + third[is_hit, None] * (c - a)
+    np.testing.assert_allclose(points, EYE + expected[is_hit, None] * rays[is_hit], atol=1e-9)
+    # a hit at or beyond the limit does not count
+    limits = np.where(is_hit, expected * (1.0 + 1e-5 * np.where(np.arange(800) % 2, 1.0, -1.0)), 1.0)
+    limited = to_host(nearest_hit(tree, ray, to_device(Float64, limits), Bool(True)).number)
+    np.testing.assert_array_equal(limited >= 0, is_hit & (limits > expected))
 
 
-@pytest.mark.parametrize("axis", [*_draw_rays(np.random.default_rng(8), 12), *np.eye(3), *-np.eye(3)], ids=str)
-@pytest.mark.parametrize("half_angle", [1e-3, 0.05, 0.5])
-def test_beam_lists_all_triangles_hit_by_its_rays(objects: Objects, axis: np.ndarray, half_angle: float) -> None:
-    """The list contains all triangles that random rays in the beam hit, and only triangles near the frustum."""
-    max_distance_m = 9.0
-    rng = np.random.default_rng(9)
-    tree = objects.hierarchy(np.arange(1500))
-    buffer = np.empty(1500, dtype=np.int64)
-    listed_triangles = set(buffer[: list_in_beam(tree, Ray(*EYE, *axis), half_angle, max_distance_m, buffer)].tolist())
-    perpendicular = np.cross(axis, _draw_rays(rng, 100))
-    perpendicular /= np.linalg.norm(perpendicular, axis=1, keepdims=True)
-    angles = half_angle * rng.uniform(0.0, 1.0, (100, 1))
-    hit_triangles: set[int] = set()
-    for ray in np.cos(angles) * axis + np.sin(angles) * perpendicular:
-        hit_triangles |= _list_hits(objects, ray, max_distance_m)
-    assert hit_triangles <= listed_triangles
-    # Only narrow beams may have no hits; otherwise the test would check nothing.
-    assert hit_triangles or half_angle < 0.5
-    # The beam lists triangles in a square frustum, which is larger than the cone at its corners.
-    centres = objects.triangles.mean(axis=1) - EYE
-    size = np.linalg.norm(objects.triangles - objects.triangles.mean(axis=1, keepdims=True), axis=2).max(axis=1)
-    axis_distance = centres @ axis
-    off_axis_distance = np.linalg.norm(centres - axis_distance[:, None] * axis, axis=1)
-    is_near = off_axis_distance <= np.sqrt(2.0) * (np.tan(half_angle) * np.maximum(axis_distance, 0.0) + 2.0 * size)
-    assert listed_triangles <= set(np.flatnonzero(is_near).tolist())
+def test_few_rays_and_parallel_rays_equal_exhaustive_search() -> None:
+    objects = _make_triangles(4.0)
+    rays = _draw_rays(np.random.default_rng(9), 50)
+    distances, numbers = first_hits(objects.triangles, EYE, rays)
+    expected = cast_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
+    np.testing.assert_allclose(distances, expected, rtol=1e-9)
+    np.testing.assert_array_equal(numbers >= 0, np.isfinite(expected))
+    assert first_hits(objects.triangles[:0], EYE, rays)[1].tolist() == [-1] * 50
+    origins = np.random.default_rng(10).uniform(-12.0, 12.0, (500, 3))
+    parallel = np.broadcast_to(rays[0], origins.shape)
+    is_hit = np.isfinite(cast_triangles(objects, origins, parallel, nearest=0.0))
+    assert 0.1 < is_hit.mean() < 0.95
+    np.testing.assert_array_equal(nearest_triangles(objects.triangles, origins, rays[0]) >= 0, is_hit)
 
 
-def test_beam_reports_an_overflow_of_its_list(objects: Objects) -> None:
-    axis, tree = direction(1.0, 0.2), objects.hierarchy(np.arange(1500))
-    buffer = np.empty(1500, dtype=np.int64)
-    count = list_in_beam(tree, Ray(*EYE, *axis), 0.3, 9.0, buffer)
-    assert count > 5
-    assert list_in_beam(tree, Ray(*EYE, *axis), 0.3, 9.0, buffer[:count].copy()) == count
-    assert list_in_beam(tree, Ray(*EYE, *axis), 0.3, 9.0, buffer[: count - 1].copy()) == -1
-    assert list_in_beam(Objects.none().hierarchy(np.arange(0)), Ray(*EYE, *axis), 0.3, 9.0, buffer) == 0
-
-
-def _list_hits(objects: Objects, ray: np.ndarray, max_distance_m: float) -> set[int]:
-    """List the indices of all triangles that a ray from the eye hits up to a distance.
-
-    The barycentric coordinates u and v and the distance t solve a linear system.
-    """
-    first, second, third = objects.triangles.transpose(1, 0, 2)
-    columns = np.stack([second - first, third - first, np.broadcast_to(-ray, first.shape)], axis=2)
-    u, v, t = np.linalg.solve(columns, (EYE - first)[:, :, None])[:, :, 0].T
-    return set(np.flatnonzero((u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0) & (t < max_distance_m)).tolist())
-
-
-@pytest.mark.parametrize("side", [16, 128])
-def test_kernels_receive_a_constant_number_of_levels(side: int) -> None:
-    surface = Surface.from_samples(np.zeros((side, side, 2), dtype=np.float32), 1.0)
-    ground = ground_struct(surface, (0.0, 1.0, 0.0, 1.0, 2.0), ceilings=True)
-    levels, top_level = ground.levels, ground.top_level
-    assert len(levels) == len(ground.ceilings) == LEVELS
-    assert levels[top_level].shape[0] == 16
-    assert all(level is expected for level, expected in zip(levels, surface.levels, strict=False))
-    # Kernels are compiled for levels of the same array type.
-    assert {(level.dtype.str, level.flags.writeable, level.flags.c_contiguous) for level in levels} == {
-        ("<f4", False, True)
-    }
-    assert all(ceiling is expected for ceiling, expected in zip(ground.ceilings, surface.ceilings, strict=False))
-    ground_without_ceilings = ground_struct(surface, ground.extent, ceilings=False)
-    assert all(ceiling is NO_CEILING for ceiling in ground_without_ceilings.ceilings)
+def test_hierarchy_contains_the_listed_triangles_only() -> None:
+    """The number of triangles is no multiple of that of a leaf, and the centre of the rays is distant."""
+    objects = _make_triangles(4.0)
+    offset = np.array([3000.0, -2000.0, 100.0])
+    moved = Objects.of_mesh(
+        (objects.triangles + offset).reshape(-1, 3),
+        np.zeros((4500, 3)),
+        np.arange(4500, dtype=np.int32).reshape(-1, 3),
+        np.zeros(1500, dtype=np.int32),
+        albedo=0.1,
+    )
+    listed = np.sort(np.random.default_rng(11).permutation(1500)[:301])
+    tree = moved.hierarchy(listed, EYE + offset)
+    assert tree is not None
+    assert moved.hierarchy(np.arange(0), EYE) is None
+    rays = _draw_rays(np.random.default_rng(12), 800)
+    ray = Ray(Array3f64(*(EYE + offset).tolist()), vectors_to_device(Array3f64, rays))
+    hit = nearest_hit(tree, ray, Float64(np.inf), Bool(True))
+    expected, number = first_hits(objects.triangles[listed], EYE, rays)
+    np.testing.assert_allclose(to_host(hit.t), expected, rtol=1e-6)
+    np.testing.assert_array_equal(to_host(hit.number), np.where(number >= 0, listed[number], -1))
 
 
 SIDE, SPACING_M = 64, 0.5
 SAMPLES = np.random.default_rng(3).normal(size=(SIDE, SIDE, 2)).astype(np.float32)
-SURFACE = Surface.from_samples(SAMPLES, SPACING_M)
+SURFACE = Surface.from_samples(SAMPLES + np.array([2000.0, 0.0], dtype=np.float32), SPACING_M)
 
 
-def test_vectorised_spline_equals_single_evaluation() -> None:
+def test_spline_equals_the_surface() -> None:
+    """Heights have the precision of the samples, also at an altitude of 2 km; slopes and albedo have single precision.
+
+    The positions are inside the terrain, on its border and in other periods.
+    """
     rng = np.random.default_rng(4)
-    # Positions inside the terrain, on its border and in other periods.
-    x, y = rng.uniform(-40.0, 40.0, (2, ROW))
+    x, y = rng.uniform(-40.0, 40.0, (2, 1000))
     x[:4], y[:4] = [0.0, -0.25, 31.75, 32.0], [31.9, 0.0, -0.1, 16.0]
-    level_of = rng.integers(0, len(SURFACE.levels), STRIP)
-    indices = np.sort(rng.permutation(STRIP)[:100])
-    cells = allocate_cells()
-    fetch_levels(SURFACE.levels, 1.0 / SPACING_M, level_of, indices, indices.size, x, y, cells)
-    for index in indices:
-        scale = 1.0 / SPACING_M / 2.0 ** level_of[index]
-        height, slope_x, slope_y, albedo = spline(cells[0], cells[1], int(index))
-        expected = sample(SURFACE.levels[level_of[index]], scale, x[index], y[index])
-        np.testing.assert_allclose((height, slope_x * scale, slope_y * scale, albedo), expected, rtol=0.0, atol=1e-14)
+    levels = rng.integers(0, len(SURFACE.levels), 1000)
+    terrain = Terrain.of_surface(SURFACE, ceilings=False)
+    positions = (to_device(Float64, values) for values in (x, y))
+    result = evaluate(terrain, to_device(Int32, levels), *positions)
+    values = np.stack([to_host(v) for v in (result.height, result.slope_x, result.slope_y, result.albedo)], axis=1)
+    expected = np.stack([SURFACE.evaluate(*at) for at in zip(x, y, levels, strict=True)])
+    # the resolution of heights near 2000 m in single precision is 1.2e-4 m
+    np.testing.assert_allclose(values[:, 0], expected[:, 0], atol=1e-6, rtol=0.0)
+    np.testing.assert_allclose(values[:, 1:], expected[:, 1:], atol=3e-6, rtol=0.0)
 
 
 #: Size of the block, bytes.

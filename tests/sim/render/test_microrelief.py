@@ -10,17 +10,19 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.kernels.microrelief import (
-    FADING,
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Float, Float64, UInt32
+from marsyard.sim.render.noise import noise_in_plane
+from marsyard.sim.render.texture import (
     HEIGHT_VARIANCE,
-    MIN_CELLS,
+    MIN_SLOPE_CELLS,
+    SLOPE_FADING,
     SLOPE_VARIANCE,
-    add_relief_slopes,
+    MicroRelief,
+    RoughGround,
+    relief_slopes,
     smith_shadowing,
 )
-from marsyard.sim.render.kernels.noise import allocate_noise, noise_2d
-from marsyard.sim.render.kernels.strips import ROW, STRIP
-from marsyard.sim.render.kernels.structs import MicroRelief
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.microrelief import octave_heights
 from tests.sim.scenes import LAMBERT, descent_camera
@@ -37,33 +39,23 @@ def _make_relief(coarsest_m: float, *heights_m: float) -> MicroRelief:
 
 def _sample_noise(x: np.ndarray, y: np.ndarray, seed: int = 0) -> np.ndarray:
     """Compute value and x and y derivatives of the noise, shape (n, 3)."""
-    buffers, values, flat_x, flat_y = allocate_noise(), np.empty((x.size, 3)), x.ravel(), y.ravel()
-    for first in range(0, x.size, STRIP):
-        strip = slice(first, first + STRIP)
-        noise_2d(flat_x[strip], flat_y[strip], 1.0, seed, buffers)
-        values[strip] = buffers.noise.reshape(3, ROW)[:, : len(values[strip])].T
-    return values
+    position = [to_device(Float64, values) for values in (x, y)]
+    noise = noise_in_plane(position, Float64(1.0), UInt32(seed))
+    return np.stack([to_host(values).astype(np.float64) for values in noise], axis=1)
 
 
 def _add_slopes(x: np.ndarray, y: np.ndarray, footprint_m: np.ndarray, relief: MicroRelief) -> list[np.ndarray]:
-    """Compute slopes along x and y, and resolved and unresolved variance of slope.
-
-    The kernel processes a strip of at most `STRIP` positions in one call.
-    """
-    outputs, buffers = [np.zeros(x.size) for _ in range(4)], allocate_noise()
-    for first in range(0, x.size, STRIP):
-        strip = slice(first, first + STRIP)
-        output_strips = (output[strip] for output in outputs)
-        add_relief_slopes(x[strip], y[strip], footprint_m[strip], relief, buffers, *output_strips)
-    return outputs
+    """Compute slopes along x and y, and resolved and unresolved variance of slope."""
+    ground = RoughGround.of(relief)
+    assert ground is not None
+    positions = vectors_to_device(Array3f64, np.stack([x, y, np.zeros(x.size)], axis=1))
+    slopes = relief_slopes(ground, positions, to_device(Float, footprint_m))
+    return [to_host(values) for values in (slopes.x, slopes.y, slopes.resolved, slopes.unresolved)]
 
 
 @pytest.fixture(scope="module")
 def flat() -> Surface:
-    levels = [np.zeros((side, side, 2), dtype=np.float32) for side in (64, 32, 16, 8)]
-    for level in levels:
-        level[..., 1] = 0.2
-    return Surface(tuple(levels), 1.0)
+    return Surface.from_samples(np.broadcast_to(np.array([0.0, 0.2], dtype=np.float32), (64, 64, 2)), 1.0)
 
 
 def test_noise_has_the_specified_variances_and_derivatives() -> None:
@@ -122,16 +114,16 @@ def test_slopes_are_attenuated_as_by_averaging_over_a_pixel(cell_px: float) -> N
     u, v = (grid.ravel() for grid in np.meshgrid(centre, centre))
     outputs = _add_slopes(u, v, np.full(u.size, 1.0 / cell_px), _make_relief(1.0, 1.0))
     assert np.std(outputs[0]) == pytest.approx(np.std(expected), rel=0.06)
-    np.testing.assert_allclose(outputs[2] + outputs[3], SLOPE_VARIANCE)
+    np.testing.assert_allclose(outputs[2] + outputs[3], SLOPE_VARIANCE, rtol=1e-6)
 
 
 def test_unresolved_octaves_only_add_to_the_variance() -> None:
     position = np.array([0.3])
-    outputs = _add_slopes(position, position, np.array([1.001 / MIN_CELLS]), _make_relief(1.0, 0.1, 0.1))
+    outputs = _add_slopes(position, position, np.array([1.001 / MIN_SLOPE_CELLS]), _make_relief(1.0, 0.1, 0.1))
     assert outputs[0][0] == outputs[1][0] == outputs[2][0] == 0.0
     assert outputs[3][0] == pytest.approx((0.1**2 + 0.2**2) * SLOPE_VARIANCE)
-    # Octaves with cells of up to sqrt(FADING) footprints are unresolved.
-    assert pytest.approx(MIN_CELLS**2) == FADING
+    # Octaves with cells of up to sqrt(SLOPE_FADING) footprints are unresolved.
+    assert pytest.approx(MIN_SLOPE_CELLS**2) == SLOPE_FADING
 
 
 @pytest.mark.parametrize("elevation_deg", [5.0, 15.0, 30.0, 60.0])
@@ -142,7 +134,8 @@ def test_shadowing_equals_smiths_formula(elevation_deg: float, slope_deg: float)
     cosine, sigma = np.sin(np.radians(elevation_deg)), np.tan(np.radians(slope_deg))
     a = cosine / (np.sqrt(2.0) * sigma * np.sqrt(1.0 - cosine**2))
     smith_lambda = 0.5 * (np.exp(-(a**2)) / (a * np.sqrt(np.pi)) - special.erfc(a))
-    assert smith_shadowing(cosine, sigma**2) == pytest.approx(1.0 / (1.0 + smith_lambda), abs=0.005)
+    result = to_host(smith_shadowing(Float(cosine), Float(sigma**2)))[0]
+    assert result == pytest.approx(1.0 / (1.0 + smith_lambda), abs=0.005)
 
 
 def _shade_heights(heights: np.ndarray, step_m: float, sun: np.ndarray) -> np.ndarray:
@@ -197,13 +190,3 @@ def test_relief_does_not_change_geometric_truth_and_mean_brightness(renderer: Re
     np.testing.assert_array_equal(first.normal, second.normal)
     assert second.radiance.std() > 2.0 * first.radiance.std()
     assert second.radiance.mean() == pytest.approx(first.radiance.mean(), rel=0.01)
-
-
-def test_kernels_receive_read_only_arrays(flat: Surface) -> None:
-    """For writable arrays numba would compile the kernels again."""
-    scene = Scene(flat, (0.0, 0.0), Sun(np.array([0.0, 0.0, 1.0])), LAMBERT, relief=_make_relief(1.0, 0.1))
-    arrays = [value for value in scene.materials.relief if isinstance(value, np.ndarray)]
-    assert len(arrays) == 2
-    assert not any(array.flags.writeable for array in (*arrays, *flat.levels))
-    # the arrays of the caller remain writable
-    assert UNIFORM.flags.writeable

@@ -10,11 +10,13 @@ from hypothesis import strategies as st
 from marsyard.scenarios.views import SiteGround, Viewpoint, mast_pose, nadir_pose, site_scene
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
+from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import default_backend
-from marsyard.sim.render.kernels.structs import Footprint
+from marsyard.sim.render.device import Float64
 from marsyard.sim.render.kernels.views import depth_in_metres
 from marsyard.sim.render.renderer import cell_spans_in_hull, ground_mesh
-from marsyard.sim.render.scene import ALL_GROUND, graded_offsets, shadow_footprint
+from marsyard.sim.render.scene import graded_offsets, shadow_footprint
+from marsyard.sim.render.sunlight import Footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, Surface, TerrainParameters, site
 
@@ -147,15 +149,10 @@ def test_partial_mesh_equals_the_cells_of_the_full_mesh(terrain: Surface) -> Non
 ROCKY = TerrainParameters(samples=512, spacing_m=3.0, rocks=RockParameters(abundance=0.15, smallest_m=1.0))
 
 
-def _is_inside(footprint: Footprint, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return whether the footprint marks the cells of the positions (m)."""
-    cells, west, south, per_metre = footprint
-    column = np.floor((x - west) * per_metre).astype(int)
-    row = np.floor((y - south) * per_metre).astype(int)
-    is_in_grid = (column >= 0) & (column < cells.shape[1]) & (row >= 0) & (row < cells.shape[0])
-    is_shaded = np.zeros(x.shape, dtype=bool)
-    is_shaded[is_in_grid] = cells[row[is_in_grid], column[is_in_grid]]
-    return is_shaded
+def _is_inside(footprint: Footprint | None, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return whether the footprint contains positions (m)."""
+    assert footprint is not None
+    return to_host(footprint.contains(to_device(Float64, x), to_device(Float64, y)))
 
 
 @pytest.mark.parametrize("elevation", [0.2, 0.7, 1.5])
@@ -182,8 +179,8 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
 
 def test_footprint_without_objects_or_sun_is_everywhere() -> None:
     sphere = np.array([[0.0, 0.0, 0.0, 1.0]])
-    assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is ALL_GROUND
-    assert shadow_footprint(sphere, direction(0.0, -0.1), 0.0) is ALL_GROUND
+    assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is None
+    assert shadow_footprint(sphere, direction(0.0, -0.1), 0.0) is None
 
 
 def test_footprint_does_not_change_images() -> None:
@@ -196,10 +193,11 @@ def test_footprint_does_not_change_images() -> None:
     frame = process_renderer(default_backend()).render(scene, rays, pose)
     # Replace the cached property: no pixel is excluded from the shadow test.
     full_scene = replace(scene)
-    full_scene.__dict__["footprint"] = ALL_GROUND
+    full_scene.__dict__["footprint"] = None
     full_frame = process_renderer(default_backend()).render(full_scene, rays, pose)
     np.testing.assert_array_equal(frame.radiance, full_frame.radiance)
-    assert not scene.footprint.cells.all()
+    assert scene.footprint is not None
+    assert not to_host(scene.footprint.cells).all()
 
 
 @pytest.mark.parametrize("elevation", [0.25, 1.0])

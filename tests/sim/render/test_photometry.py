@@ -11,9 +11,10 @@ from scipy.stats import qmc
 from marsyard.sim.camera import Cahv, Cahvore, CameraModel
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.kernels.noise import allocate_noise, noise_3d
-from marsyard.sim.render.kernels.photometry import MIN_CELLS, NOISE_VARIANCE, add_texture
-from marsyard.sim.render.kernels.strips import STRIP
+from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f64, Bool, Float, Float64, UInt32
+from marsyard.sim.render.noise import noise_in_space
+from marsyard.sim.render.texture import MIN_CELLS, NOISE_VARIANCE, Octaves, log_relative_albedo
 from marsyard.sim.terrain import Surface, sites
 from tests.sim.scenes import DOWN, descent_camera, flat_ground, make_ground
 
@@ -170,24 +171,17 @@ POSITIONS = np.random.default_rng(5).uniform(-500.0, 500.0, (60000, 3))
 
 
 def _log_albedo(positions: np.ndarray, footprint_m: np.ndarray, coarsest_m: float, octaves: np.ndarray) -> np.ndarray:
-    """Compute the logarithm of the relative albedo at positions, shape (n, 3).
-
-    The kernel processes a strip of at most `STRIP` positions in one call.
-    """
-    log_albedo, buffers = np.zeros(len(positions)), allocate_noise()
-    for first in range(0, len(positions), STRIP):
-        strip = slice(first, first + STRIP)
-        x, y, z = positions[strip].T.copy()
-        add_texture((x, y, z), footprint_m[strip], (coarsest_m, octaves), np.ones(x.size), buffers, log_albedo[strip])
-    return log_albedo
+    """Compute the logarithm of the relative albedo at positions, shape (n, 3)."""
+    texture, no_texture = Octaves.of(coarsest_m, octaves), Octaves.of(1.0, ())
+    points, footprint = vectors_to_device(Array3f64, positions), to_device(Float, footprint_m)
+    on_ground = log_relative_albedo(texture, no_texture, Bool(False), points, footprint, Float(1.0))
+    on_objects = log_relative_albedo(no_texture, texture, Bool(True), points, footprint, Float(1.0))
+    np.testing.assert_array_equal(to_host(on_ground), to_host(on_objects))
+    return to_host(on_ground).astype(np.float64)
 
 
 def test_noise_has_the_specified_variance() -> None:
-    noise, buffers = np.empty(len(POSITIONS)), allocate_noise()
-    for first in range(0, len(POSITIONS), STRIP):
-        x, y, z = POSITIONS[first : first + STRIP].T.copy()
-        noise_3d(x, y, z, 1.0, 1, buffers)
-        noise[first : first + x.size] = buffers.noise[: x.size]
+    noise = to_host(noise_in_space(list(vectors_to_device(Array3f64, POSITIONS)), Float64(1.0), UInt32(1)))
     assert np.mean(noise) == pytest.approx(0.0, abs=0.005)
     assert np.mean(noise**2) == pytest.approx(NOISE_VARIANCE, rel=0.02)
 

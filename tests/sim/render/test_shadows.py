@@ -11,16 +11,12 @@ from benchmarks.validation.raycast import Ground, cast_triangles
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.kernels.casters import find_occluded_positions
-from marsyard.sim.render.kernels.ground import height_range
-from marsyard.sim.render.scene import (
-    NO_SHADOW,
-    casters_towards,
-    ground_in_cones,
-    ground_shadow,
-    is_sun_above_slopes,
-    slope_bounds,
-)
+from marsyard.sim.render.arrays import compiled, to_host, vectors_to_device
+from marsyard.sim.render.casters import Casters, are_occluded
+from marsyard.sim.render.device import Array3f64, Bool
+from marsyard.sim.render.kernels.sweep import height_range
+from marsyard.sim.render.scene import casters_towards, ground_in_cones, ground_shadow, is_sun_above_slopes, slope_bounds
+from marsyard.sim.render.sunlight import GroundShadow
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 from tests.sim.scenes import DOWN, LAMBERT, descent_camera, make_ground, rocks_near
@@ -125,8 +121,8 @@ def test_shaded_positions_equal_an_exhaustive_search(elevation: float, distant_m
     positions = rng.uniform(-9.0, 9.0, (3000, 3))
     positions[:100] += centres[-1]
     casters = casters_towards(objects, sun)
-    result = np.empty(len(positions), dtype=np.bool_)
-    find_occluded_positions(casters, *positions.T.copy(), result)
+    assert casters is not None
+    result = to_host(are_occluded(casters, vectors_to_device(Array3f64, positions), Bool(True)))
     rays = np.broadcast_to(sun.direction, positions.shape)
     expected = np.isfinite(cast_triangles(objects, positions, rays, nearest=0.0))
     assert 0.1 < np.mean(expected) < 0.9
@@ -144,14 +140,19 @@ def test_distant_bodies_do_not_slow_down_shadows() -> None:
     hills = np.array([[9000.0, 4000.0, 50.0], [-7000.0, -9000.0, 50.0]])
     sun = Sun(direction(0.7, 0.6))
     positions = np.column_stack([rng.uniform(-20.0, 20.0, (20_000, 2)), np.zeros(20_000)])
-    seconds = []
+    points, seconds = vectors_to_device(Array3f64, positions), []
+
+    @compiled
+    def test_points(casters: Casters, points: Array3f64) -> Bool:
+        return are_occluded(casters, points, Bool(True))
+
     for centres in (rocks, np.concatenate([rocks, hills])):
         casters = casters_towards(_random_bodies(rng, centres, np.full(len(centres), 0.05)), sun)
         times = []
         for _ in range(5):
-            start = time.thread_time()
-            find_occluded_positions(casters, *positions.T.copy(), np.empty(len(positions), dtype=np.bool_))
-            times.append(time.thread_time() - start)
+            start = time.process_time()
+            to_host(test_points(casters, points))
+            times.append(time.process_time() - start)
         seconds.append(min(times))
     assert seconds[1] < 5.0 * seconds[0]
 
@@ -160,9 +161,10 @@ def test_overlapping_bodies_are_listed_in_few_cells() -> None:
     """Fine cells that are not smaller than the bodies: without this limit each body would be in 100 times as many."""
     count = 400
     objects = _random_bodies(np.random.default_rng(5), np.zeros((count, 3)), np.full(count, 1.0))
-    _grid, _sides, _fine_grids, _layouts, _starts, listed_bodies = casters_towards(objects, Sun(direction(0.7, 0.6)))[2]
+    casters = casters_towards(objects, Sun(direction(0.7, 0.6)))
+    assert casters is not None
     # at most all bodies in all of the coarse cells (one per body), and each in a few fine cells there
-    assert len(listed_bodies) < 4 * count * count
+    assert len(casters.fine.items) < 4 * count * count
 
 
 def test_another_photometry_keeps_the_shadows(terrain: Surface) -> None:
@@ -175,6 +177,12 @@ def test_another_photometry_keeps_the_shadows(terrain: Surface) -> None:
     assert scene.photometry == LAMBERT
 
 
+def _grid_values(shadow: GroundShadow) -> np.ndarray:
+    """Return the heights of a shadow, shape (side, side)."""
+    values = to_host(shadow.height.values)
+    return values.reshape((round(np.sqrt(values.size)),) * 2)
+
+
 @pytest.mark.parametrize("azimuth_deg", [20.0, 110.0, 200.0, 290.0, 45.0])
 def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth_deg: float) -> None:
     """The area includes the border of the terrain period."""
@@ -182,8 +190,13 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth
     heights = height_range(terrain.levels[0])
     area_m = (-40.0, 60.0, 700.0, 760.0)
     full_shadow, area_shadow = (ground_shadow(terrain, sun, heights), ground_shadow(terrain, sun, heights, area_m))
-    full_grid, area_grid, spacing = full_shadow.height, area_shadow.height, full_shadow.spacing
-    assert full_shadow[2:] == area_shadow[2:]
+    assert full_shadow is not None
+    assert area_shadow is not None
+    full_grid, area_grid = (_grid_values(shadow) for shadow in (full_shadow, area_shadow))
+    spacing = to_host(full_shadow.spacing)[0]
+    assert full_shadow.along_x == area_shadow.along_x
+    for name in ("spacing", "level", "row_m", "cos_elevation", "max_height"):
+        np.testing.assert_array_equal(to_host(getattr(full_shadow, name)), to_host(getattr(area_shadow, name)))
     assert len(area_grid) < len(full_grid)
     x, y = (np.arange(int(low / spacing) - 1, int(high / spacing) + 3) for low, high in (area_m[:2], area_m[2:]))
     rows, columns = (x, y) if full_shadow.along_x else (y, x)
@@ -218,12 +231,13 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     assert slope_bounds(terrain, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow; the tolerance covers rounding.
     shadow = ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
-    heights = terrain.levels[shadow.level][..., 0].T if shadow.along_x else terrain.levels[shadow.level][..., 0]
-    assert np.all(shadow.height < heights + 1e-3)
+    assert shadow is not None
+    heights = terrain.levels[to_host(shadow.level)[0]][..., 0]
+    assert np.all(_grid_values(shadow) < (heights.T if shadow.along_x else heights) + 1e-3)
     scene = Scene(terrain, (0.0, 0.0), just_above, Photometry())
-    assert scene.shadow is NO_SHADOW
+    assert scene.shadow is None
     below = scene.with_light(just_below, Photometry())
-    assert below.shadow is not NO_SHADOW
+    assert below.shadow is not None
     # the number of rays at edges changes no cached result
     assert below.with_edge_rays(1).edge_rays == 1
     assert below.with_edge_rays(1).shadow is below.shadow

@@ -20,7 +20,8 @@ from marsyard.sim.render import (
     Scene,
     Sun,
 )
-from marsyard.sim.render.kernels.photometry import sky_brightness
+from marsyard.sim.render.arrays import to_device, to_host
+from marsyard.sim.render.device import Float64
 from marsyard.sim.terrain import Surface
 from tests.sim.scenes import LAMBERT, descent_camera, flat_ground
 
@@ -45,20 +46,19 @@ def _render_from_mast(renderer: Renderer, camera: Cahv, sun: Sun, photometry: Ph
 def test_sky_irradiance_on_level_ground_matches_sky_fraction(elevation_deg: float, depth: float) -> None:
     photometry = replace(DUSTY, sky=DustySky(depth, 0.95, 0.65))
     sun = Sun(direction(0.3, np.radians(elevation_deg)))
-    coefficients = photometry.sky_coefficients(sun)
+    sky = photometry.sky_model(sun)
     up_squared, azimuth_turns = qmc.Sobol(2, rng=np.random.default_rng(2)).random_base2(14).T
     up, horizontal, azimuth = np.sqrt(up_squared), np.sqrt(1.0 - up_squared), 2.0 * np.pi * azimuth_turns
     directions = np.stack([horizontal * np.sin(azimuth), horizontal * np.cos(azimuth), up], axis=1)
     cos_sun_angles = directions @ sun.direction
     # The directions have a density proportional to the sine of elevation. Angles of at least 1e-3 rad from the sun
     # exclude the solar disc.
-    brightness = [
-        sky_brightness(coefficients, sun.direction[2], 1e-9, ray[2], min(cos_angle, np.cos(1e-3)), 1e-3)
-        for ray, cos_angle in zip(directions, cos_sun_angles, strict=True)
-    ]
+    mu, cos_g = to_device(Float64, directions[:, 2]), to_device(Float64, np.minimum(cos_sun_angles, np.cos(1e-3)))
+    brightness = to_host(sky.radiance(Float64(sun.direction[2]), Float64(1e-9), mu, cos_g, Float64(1e-3)))
+    uniform = to_host(sky.uniform)[0]
     # The forward peak (0.65**2 of the singly scattered light) counts as direct sunlight.
-    single_scattering = np.mean(brightness) - coefficients[0]
-    assert coefficients[0] + (1.0 - 0.65**2) * single_scattering == pytest.approx(0.25, rel=0.01)
+    single_scattering = np.mean(brightness) - uniform
+    assert uniform + (1.0 - 0.65**2) * single_scattering == pytest.approx(0.25, rel=0.01)
 
 
 def test_sky_radiance_matches_the_formula(renderer: Renderer) -> None:

@@ -157,7 +157,7 @@ def test_rocks_follow_the_density_of_units_with_the_same_total() -> None:
     surface = synthesise(_make_parameters(samples=256, spacing_m=0.5, units=_make_units()), np.random.default_rng(4))
     parameters = RockParameters(abundance=0.005, smallest_m=0.02)  # few rocks, so that overlaps are rare
     rocks = RockField.draw(surface, parameters, np.random.default_rng(2))
-    uniform_rocks = RockField.draw(Surface(surface.levels, surface.spacing_m), parameters, np.random.default_rng(2))
+    uniform_rocks = RockField.draw(Surface(surface.samples, surface.spacing_m), parameters, np.random.default_rng(2))
     assert len(rocks) == len(uniform_rocks)
     side = len(surface.factors)
     cell = (rocks.position_m[:, :2] / surface.period_m * side).astype(int) % side

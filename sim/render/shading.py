@@ -1,0 +1,157 @@
+"""The radiance of every pixel: sample the surface that its ray meets, then texture, illumination and reflectance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+
+from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
+from marsyard.sim.render.device import Array3f, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.primary import Hits, Points, Pose, Rays, locate
+from marsyard.sim.render.reflectance import Angles, Law, Sky
+from marsyard.sim.render.shadows import ObjectSurfaces
+from marsyard.sim.render.spline import Terrain, evaluate
+from marsyard.sim.render.sunlight import Clouds, disc_overlap
+from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albedo, relief_slopes, smith_shadowing
+
+#: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
+MAX_SHARP_FOOTPRINT = 1.2
+#: Body number of pixels that see the ground, and of pixels that see the sky.
+GROUND, SKY = -1, -2
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Illumination at one time: unit vector to the sun, its angular radius, reflectance law, sky, and clouds.
+
+    `caster_diameter` is that of a round body at the camera, metres; None without one.
+    """
+
+    sun: Values
+    sun_radius: Values
+    law: Law
+    sky: Sky
+    caster_diameter: Values | None
+    clouds: Clouds | None
+
+    def sky_radiance(self, direction: Values, pixel_rad: Values) -> Values:
+        """Radiance factor of the sky in directions."""
+        cos_g = dr.dot(direction, self.sun)
+        return self.sky.radiance(self.sun.z, self.sun_radius, direction.z, cos_g, Float64(pixel_rad))
+
+
+@dataclass(frozen=True, eq=False)
+class Materials:
+    """Micro-relief, textures of ground and objects, and the objects' surfaces; None where there are none."""
+
+    relief: RoughGround | None
+    ground_texture: Octaves
+    object_texture: Octaves
+    objects: ObjectSurfaces | None
+
+
+@dataclass(frozen=True, eq=False)
+class ShadedImage:
+    """Radiance factor, body number (or `GROUND`, `SKY`) and unit normal in world axes of each pixel."""
+
+    radiance: Values
+    body: Values
+    normal: Values
+
+
+@dataclass(eq=False)
+class _Surface:
+    """Slopes along x and y and albedo of the ground."""
+
+    slope_x: Values
+    slope_y: Values
+    albedo: Values
+
+    def normal(self) -> Values:
+        """Compute the unit normal."""
+        return dr.normalize(Array3f(-self.slope_x, -self.slope_y, 1.0))
+
+
+def _sample_ground(terrain: Terrain, points: Points, level: Values) -> _Surface:
+    """Sample the ground on the two terrain levels nearest to the pixels' footprints, and blend them."""
+    samples = points.footprint / (MAX_SHARP_FOOTPRINT * Float(terrain.spacing))
+    fractional = larger(dr.log2(larger(samples, 1.0)), Float(level))
+    lower = dr.minimum(Int32(fractional), terrain.top_level)
+    blend = dr.select(lower < terrain.top_level, smaller(fractional - Float(lower), 1.0), 0.0)
+
+    def add_level(total: _Surface, weight: Values, level: Values, is_active: Values) -> tuple[_Surface, ...]:
+        ground = evaluate(terrain, level, points.position.x, points.position.y, is_active)
+        total = _Surface(
+            dr.fma(weight, ground.slope_x, total.slope_x),
+            dr.fma(weight, ground.slope_y, total.slope_y),
+            dr.fma(weight, ground.albedo, total.albedo),
+        )
+        return total, blend, level + 1, is_active & (blend > 0.0) & (level == lower)
+
+    nothing = _Surface(Float(0.0), Float(0.0), Float(0.0))
+    return dr.while_loop(
+        (nothing, 1.0 - blend, Int32(lower), Bool(points.is_ground)),
+        lambda total, weight, level, is_active: is_active,
+        add_level,
+    )[0]
+
+
+@compiled
+def shade(
+    terrain: Terrain, pose: Pose, rays: Rays, hits: Hits, light: Light, sun_fraction: Values, materials: Materials
+) -> ShadedImage:
+    """Compute radiance factor, body and normal of every pixel.
+
+    `sun_fraction` is the fraction of the sun's disc that ground and objects leave visible (`shadows.visible_sun`).
+    """
+    points = locate(rays, pose, hits)
+    is_object, is_ground = points.is_object, points.is_ground
+    ground = _sample_ground(terrain, points, hits.level)
+    normal, albedo = ground.normal(), ground.albedo
+    body, texture_footprint = dr.select(is_ground, Int32(GROUND), SKY), dr.select(is_ground, points.footprint, dr.inf)
+    if materials.objects is not None:
+        object_normal = materials.objects.normal_at(hits, is_object)
+        normal = dr.select(is_object, object_normal, normal)
+        object_body = dr.gather(Int32, materials.objects.body_of_triangle, UInt32(hits.triangle), is_object)
+        body = dr.select(is_object, object_body, body)
+        object_albedo = dr.gather(Float, materials.objects.albedo, UInt32(object_body), is_object)
+        albedo = dr.select(is_object, object_albedo, albedo)
+        facing = -dr.dot(Array3f(points.direction), object_normal)
+        object_footprint = Float(hits.distance) * rays.pixel_angles / dr.sqrt(larger(facing, 0.05))
+        texture_footprint = dr.select(is_object, object_footprint, texture_footprint)
+    is_surface = is_ground | is_object
+    smooth_normal, strength = dr.select(is_surface, normal, 0.0), Float(1.0)
+    slopes = None
+    if materials.relief is not None:
+        # tilted normals change the mean radiance, but the reflectance law already includes the mean effect of all
+        # roughness: the mean is restored below
+        slopes = relief_slopes(materials.relief, points.position, dr.select(is_ground, points.footprint, dr.inf))
+        x, y = points.position.x, points.position.y
+        roughness = dr.select(is_ground, materials.relief.roughness.interpolate(x, y), 0.0)
+        strength = dr.select(is_ground, materials.relief.texture.interpolate(x, y), 1.0)
+        tilted = _Surface(ground.slope_x + roughness * slopes.x, ground.slope_y + roughness * slopes.y, albedo)
+        normal = dr.select(is_ground, tilted.normal(), normal)
+        slopes.resolved, slopes.unresolved = (
+            roughness * roughness * variance for variance in (slopes.resolved, slopes.unresolved)
+        )
+    angles = Angles.of(normal, points.direction, light.sun)
+    textures = materials.ground_texture, materials.object_texture
+    albedo *= dr.exp(log_relative_albedo(*textures, is_object, points.position, texture_footprint, strength))
+    fraction = sun_fraction
+    if light.caster_diameter is not None:
+        radius = 0.5 * light.caster_diameter / hits.distance
+        fraction *= where(
+            is_surface & (angles.cos_g > 0.9),
+            lambda: 1.0 - Float(disc_overlap(radius, light.sun_radius, dr.acos(angles.cos_g))),
+            Float(1.0),
+        )
+    if light.clouds is not None:
+        fraction *= light.clouds.transmittance(points.position, light.sun)
+    if slopes is not None:
+        # on level ground the mean of n_z, 1 / sqrt(1 + slope**2), is 1 - variance to second order in the slope
+        cosine = smaller(larger(angles.cos_i, 1e-6), 1.0)
+        fraction *= (1.0 + slopes.resolved) * smith_shadowing(cosine, slopes.unresolved)
+    radiance = albedo * light.law.radiance(angles, normal.z, fraction)
+    radiance = where(~is_surface, lambda: Float(light.sky_radiance(points.direction, rays.pixel_angles)), radiance)
+    return ShadedImage(radiance, body, smooth_normal)

@@ -1,0 +1,176 @@
+"""Detail finer than the terrain's samples: albedo texture, and micro-relief, which changes surface normals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+from jaxtyping import Float as FloatArray
+from jaxtyping import Float32
+
+from marsyard.sim.render.arrays import Values, larger, smaller, to_device
+from marsyard.sim.render.device import Float, Float64, UInt32
+from marsyard.sim.render.noise import noise_in_plane, noise_in_space
+from marsyard.sim.render.sunlight import Grid
+from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
+
+#: Mean square of `noise_in_space`; mean squares of `noise_in_plane` and of its derivative along one axis.
+NOISE_VARIANCE, HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0732, 0.0464, 0.3886
+#: A pixel averages over its area: a wave of f cycles per footprint keeps the fraction sinc(f) of its amplitude. (The
+#: detector model applies the blur of the optics.) Noise with cells of c footprints has a median frequency of 0.53
+#: cycles per cell, its slopes of 0.61; ``(1 - FADING / c^2)^2`` approximates its sinc to 0.02 down to the Nyquist
+#: frequency. FADING is (0.53 pi)^2 / 12, from the series sinc(f) = 1 - (pi f)^2 / 6. Waves above the Nyquist frequency
+#: alias, as in a real camera.
+FADING, SLOPE_FADING = 0.231, 0.306
+#: Cell size, in footprints, at which an octave of texture, or of slopes, vanishes.
+MIN_CELLS, MIN_SLOPE_CELLS = math.sqrt(FADING), math.sqrt(SLOPE_FADING)
+
+
+@dataclass(frozen=True, eq=False)
+class Octaves:
+    """Octaves of noise: cell size of the coarsest, metres, halved with each octave; amplitudes, coarsest first."""
+
+    coarsest: Values
+    amplitudes: Values
+    count: Values
+
+    @classmethod
+    def of(cls, coarsest_m: float, amplitudes: FloatArray[np.ndarray, "octaves"] | tuple[float, ...]) -> Octaves:
+        """Copy octaves to the device."""
+        # Dr.Jit cannot gather from an empty array
+        padded = np.array([*amplitudes, 0.0])
+        return cls(Float64(coarsest_m), to_device(Float, padded), UInt32(len(padded) - 1))
+
+
+def _fade(footprint: Values, cell: Values, fading: float) -> Values:
+    """Compute the fraction of an octave's amplitude that remains in the mean over a pixel's footprint."""
+    ratio = footprint / Float(cell)
+    fade = larger(1.0 - fading * ratio * ratio, 0.0)
+    return fade * fade
+
+
+def log_relative_albedo(
+    ground: Octaves, objects: Octaves, on_object: Values, position: Values, footprint: Values, strength: Values
+) -> Values:
+    """Compute the logarithm of the relative albedo, averaged over the pixels' footprints.
+
+    Each octave fades by the average over the pixel, so that detail appears gradually as a camera approaches the surface
+    (`FADING`). Half of each octave's variance is subtracted (mean of a log-normal variable): the mean albedo does not
+    depend on the number of visible octaves. Pixels with an infinite footprint have no texture. `strength` is a factor
+    of the amplitudes.
+    """
+    count = dr.select(on_object, objects.count, ground.count)
+    min_cell = Float64(MIN_CELLS * footprint)
+
+    def add_octave(octave: Values, cell: Values, total: Values) -> tuple[Values, Values, Values]:
+        amplitude = dr.select(
+            on_object,
+            dr.gather(Float, objects.amplitudes, dr.minimum(octave, objects.count)),
+            dr.gather(Float, ground.amplitudes, dr.minimum(octave, ground.count)),
+        )
+        gain = strength * amplitude * _fade(footprint, cell, FADING)
+        noise = noise_in_space(list(position), cell, octave)
+        return octave + 1, 0.5 * cell, total + gain * noise - 0.5 * NOISE_VARIANCE * gain * gain
+
+    first = dr.select(on_object, objects.coarsest, ground.coarsest)
+    return dr.while_loop(
+        (UInt32(0), first, Float(0.0)), lambda octave, cell, total: (octave < count) & (cell > min_cell), add_octave
+    )[2]
+
+
+@dataclass(frozen=True)
+class MicroRelief:
+    """Octaves of height noise on the ground, and maps of their strength. Without octaves `heights` is empty.
+
+    - coarsest: cell size of the coarsest octave, metres; the cell size is halved with each octave
+    - heights: height amplitude of each octave, metres, coarsest first
+    - factors: factors of these heights, and of the ground's albedo texture, on a periodic grid: the first two channels
+      of `marsyard.sim.terrain.surface.Surface.factors`
+    - per_metre: samples of that grid per metre
+    """
+
+    coarsest: float
+    heights: FloatArray[np.ndarray, "octaves"]
+    factors: Float32[np.ndarray, "side side channels"]
+    per_metre: float
+
+
+@dataclass(frozen=True, eq=False)
+class RoughGround:
+    """Micro-relief on the device.
+
+    - octaves: octaves of the heights
+    - variance_from: variance of the slope along one axis of each octave and all finer ones; 0 at the end
+    - roughness, texture: factors of the heights, and of the texture's amplitudes
+    """
+
+    octaves: Octaves
+    variance_from: Values
+    roughness: Grid
+    texture: Grid
+
+    @classmethod
+    def of(cls, relief: MicroRelief) -> RoughGround | None:
+        """Copy micro-relief to the device; None without octaves."""
+        if len(relief.heights) == 0:
+            return None
+        roughness, texture = (Grid.of(relief.factors[..., k], relief.per_metre) for k in (ROUGHNESS, TEXTURE))
+        gains = relief.heights / (relief.coarsest * 0.5 ** np.arange(len(relief.heights)))
+        variance_from = SLOPE_VARIANCE * np.cumsum([0.0, *gains[::-1] ** 2])[::-1]
+        octaves = Octaves.of(relief.coarsest, relief.heights)
+        return cls(octaves, to_device(Float, variance_from), roughness, texture)
+
+
+@dataclass(eq=False)
+class Slopes:
+    """Slopes along x and y of the octaves that a pixel resolves; variances of the slope along one axis.
+
+    `resolved` is the variance of the part that a pixel resolves, `unresolved` that of the remainder.
+    """
+
+    x: Values
+    y: Values
+    resolved: Values
+    unresolved: Values
+
+
+def relief_slopes(ground: RoughGround, position: Values, footprint: Values) -> Slopes:
+    """Compute the slopes of micro-relief at positions, for a roughness of 1.
+
+    An octave fades with the footprint of the pixel (`SLOPE_FADING`).
+    """
+    octaves, min_cell = ground.octaves, Float64(MIN_SLOPE_CELLS * footprint)
+
+    def add_octave(octave: Values, cell: Values, total: Slopes) -> tuple[Values, Values, Slopes]:
+        gain = dr.gather(Float, octaves.amplitudes, dr.minimum(octave, octaves.count)) / Float(cell)
+        fade, variance = _fade(footprint, cell, SLOPE_FADING), gain * gain * SLOPE_VARIANCE
+        _, slope_x, slope_y = noise_in_plane(list(position)[:2], cell, octave)
+        total = Slopes(
+            total.x + gain * fade * slope_x,
+            total.y + gain * fade * slope_y,
+            total.resolved + variance * fade * fade,
+            total.unresolved + variance * (1.0 - fade * fade),
+        )
+        return octave + 1, 0.5 * cell, total
+
+    octave, _, total = dr.while_loop(
+        (UInt32(0), Float64(octaves.coarsest), Slopes(*(Float(0.0) for _ in range(4)))),
+        lambda octave, cell, total: (octave < octaves.count) & (cell > min_cell),
+        add_octave,
+    )
+    total.unresolved += dr.gather(Float, ground.variance_from, octave)
+    return total
+
+
+def smith_shadowing(cosine: Values, variance: Values) -> Values:
+    """Fraction of illuminated facets that the roughness does not shade (Smith 1967, Gaussian slopes).
+
+    `cosine` is that of the incidence angle, `variance` that of the slope along one axis. The rational approximation of
+    Walter et al. (2007, section 5.2) is at least 0.996 of the exact value.
+    """
+    # a is large without roughness or at normal incidence
+    a = smaller(cosine / dr.sqrt(larger(2.0 * variance * (1.0 - cosine * cosine), 1e-30)), 1.6)
+    numerator = 3.535 * a + 2.181 * a * a
+    return dr.select(a < 1.6, numerator / (numerator + 1.0 - 1.259 * a + 0.396 * a * a), 1.0)
