@@ -2,6 +2,9 @@
 
 A confirmation is evaluated together with the earlier ones of its claim. The record of confirmations contains the number
 of cases and failures of each terrain, so that the folders of the earlier runs are not needed.
+
+A look is an evaluation that the campaign planned: after its first cases, and after each further block up to its maximum
+number. A claim is an algorithm with its options on a campaign's definition (`marsyard.campaigns.definition.claims`).
 """
 
 from __future__ import annotations

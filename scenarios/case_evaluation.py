@@ -31,7 +31,7 @@ class Score:
     - answered: whether the answer is valid (the population `valid` of requirements)
     - row: columns of the answer and of its errors
     - products: arrays for the case's figures
-    - scored: input of custom scores; None without an answer
+    - custom_input: input of custom scores; None without an answer
     - timeline: creates the timeline of the case with this answer
     - outcome: outcome of the answer; empty for the name of its attribute `outcome`, or of the failure
     """
@@ -39,7 +39,7 @@ class Score:
     answered: bool
     row: Mapping[str, Scalar]
     products: Mapping[str, Any] = field(default_factory=dict)
-    scored: ScoredCase | None = None
+    custom_input: ScoredCase | None = None
     timeline: Callable[[], Timeline] | None = None
     outcome: str = ""
 
@@ -67,8 +67,8 @@ def evaluate_case(
         runs[algorithm] = algorithm_run = run(algorithm)
         scored = score(algorithm, runs)
         row: dict[str, Scalar] = {**scored.row, **algorithm_run.row}
-        if scored.scored is not None:
-            row |= compute_scores(getattr(p, "scores", ()), scored.scored, {*row, *conditions})
+        if scored.custom_input is not None:
+            row |= compute_scores(getattr(p, "scores", ()), scored.custom_input, {*row, *conditions})
         products = dict(scored.products)
         if scored.timeline is not None:
             products |= timeline_products(scored.timeline, is_tested=algorithm == p.algorithm)

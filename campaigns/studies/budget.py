@@ -186,8 +186,8 @@ class _BudgetStudy:
 
     def _generator(self, name: str) -> np.random.Generator:
         """Create a random generator of the study, which does not depend on the cases."""
-        variant = self._campaign.definition
-        return Streams(variant.seed, variant.name, 0).generator(f"budget: {name}")
+        definition = self._campaign.definition
+        return Streams(definition.seed, definition.name, 0).generator(f"budget: {name}")
 
     def _run_variants(self, variants: Sequence[Variant]) -> tuple[Float64[np.ndarray, "variants n"], np.ndarray, int]:
         """Evaluate the base cases in all variants; return errors, terrain groups, and number of violations."""

@@ -73,8 +73,8 @@ def compute_budget(
     None for too few of these cases, for one group, or if all errors are equal. The intervals are those of
     `studentized_intervals`; groups of cases (terrains) are resampled.
 
-    - errors: error of each case in each variant, in the order of
-      `marsyard.campaigns.studies.budget.list_variants`; NaN without a value
+    - errors: error of each case in each variant: with all sources, with none, without each one, then with each one
+      alone (`marsyard.campaigns.studies.budget.list_variants`); NaN without a value
     - groups: number of the group of each case
     """
     has_error = np.isfinite(errors)

@@ -146,13 +146,13 @@ def resume(
     from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.cli.studies import contains_study, continue_study
+    from marsyard.cli.studies import contains_study, continue_study_and_exit
     from marsyard.cli.until_decided import continue_until_decided
 
     if trust:
         adopt(directory)
     if contains_study(directory):
-        continue_study(directory, jobs, cluster)
+        continue_study_and_exit(directory, jobs, cluster)
     executor, allowed = make_executor(jobs, cluster), [*RETRYABLE, "all"]
     for name in retry or []:
         if name not in allowed:
@@ -189,12 +189,12 @@ def append(
     from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.record import stored_definition
     from marsyard.cli.estimate import print_limits
-    from marsyard.cli.studies import contains_study, continue_study
+    from marsyard.cli.studies import contains_study, continue_study_and_exit
 
     if trust:
         adopt(directory)
     if contains_study(directory):
-        continue_study(directory, jobs, cluster, cases, is_random=random)
+        continue_study_and_exit(directory, jobs, cluster, cases, is_random=random)
     if random:
         raise CampaignError(f"--random is for studies of `marsyard rare`; {directory} contains a campaign")
     if stored_definition(directory).max_cases is not None:

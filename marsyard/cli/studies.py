@@ -194,7 +194,7 @@ def contains_study(directory: Path) -> bool:
     return read_study(directory) is not None
 
 
-def continue_study(
+def continue_study_and_exit(
     directory: Path, jobs: int | None, cluster: str | None, additional: int = 0, *, is_random: bool = False
 ) -> NoReturn:
     """Continue the study in a folder, and exit with the status of its verdict.

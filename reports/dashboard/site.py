@@ -18,7 +18,7 @@ from markupsafe import Markup
 from marsyard.campaigns.definition.requirements import SharedRequirement, shipped_requirements
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports.campaign import VERIFICATION_FILE
-from marsyard.reports.dashboard import entries as stored
+from marsyard.reports.dashboard import entries as campaign_entries
 from marsyard.reports.dashboard.entries import Entry, RequirementRow, basis_text, evidence_text, margin_text
 from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.page import embed_json, script_hash
@@ -53,8 +53,8 @@ def write_site(
     # the pages of a campaign are in the folder c/SLUG
     pages = directory / "c"
     pages.mkdir(parents=True, exist_ok=True)
-    entries, problems = stored.read_entries(stored.find_campaigns(sources), pages)
-    rows = stored.requirement_rows(entries, shipped_requirements() if shared is None else shared)
+    entries, problems = campaign_entries.read_entries(campaign_entries.find_campaigns(sources), pages)
+    rows = campaign_entries.requirement_rows(entries, shipped_requirements() if shared is None else shared)
     for entry in entries:
         _write_campaign(pages / entry.slug, entry)
     script = read_script()
@@ -71,8 +71,8 @@ def write_site(
         entries=entries,
         problems=problems,
         filters=[(name.lower(), name, sorted(choices - {""})) for name, choices in filter_values.items()],
-        max_other=stored.MAX_OTHER_VERDICTS,
-        coverage=stored.count_verdicts(rows),
+        max_other=campaign_entries.MAX_OTHER_VERDICTS,
+        coverage=campaign_entries.count_verdicts(rows),
         multiplicity=multiplicity_text([row.latest.verdict for row in rows if row.latest is not None]),
         data=embed_json(_create_filter_data(rows)),
         script=script,

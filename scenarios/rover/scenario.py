@@ -384,7 +384,7 @@ def score_track(p: RoverScenarioParameters, track: ScoredTrack | None, *, is_tes
     run, row = track.run, dict(track.row)
     is_completed, scored = run.outcome is RunOutcome.COMPLETED, score.create_scored_run(run)
     if not is_tested:
-        return Score(is_completed, row, scored=scored)
+        return Score(is_completed, row, custom_input=scored)
     digest = hashlib.sha256(b"".join(stop.images.digest for stop in run.stops)).hexdigest()
     row |= {**score.update_columns(run, p.score.stored_updates), **score.run_conditions(p, run)}
     row |= image_columns(p.backend, digest)
