@@ -69,7 +69,7 @@ class DetectorParameters(Parameters):
     """A frame-transfer detector without mechanical shutter. Defaults: the MER descent camera as flown.
 
     Full well, gain, read noise and readout rate: Maki et al. 2003. Responsivity and dark current are calibrated (see
-    `marsyard.sim.sensor.optics`). The clearing time is assumed.
+    `marsyard.sim.sensor.optics`). The clearing time is assumed. The pattern `residual_spread` is no default.
     """
 
     exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="exposure time, s")] = 0.004

@@ -246,10 +246,10 @@ def _locks(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> N
         if request.param:
             raise OSError(request.param, os.strerror(request.param))
 
+    monkeypatch.setattr(lock, "_BEAT_S", 0.1)
+    monkeypatch.setattr(lock, "_SILENCE_S", 1.5)
     if request.param is not None:
         monkeypatch.setattr("fcntl.flock", flock)
-        monkeypatch.setattr(lock, "_BEAT_S", 0.1)
-        monkeypatch.setattr(lock, "_SILENCE_S", 1.5)
 
 
 @pytest.mark.usefixtures("_locks")

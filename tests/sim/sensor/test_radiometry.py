@@ -71,6 +71,8 @@ def test_default_detector_equals_the_flight_descent_camera() -> None:
     flight = FLIGHT_CAMERA.detector.model_dump()
     assert parameters.responsivity_e_s == pytest.approx(flight.pop("responsivity_e_s"), rel=2e-3)
     assert parameters.optics.diffraction_px == pytest.approx(flight.pop("optics")["diffraction_px"], abs=0.01)
+    # the pattern is calibrated to pairs of images of this camera only
+    assert flight.pop("residual_spread") > parameters.residual_spread == 0.0
     assert parameters.model_dump(include=set(flight)) == flight
     assert parameters.dark_e_s == DARK_E_S
 
