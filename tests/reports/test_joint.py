@@ -70,6 +70,7 @@ def count_deciding_failures(look: int) -> tuple[int, int]:
     return largest_pass, bisect.bisect_left(counts, True, key=lambda count: evaluate(count) is Status.FAIL)
 
 
+@pytest.mark.slow
 def test_repeated_confirmations_keep_the_risk_of_a_wrong_pass() -> None:
     """Exact probability of PASS in up to 20 confirmations of 60 cases, repeated until one passes; FAIL is final."""
     undecided, passed = np.ones(1), 0.0

@@ -45,7 +45,7 @@ def test_stated_number_bounds_the_false_passes_of_a_simulation() -> None:
     assert passes.any(axis=1).mean() <= 0.3 + 3 * 0.0065
 
 
-@pytest.mark.parametrize("requirements", [1, 2])
+@pytest.mark.parametrize("requirements", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_statement_is_printed_and_shown(make_run: MakeRun, tmp_path: Path, requirements: int) -> None:
     second = {**VELOCITY, "id": "SECOND", "bound": 9.0}
     directory = make_run(make_rows(24), [VELOCITY, second][:requirements])

@@ -17,7 +17,7 @@ from tests.reports.synthetic_run import MakeRun, make_rows
     "options",
     [
         {"cases": 24},
-        {"cases": 120, "terrains": 30},
+        pytest.param({"cases": 400, "terrains": 60}, marks=pytest.mark.slow),
         pytest.param({"cases": 24, "n_crashed": 3}, marks=pytest.mark.slow),
         {"cases": 24, "answer_rate": 0.0},
         {"cases": 1},

@@ -32,13 +32,13 @@ def has_texture(m):
         "dimes",
         "vtt",
         "hda",
-        "velocity_stream:ChainedShifts",
         *(
             pytest.param(spec, marks=pytest.mark.slow)
             for spec in (*VELOCITY.shipped, *TRACKING.shipped, *LANDING.shipped)
             if spec not in ("dimes", "vtt", "hda")
         ),
         pytest.param("velocity_estimator:MedianShift", marks=pytest.mark.slow),
+        pytest.param("velocity_stream:ChainedShifts", marks=pytest.mark.slow),
         pytest.param("velocity_stream:IntegratedShifts", marks=pytest.mark.slow),
     ],
 )

@@ -92,6 +92,7 @@ def test_motion_along_optical_axis_cannot_be_rectified(landing_scene: LandingSce
     assert rectify_views(landing_scene.views, axial_motion) is None
 
 
+@pytest.mark.slow
 def test_vertical_descent_has_no_semi_global_structure() -> None:
     measurements = measure_pass(make_scene((0.0, 0.0, 8.6, 20.0)))
     result = SemiGlobalEstimator(OPTIONS).estimate(measurements)

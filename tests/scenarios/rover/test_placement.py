@@ -191,6 +191,7 @@ def test_regression_campaign_has_the_14_runs_of_the_paper() -> None:
     assert [(leg.visual_odometry, leg.autonav) for leg in ramp] == [(True, False)] * 2
 
 
+@pytest.mark.slow
 def test_shadow_of_a_shared_drive_does_not_depend_on_the_tracker() -> None:
     """The sun is 30 deg high behind the rover: at the last stop the mast shades the middle of the rock."""
     values: dict[str, Any] = {

@@ -48,6 +48,7 @@ def test_heights_speed_and_tilt_match_the_paper() -> None:
     assert 25.0 < np.degrees(np.linalg.norm(motion.body_rates_rad_s, axis=1)).max() < 61.0
 
 
+@pytest.mark.slow
 def test_rates_of_climb_are_uniform() -> None:
     """Between 1 and 2 m/s: mean 1.5, standard deviation 1 / sqrt(12). Tolerances: four standard errors of 400 passes.
 
