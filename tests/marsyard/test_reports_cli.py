@@ -145,6 +145,7 @@ def test_campaign_stops_if_no_further_evaluation_can_decide() -> None:
     assert _find_next_look(32, 0, 33, probability=0.5) is None
 
 
+@pytest.mark.slow
 def test_adaptive_campaign_reports_its_end(tmp_path: Path) -> None:
     requirement = REQUIREMENT.replace("0.99", "0.5")
     dispersions = '[dispersions]\naltitude_m = {distribution = "normal", mean = 2000, sd = 100}\n'
