@@ -63,7 +63,7 @@ def render_reference(
     """Compute the radiance factor along the rays of a frame with Mitsuba, and whether the points are in cast shadow."""
     import mitsuba as mi
 
-    # one ray at a time: the vector variants of Mitsuba 3.9 need LLVM 17
+    # one ray at a time: the vector variants of Mitsuba 3.9 abort with LLVM 15
     mi.set_variant("scalar_rgb")
     sun = np.asarray(view.scene.sun.direction, dtype=np.float64)
     points = frame.points_world().reshape(-1, 3)

@@ -247,6 +247,7 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
         p.crater_sand_log_albedo * rng.uniform(0.5, 1.5, count),
         p.crater_floor_contrast * rng.standard_normal(count),
     )
+    # spread of sand and of its asymmetry between craters (assumed)
     fill_radius = rng.uniform(SMALLEST_FILL, LARGEST_FILL, count)
     lee = 0.3 * rng.standard_normal((count, 2))
     outline = rng.standard_normal((count, 8)) * np.repeat(OUTLINE_RMS, 2)
