@@ -16,11 +16,12 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from marsyard.reports import rates
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.figures import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
 from marsyard.reports.rates import CONFIDENCE, CaseFraction, PooledRate, finite_values, varies
 from marsyard.reports.section import Block, Grid, svg_figure
 from marsyard.reports.statistics.drivers import MIN_CASES, estimate_driver
-from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, numbers, percent
+from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, percent
 
 Rows = pd.DataFrame
 #: Function that computes a rate of rows.

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
 from marsyard.reports import rates
+from marsyard.reports.column_selection import distinct_columns, numbers
 from marsyard.reports.common_sections import rank_drivers
 from marsyard.reports.conditions import CONDITIONS
 from marsyard.reports.decision import requirement_masks
@@ -32,7 +33,7 @@ from marsyard.reports.section import (
     svg_figure,
 )
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.wording import distinct_columns, label, number, numbers
+from marsyard.reports.wording import label, number
 
 #: Minimum number of violations, and of other cases, of a requirement.
 MIN_CASES_PER_CLASS = 20

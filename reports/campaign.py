@@ -19,6 +19,7 @@ from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences
+from marsyard.reports.column_selection import numbers, primary_metric
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
@@ -37,7 +38,7 @@ from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import count, label, number, numbers, primary_metric
+from marsyard.reports.wording import count, label, number
 from marsyard.sim.cache import hide_folders
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.

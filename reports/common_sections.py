@@ -21,6 +21,7 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import NO_FAULT, OutcomesBySize, Rows
+from marsyard.reports.column_selection import axis_columns, driver_columns, numbers
 from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.figures import ELLIPSE
@@ -45,16 +46,13 @@ from marsyard.reports.statistics.proportions import proportion_interval
 from marsyard.reports.statistics.samples import circular_error, error_ellipse, mean_interval, quantile_bounds
 from marsyard.reports.wording import (
     NOTHING,
-    axis_columns,
     coefficient,
-    driver_columns,
     format_fraction,
     interval,
     label,
     magnitude_label,
     note_text,
     number,
-    numbers,
     p_text,
     percent,
 )

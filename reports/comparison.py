@@ -20,6 +20,7 @@ from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.campaign import leaves
 from marsyard.reports import rates
+from marsyard.reports.column_selection import numbers, primary_metric
 from marsyard.reports.decision import requirement_masks
 from marsyard.reports.rates import CONFIDENCE, success_mask
 from marsyard.reports.sampling_design import read_sampling_design
@@ -34,17 +35,7 @@ from marsyard.reports.statistics.changes import (
     symmetry_p_value,
 )
 from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.wording import (
-    NOTHING,
-    format_fraction,
-    label,
-    note_text,
-    number,
-    numbers,
-    p_text,
-    percent,
-    primary_metric,
-)
+from marsyard.reports.wording import NOTHING, format_fraction, label, note_text, number, p_text, percent
 from marsyard.scenarios.columns import split_unit
 
 

@@ -16,19 +16,11 @@ from jaxtyping import Bool
 from scipy import stats
 
 from marsyard.reports import rates
+from marsyard.reports.column_selection import axis_columns, numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import (
-    axis_columns,
-    format_fraction,
-    label,
-    note_text,
-    number,
-    numbers,
-    percent,
-    plain_value,
-)
+from marsyard.reports.wording import format_fraction, label, note_text, number, percent, plain_value
 from marsyard.scenarios.columns import split_unit
 
 #: Prefixes of the condition columns in the order of the page; the first column with each prefix is used.

@@ -13,10 +13,11 @@ import pandas as pd
 from jaxtyping import Bool, Int
 from markupsafe import Markup
 
+from marsyard.reports.column_selection import axis_columns, is_varying_number, numbers
 from marsyard.reports.page import replay_command
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.wording import axis_columns, is_varying_number, label, numbers
+from marsyard.reports.wording import label
 
 #: Maximum number of points of the explorer, without violations, and of violations. Maximum number of extreme cases of
 #: each kind: largest errors, no answer, crashed.

@@ -17,20 +17,13 @@ from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
 from marsyard.reports import section
+from marsyard.reports.column_selection import axis_columns, category_column, numbers
 from marsyard.reports.rates import ENGINE_FAILURES, CaseFraction, PooledRate
 from marsyard.reports.section import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.statistics.samples import error_ellipse
 from marsyard.reports.tables import answered_outcomes, outcome_counts
-from marsyard.reports.wording import (
-    axis_columns,
-    category_column,
-    format_fraction,
-    label,
-    magnitude_label,
-    numbers,
-    plain_value,
-)
 from marsyard.reports.wording import count as count_text
+from marsyard.reports.wording import format_fraction, label, magnitude_label, plain_value
 from marsyard.scenarios.columns import split_unit
 
 #: Probability of the ellipse about the errors.

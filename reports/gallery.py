@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from marsyard.reports.column_selection import numbers, primary_metric
 from marsyard.reports.presentation import CaseView, create_case_view
 from marsyard.reports.rates import population_mask
 from marsyard.reports.section import SvgFigure, svg_figure
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.wording import NOTHING, numbers, primary_metric
+from marsyard.reports.wording import NOTHING
 
 #: Number of selected cases of each group (largest errors, no answer, random); a case has half a megabyte of images.
 CASES_PER_GROUP = 2

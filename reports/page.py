@@ -25,6 +25,7 @@ from pydantic import BaseModel
 from marsyard.algorithms.faults import Fault
 from marsyard.campaigns.definition.campaign_file import description_at
 from marsyard.reports import figures
+from marsyard.reports.column_selection import axis_columns, numbers
 from marsyard.reports.presentation import presentations, system_presentation
 from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
 from marsyard.reports.sampling_design import read_sampling_design
@@ -36,13 +37,11 @@ from marsyard.reports.traceability import read_algorithms
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import (
     NOTHING,
-    axis_columns,
     coefficient,
     count,
     format_fraction,
     label,
     number,
-    numbers,
     percent,
     requirement_text,
 )

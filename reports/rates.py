@@ -11,10 +11,11 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns import errors
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.statistics.clusters import ClusteredCases
 from marsyard.reports.statistics.proportions import Interval, proportion_interval
 from marsyard.reports.statistics.samples import is_interpolated
-from marsyard.reports.wording import NOTHING, number, numbers, percent
+from marsyard.reports.wording import NOTHING, number, percent
 
 #: Outcomes of cases that the engine could not finish.
 ENGINE_FAILURES = errors.ENGINE_FAILURES

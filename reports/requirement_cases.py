@@ -18,13 +18,14 @@ from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns.errors import ENGINE_FAILURES
 from marsyard.reports import rates
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.explorer import ExploredRequirement
 from marsyard.reports.presentation import Cause, system_presentation
 from marsyard.reports.products import thumbnail, to_float
 from marsyard.reports.section import Grid, build_grid
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import NOTHING, count, label, number, numbers, percent
+from marsyard.reports.wording import NOTHING, count, label, number, percent
 from marsyard.scenarios.columns import split_unit
 
 #: Maximum number of violations, and of the cases nearest to the limit, that are listed for a requirement.

@@ -16,7 +16,7 @@ from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.products import load_products
 from marsyard.campaigns.store.record import reject_links
 from marsyard.campaigns.store.table import check_table
-from marsyard.reports.wording import axis_columns, driver_columns, looks_like_condition, primary_metric
+from marsyard.reports.column_selection import axis_columns, driver_columns, looks_like_condition, primary_metric
 from marsyard.scenarios.columns import Columns, enabling_columns, row_columns
 from marsyard.sim.files import report_damage
 
@@ -82,7 +82,7 @@ class StoredRun:
         return _is_condition(self.record, name)
 
     def driver_columns(self, metric: str, max_columns: int = 6) -> list[str]:
-        """Select conditions that may affect a metric; see `marsyard.reports.wording.driver_columns`."""
+        """Select conditions that may affect a metric; see `marsyard.reports.column_selection.driver_columns`."""
         return driver_columns(self.frame, metric, max_columns, self.is_condition)
 
     @property

@@ -14,21 +14,12 @@ from rich.table import Table
 from rich.text import Text
 
 from marsyard.campaigns.definition.evidence import Confirmation
+from marsyard.reports.column_selection import axis_columns, numbers
 from marsyard.reports.rates import ENGINE_FAILURES, is_flag, population_mask, terrain_groups
 from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict
-from marsyard.reports.wording import (
-    NOTHING,
-    axis_columns,
-    format_fraction,
-    interval,
-    label,
-    number,
-    numbers,
-    percent,
-    requirement_text,
-)
+from marsyard.reports.wording import NOTHING, format_fraction, interval, label, number, percent, requirement_text
 
 _STYLES = {
     Status.PASS: "bold green",

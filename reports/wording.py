@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-import re
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from jaxtyping import Float
 
 from marsyard.scenarios.columns import find_column, split_unit
 from marsyard.scenarios.columns import label as column_label
@@ -164,22 +161,6 @@ def note_text(key: str, **values: object) -> str:
     return _read_notes()[table][name].format(**values)
 
 
-_AXES = ("x", "y", "z")
-#: Pattern of columns that describe the run or the results, in scenarios that do not declare their columns.
-_EXCLUDED_COLUMNS = re.compile(
-    r"time|hash|^case$|^outcome$|^answered$|^error$|^traceback$|^gl_|^processor|version|host|estimated|_true_"
-    r"|^firing_|^touchdown_|^site_|^fault_size$|^update_\d|^(range|cross|worst)_error|^drift|^false_|^lost_"
-    r"|\.|^algorithm$|^stderr$|^velocity_(?:nees|normalised|sd|correlation)"
-)
-#: Prefixes of the condition columns that `driver_columns` lists first.
-_PREFERRED_DRIVERS = (
-    "off_nadir_max", "attitude_rate_max", "altitude_1", "horizontal_speed", "sun_elevation", "slip_mean",
-    "pose_error_fraction", "rock_diameter", "disparity_error_goal",
-)  # fmt: skip
-#: Maximum number of distinct values of a column that divides the cases into categories.
-_MAX_CATEGORIES = 6
-
-
 def label(column: str) -> str:
     """Return the column in words, with its unit: ``velocity error (m/s)``."""
     unit = split_unit(column)[1]
@@ -191,95 +172,3 @@ def magnitude_label(column: str) -> str:
     """Return the magnitude of a column in words, with its unit: ``|velocity error| (m/s)``."""
     unit = split_unit(column)[1]
     return f"|{label(column).removesuffix(f' ({unit})')}|{f' ({unit})' if unit else ''}"
-
-
-def axis_columns(metric: str, columns: Sequence[str]) -> list[str]:
-    """List the signed components of a metric among the columns: ``velocity_error_x_m_s`` for ``velocity_error_m_s``."""
-    name, _ = split_unit(metric)
-    ending = metric[len(name) :]
-    return [part for axis in _AXES if (part := f"{name}_{axis}{ending}") in columns]
-
-
-def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]]) -> str | None:
-    """Return the page's metric: the first numeric metric of a requirement, else the first error column, else None."""
-    requirement_metrics = [str(requirement.get("metric", "")) for requirement in requirements]
-    error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
-    names = (*requirement_metrics, *error_columns)
-    return next((name for name in names if name in frame and _is_number(frame, name)), None)
-
-
-def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
-    """Return a column as float64; NaN for missing numbers or a missing column."""
-    if column not in frame:
-        return np.full(len(frame), np.nan)
-    values = pd.to_numeric(frame[column], errors="coerce")
-    return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
-
-
-def looks_like_condition(name: str) -> bool:
-    """Whether the name of a column, of a scenario that declares none, does not look like a result."""
-    return not _EXCLUDED_COLUMNS.search(name)
-
-
-def driver_columns(
-    frame: pd.DataFrame, metric: str, max_columns: int = 6, is_condition: Callable[[str], bool] = looks_like_condition
-) -> list[str]:
-    """Select conditions that may affect a metric: `_PREFERRED_DRIVERS` first, then by rank correlation.
-
-    A sampled value that a column of the scenario repeats is not listed again.
-    """
-    names = [str(name) for name in frame.columns]
-    terrains = [name for name in names if name.rpartition(".")[2] == "terrain"]
-    excluded_names = {metric, *axis_columns(metric, names), *terrains}
-    candidates = [
-        name
-        for name in names
-        if name not in excluded_names and is_condition(name) and _is_number(frame, name) and frame[name].nunique() > 1
-    ]
-    candidates = distinct_columns(frame, candidates)
-    preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]
-    magnitude = np.abs(numbers(frame, metric))
-    others = sorted(
-        (name for name in candidates if name not in preferred_names),
-        key=lambda name: -abs(np.nan_to_num(rank_correlation(numbers(frame, name), magnitude))),
-    )
-    return [*preferred_names, *others][:max_columns]
-
-
-def distinct_columns(frame: pd.DataFrame, names: Sequence[str]) -> list[str]:
-    """Remove sampled values that equal another column; their names are paths of parameters."""
-    others = [name for name in names if "." not in name]
-    known = [numbers(frame, name) for name in others]
-    is_repeated = (
-        "." in name and any(np.allclose(numbers(frame, name), values, rtol=1e-9, equal_nan=True) for values in known)
-        for name in names
-    )
-    return [name for name, repeated in zip(names, is_repeated, strict=True) if not repeated]
-
-
-def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
-    """Compute Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
-    finite = np.isfinite(x) & np.isfinite(y)
-    if finite.sum() < 4:
-        return float("nan")
-    ranks_x, ranks_y = (pd.Series(values[finite]).rank().to_numpy() for values in (x, y))
-    return float("nan") if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0 else float(np.corrcoef(ranks_x, ranks_y)[0, 1])
-
-
-def category_column(frame: pd.DataFrame) -> str | None:
-    """Return the first column with 2 to 6 distinct values: a column of text, or the terrain; None if there is none."""
-    types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _EXCLUDED_COLUMNS.search(str(name))}
-    is_text = (pd.api.types.is_string_dtype, pd.api.types.is_object_dtype)
-    names = [name for name, dtype in types.items() if any(check(dtype) for check in is_text)]
-    names += ["terrain"] if "terrain" in frame else []
-    return next((name for name in names if 2 <= frame[name].nunique() <= _MAX_CATEGORIES), None)
-
-
-def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
-    """Whether a column contains numbers of more than one value."""
-    return _is_number(frame, column) and frame[column].nunique() > 1
-
-
-def _is_number(frame: pd.DataFrame, column: str) -> bool:
-    dtype = frame[column].dtype
-    return pd.api.types.is_numeric_dtype(dtype) and not pd.api.types.is_bool_dtype(dtype)

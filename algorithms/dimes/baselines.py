@@ -1,6 +1,6 @@
 """Baseline velocity estimators to compare with DIMES: phase correlation, and ORB features with a homography (OpenCV).
 
-Both images of a pair are rectified to one virtual camera that looks straight down (`binning.rectify_patch`) and
+Both images of a pair are rectified to one virtual camera that looks straight down (`rectification.rectify_patch`) and
 corrected as in DIMES. The baselines match one large square of the overlap region instead of templates. The IMU check of
 the two velocities is that of DIMES, with the same threshold. Only the measurement of the shift differs.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from marsyard.algorithms.arrays import Points2, Raster, Vector2
-from marsyard.algorithms.dimes import binning
+from marsyard.algorithms.dimes import binning, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import rank_combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
@@ -96,7 +96,7 @@ def find_common_square(
     gsd = float(second.centre[2]) * second.camera.pixel_angle_rad
     max_offset_m = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
     points_per_side = 2 * int(np.ceil(max_offset_m / (COARSE_STEP_PX * gsd))) + 1
-    lattice = binning.ground_lattice(np.zeros(2), points_per_side, COARSE_STEP_PX * gsd)
+    lattice = rectification.ground_lattice(np.zeros(2), points_per_side, COARSE_STEP_PX * gsd)
     visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
         visible &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
@@ -111,7 +111,7 @@ def rectify_pair(first: binning.BinnedView, second: binning.BinnedView, options:
     """Rectify both images of a pair over their largest common square; None if the square is too small."""
     square = find_common_square(first, second, options)
     return square and PairPatches(
-        binning.rectify_patch(first, *square), binning.rectify_patch(second, *square), square[2]
+        rectification.rectify_patch(first, *square), rectification.rectify_patch(second, *square), square[2]
     )
 
 

@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
-from marsyard.algorithms.dimes.binning import BinnedView, build_views, pixels_from_ground, rectify_patch
+from marsyard.algorithms.dimes.binning import BinnedView, build_views, pixels_from_ground
 from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.rectification import rectify_patch
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
 from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
-from marsyard.algorithms.dimes import binning
+from marsyard.algorithms.dimes import binning, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
 
@@ -191,7 +191,7 @@ def searchable_positions(
     second: binning.BinnedView, centre: Vector2, geometry: SearchGeometry, options: DimesOptions
 ) -> Bool[np.ndarray, "s s"]:
     """Whether the second view shows the complete template at each position of the search around `centre` (ground)."""
-    lattice = binning.ground_lattice(centre, geometry.window_px, geometry.gsd_m)
+    lattice = rectification.ground_lattice(centre, geometry.window_px, geometry.gsd_m)
     inside = binning.inside_frame(second, lattice, options.border_px, options.max_off_nadir_rad)
     half = geometry.template_px // 2
     return np.asarray(ndimage.minimum_filter(inside, size=geometry.template_px)[half:-half, half:-half])

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from scipy import optimize, special
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
-from marsyard.algorithms.dimes import binning, overlap
+from marsyard.algorithms.dimes import binning, overlap, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.registration import WindowSpline, register_template, spline_coefficients
 
@@ -82,7 +82,7 @@ def track_grid(
     high = np.min([outline.max(axis=0) for outline in outlines], axis=0)
     per_side = max(int((high - low).max() / gsd) // side, 1)
     size, centre = per_side * side, 0.5 * (low + high)
-    templates, window = (binning.rectify_patch(view, centre - offset, size, gsd) for view, offset in shifts)
+    templates, window = (rectification.rectify_patch(view, centre - offset, size, gsd) for view, offset in shifts)
     spline = WindowSpline((0, 0), (size, size), spline_coefficients(window))
     corners = side * np.stack(np.divmod(np.arange(per_side**2), per_side), axis=-1)
     rows, columns = ((corners + 0.5 * (side - size)) * gsd).T

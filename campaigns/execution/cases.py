@@ -20,7 +20,7 @@ from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Case
 from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.worker_process import Executor, TaskResult, Work, WorkLimits
+from marsyard.campaigns.execution.work import Executor, TaskResult, Work, WorkLimits
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row

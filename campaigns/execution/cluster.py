@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 from marsyard.campaigns.definition.identity import hash_code, read_versions
 from marsyard.campaigns.errors import CRASHED, CampaignError, WorkerExitError
 from marsyard.campaigns.execution.batches import Batches
-from marsyard.campaigns.execution.worker_process import TaskResult, Work
+from marsyard.campaigns.execution.work import TaskResult, Work
 from marsyard.campaigns.execution.workers import LocalExecutor
 
 Result = TypeVar("Result")

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 from marsyard.campaigns.execution.cluster import ClusterExecutor
-from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.execution.workers import LocalExecutor
 
 

@@ -1,28 +1,24 @@
-"""Tasks of the worker processes and their results, and the code inside a worker: setup, batches and status.
-
-A task is a function of an integer, its item: the number of a case, of a shared input or of a check.
-"""
+"""Code inside a worker process: setup, batches of items, and status (tasks: `marsyard.campaigns.execution.work`)."""
 
 from __future__ import annotations
 
 import faulthandler
 import gc
-import math
 import mmap
 import os
 import signal
 import struct
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Generic, Protocol, TypeVar
+from typing import Generic
 
 from marsyard.campaigns.execution import process_state
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, become_supervised
+from marsyard.campaigns.execution.work import Result, TaskResult
 
-Result = TypeVar("Result")
 #: Linux's `oom_score_adj` of a worker (at most 1000): if memory runs out, workers are killed before their parent.
 _OOM_SCORE = 800
 #: Exit status of a worker after an item closed file descriptors that the worker needs.
@@ -30,66 +26,6 @@ FILES_CLOSED = 97
 #: Layout of the status board: item, or `_NO_ITEM` between items.
 _BOARD_LAYOUT = struct.Struct("=q")
 _NO_ITEM = -1
-
-
-@dataclass(frozen=True)
-class TaskResult(Generic[Result]):
-    """Result of a task for one item, or the error that prevented the result.
-
-    - changed: names of the parts of the process state that the task changed
-    - crashed: whether the task requested a fresh worker (`request_fresh_worker`)
-    - previous_item: only for a crashed item: item that ran before in the same process; None for the first item
-    - crashed_only_after: predecessor item needed to reproduce the crash; the item does not crash in a fresh process
-    """
-
-    item: int
-    result: Result | None
-    error: Exception | None
-    changed: tuple[str, ...] = ()
-    crashed: bool = False
-    previous_item: int | None = None
-    crashed_only_after: int | None = None
-
-
-@dataclass(frozen=True)
-class WorkLimits:
-    """Limits of one task.
-
-    - time_s: wall-clock time
-    - memory_bytes: private memory of the worker and its descendants, without mapped files and shared libraries; None
-      for an equal fraction of 80 % of the free memory at the start of the work
-    - output_bytes: bytes on standard output and standard error
-    """
-
-    time_s: float = math.inf
-    memory_bytes: float | None = None
-    output_bytes: float = math.inf
-
-
-@dataclass(frozen=True)
-class Work(Generic[Result]):
-    """A task to be run on many items.
-
-    - task: a pure, picklable function of the item; limits: limits of the task for one item
-    - items: iterator that is advanced only when workers need items; total: number of items, if known
-    - load: loads the code of the task once in each worker, without time limits of items; its errors are ignored
-    """
-
-    task: Callable[[int], Result]
-    items: Iterable[int]
-    limits: WorkLimits = WorkLimits()
-    total: int | None = None
-    load: Callable[[], object] | None = None
-
-
-class Executor(Protocol):
-    """Processes that run tasks, on this machine or on a cluster."""
-
-    def run(self, work: Work[Result]) -> Iterator[list[TaskResult[Result]]]:
-        """Run the task on each item, and yield results as they arrive, in any order.
-
-        An error is the exception that the task raised, or a `WorkerExitError`.
-        """
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, CampaignError
 from marsyard.campaigns.execution.batches import Batches
 from marsyard.campaigns.execution.monitoring import POLL_INTERVAL_S, MonitoredWorker
-from marsyard.campaigns.execution.worker_process import BatchResult, TaskResult, Work
+from marsyard.campaigns.execution.work import TaskResult, Work
+from marsyard.campaigns.execution.worker_process import BatchResult
 
 Result = TypeVar("Result")
 

@@ -11,7 +11,7 @@ from functools import partial
 from itertools import chain
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.execution.worker_process import Executor, Work
+from marsyard.campaigns.execution.work import Executor, Work
 from marsyard.scenarios.systems import systems
 from marsyard.sim.kernel_cache import kernels_are_ready, mark_ready
 

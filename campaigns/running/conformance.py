@@ -7,7 +7,8 @@ from dataclasses import replace
 from functools import partial
 
 from marsyard.campaigns.errors import CampaignError, WorkerExitError
-from marsyard.campaigns.execution.worker_process import Work, WorkLimits, accept_process_state
+from marsyard.campaigns.execution.work import Work, WorkLimits
+from marsyard.campaigns.execution.worker_process import accept_process_state
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.scenarios import conformance as suite
 

@@ -19,7 +19,7 @@ from marsyard.campaigns.definition.identity import Identity, create_identity, de
 from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, DefinitionError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, run_cases
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
-from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.running.compilation import compile_kernels
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
@@ -29,6 +29,7 @@ from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
 from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.new_folder import claim_folder
 from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductStore, create_product_selection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
@@ -76,10 +77,10 @@ def run_campaign(
     Raises CampaignError if the folder contains a campaign or is not writable, or a column of a requirement is missing.
     On KeyboardInterrupt, rows and record are stored before the exception is raised again.
     """
-    record.claim_folder(directory)
+    claim_folder(directory)
     with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock
-        record.claim_folder(directory)
+        claim_folder(directory)
         identity = create_identity(campaign.definition)
         algorithms = describe_algorithms(campaign)
         create_store(directory / ROWS_FILE, {"identity": identity.definition})

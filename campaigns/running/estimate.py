@@ -11,7 +11,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.errors import ENGINE_FAILURES
 from marsyard.campaigns.execution.cases import CompletedCase, run_cases
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
-from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.running.shared_inputs import InputPlan, find_case_inputs, plan_inputs, preparation_work
 from marsyard.campaigns.store.products import ALL_PRODUCTS
 from marsyard.scenarios.interface import SelectsInputs

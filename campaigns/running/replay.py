@@ -12,7 +12,7 @@ from marsyard.campaigns.definition.campaign_file import CampaignDefinition, key_
 from marsyard.campaigns.definition.identity import Identity, create_identity
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, DefinitionError, Problem
 from marsyard.campaigns.execution.cases import run_cases
-from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.execution.workers import LocalExecutor
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint

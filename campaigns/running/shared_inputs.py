@@ -14,7 +14,7 @@ from itertools import chain
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.cases import create_loader, definition_text, prepare_input, work_limits
-from marsyard.campaigns.execution.worker_process import Executor, Work
+from marsyard.campaigns.execution.work import Executor, Work
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.scenarios.interface import SelectsInputs
 from marsyard.sim.cache import cache_directory, cached_bytes, limit_bytes

@@ -35,7 +35,8 @@ from marsyard.campaigns.definition.claims import (
 from marsyard.campaigns.definition.evidence import Confirmation, Evidence, EvidenceKind, classify_evidence
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store.git_registration import find_campaign_file_problem, find_registration_problem
-from marsyard.campaigns.store.record import git_commit, utc_now
+from marsyard.campaigns.store.machine import git_commit
+from marsyard.campaigns.store.record import utc_now
 from marsyard.scenarios.interface import HasAlgorithms
 
 _KINDS = ("chain", "start", "extension", "result")

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import re
-import shutil
-import subprocess
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -18,16 +14,14 @@ from typing import Any
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.store.machine import describe_machine, git_commit
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.sim.cache import hide_folders
-from marsyard.sim.kernel_cache import processor_features
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1
 RECORD_FILE = "campaign.json"
-#: Files of a campaign; a folder that contains any of them is never used for another campaign.
-_CAMPAIGN_FILES = (RECORD_FILE, "cases.parquet", ROWS_FILE, "report.html", "report.json", "cases")
 #: JSON types of the keys of a record that commands read.
 _KEY_TYPES: Mapping[str, tuple[type, str]] = {
     **dict.fromkeys(("name", "state"), (str, "a text")),
@@ -53,21 +47,6 @@ def reject_links(directory: Path) -> None:
 def utc_now() -> str:
     """Return the current time in ISO 8601 with a resolution of one second."""
     return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def claim_folder(directory: Path) -> None:
-    """Create the folder of a new campaign; the folder of a run that was killed before its first record can be reused.
-
-    Raises StoreError if the folder contains a campaign or is not writable.
-    """
-    with report_write_errors(directory):
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-        except FileExistsError as error:
-            raise StoreError(f"{directory} is not a folder; choose another folder with --out") from error
-        campaign_files = [name for name in _CAMPAIGN_FILES if (directory / name).exists()]
-        if campaign_files and (campaign_files != [ROWS_FILE] or not is_empty_store(directory / ROWS_FILE)):
-            raise StoreError(f"{directory} contains a campaign ({campaign_files[0]}); choose another folder with --out")
 
 
 def write_first_record(
@@ -196,41 +175,3 @@ def stored_definition(directory: Path) -> CampaignDefinition:
         return CampaignDefinition.model_validate(read(directory)["definition"])
     except (ValueError, KeyError) as error:
         raise StoreError(f"{directory / RECORD_FILE} is damaged: {error}") from error
-
-
-def git_commit() -> str | None:
-    """Return the git commit of the program, with ``+changes`` if tracked files were edited; None if unknown."""
-    git, source = shutil.which("git"), Path(__file__).resolve()
-    outputs = []
-    commands = (["rev-parse", "HEAD"], ["ls-files", source.name], ["status", "--porcelain", "--untracked-files=no"])
-    try:
-        for arguments in commands if git is not None else ():
-            command = [str(git), "-C", str(source.parent), *arguments]
-            process = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)  # noqa: S603
-            outputs.append(process.stdout.strip())
-    except (subprocess.SubprocessError, OSError):
-        return None
-    if git is None or not outputs[1]:
-        return None
-    commit, _, changes = outputs
-    return f"{commit}+changes" if changes else commit
-
-
-def describe_machine() -> dict[str, Any]:
-    """Describe Python, platform and processor (with a hash of its features).
-
-    Machines with equal descriptions compute bit-identical rows.
-    """
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        text = ""
-    model = re.search(r"^(?:model name|CPU part)\s*:\s*(.*)$", text, re.MULTILINE)
-    return {
-        "python": platform.python_version(),
-        "implementation": platform.python_implementation(),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "processor": model[1] if model else platform.processor(),
-        "processor_features": processor_features(),
-    }

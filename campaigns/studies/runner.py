@@ -20,7 +20,7 @@ from marsyard.campaigns.definition.identity import Identity, create_identity, de
 from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
-from marsyard.campaigns.execution.worker_process import Executor
+from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.running.compilation import compile_kernels
 from marsyard.campaigns.running.engine import check_metrics
@@ -33,6 +33,7 @@ from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.lock import folder_lock
+from marsyard.campaigns.store.new_folder import claim_folder
 from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
@@ -218,10 +219,10 @@ def create_study(campaign: Campaign, directory: Path, session: StudySession[Any,
 def start_study(campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Any, Result]) -> Result:
     """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder."""
     study_campaign = prepare_campaign(campaign, max_cases)
-    record.claim_folder(directory)
+    claim_folder(directory)
     with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock
-        record.claim_folder(directory)
+        claim_folder(directory)
         create_study(study_campaign, directory, session)
         return _run_study(study_campaign, directory, session)
 

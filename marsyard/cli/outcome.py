@@ -30,6 +30,7 @@ from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.cli.options import Exit
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
 from marsyard.reports.gallery import gallery_candidates
@@ -37,7 +38,7 @@ from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import count, primary_metric
+from marsyard.reports.wording import count
 from marsyard.sim.files import report_damage
 
 #: Browsers that can print pages, in order of preference, and the time limit of printing.

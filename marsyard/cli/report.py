@@ -181,7 +181,7 @@ def nightly(
     """
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.lock import folder_lock
-    from marsyard.campaigns.store.record import git_commit
+    from marsyard.campaigns.store.machine import git_commit
     from marsyard.cli import nightly_run
     from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
     from marsyard.cli.progress import campaign_progress

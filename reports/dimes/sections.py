@@ -16,6 +16,7 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, Rows, distribution_block, quantile_block, rate_block
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import (
     MUTED,
@@ -32,16 +33,7 @@ from marsyard.reports.section import (
 )
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.tables import error_summaries, statistics_rows
-from marsyard.reports.wording import (
-    NOTHING,
-    format_fraction,
-    label,
-    magnitude_label,
-    note_text,
-    number,
-    numbers,
-    percent,
-)
+from marsyard.reports.wording import NOTHING, format_fraction, label, magnitude_label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 from marsyard.scenarios.descent.parameters import LandingParameters
 

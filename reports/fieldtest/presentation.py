@@ -16,6 +16,7 @@ from matplotlib.patches import Circle
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows
+from marsyard.reports.column_selection import axis_columns, numbers
 from marsyard.reports.dimes.presentation import explain
 from marsyard.reports.papers import read_paper
 from marsyard.reports.presentation import Presentation
@@ -33,17 +34,7 @@ from marsyard.reports.section import (
     new_axes,
     svg_figure,
 )
-from marsyard.reports.wording import (
-    NOTHING,
-    axis_columns,
-    count,
-    format_fraction,
-    label,
-    note_text,
-    number,
-    numbers,
-    percent,
-)
+from marsyard.reports.wording import NOTHING, count, format_fraction, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 
 #: Rows of the paper's Fig. 11 by (category, run).

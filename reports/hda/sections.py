@@ -25,13 +25,14 @@ from marsyard.reports.blocks import (
     quantile_block,
     scatter_block,
 )
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
 from marsyard.reports.statistics.drivers import MIN_CASES
 from marsyard.reports.statistics.samples import is_interpolated, quantile_bounds
-from marsyard.reports.wording import NOTHING, count, format_fraction, number, numbers
+from marsyard.reports.wording import NOTHING, count, format_fraction, number
 from marsyard.scenarios.landing.parameters import LanderParameters
 
 PAPER = read_paper(Path(__file__).with_name("paper.toml"))

@@ -13,12 +13,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from marsyard.reports import section
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
 from marsyard.reports.images import Image, show_image
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.products import Products, check_shape, to_matrix
-from marsyard.reports.wording import NOTHING, label, number, numbers
+from marsyard.reports.wording import NOTHING, label, number
 
 MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"
 #: Maximum number of rows of the table; additional cases are counted.

@@ -28,11 +28,12 @@ from marsyard.algorithms.vtt.accuracy import (
 )
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows, distribution_block
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section, has_values
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import NOTHING, format_fraction, numbers
+from marsyard.reports.wording import NOTHING, format_fraction
 from marsyard.scenarios.rover.stops import RunOutcome
 
 #: Columns of all rows of tracking cases.

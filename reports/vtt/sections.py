@@ -19,6 +19,7 @@ import pandas as pd
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows
+from marsyard.reports.column_selection import numbers
 from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.papers import paper_section, read_paper
 from marsyard.reports.rates import CONFIDENCE
@@ -32,7 +33,7 @@ from marsyard.reports.vtt.goal import (
     selectable_targets,
     table_1_section,
 )
-from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, numbers, percent
+from marsyard.reports.wording import NOTHING, format_fraction, note_text, number, percent
 
 _PAPER_FILE = Path(__file__).with_name("paper.toml")
 PAPER = read_paper(_PAPER_FILE)

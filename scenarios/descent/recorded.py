@@ -12,7 +12,8 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.user_files import RecordedAxes, UserFile
+from marsyard.scenarios.recorded_axes import RecordedAxes
+from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
 from marsyard.sim.parameters import bounded_field
 

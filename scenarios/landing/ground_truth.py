@@ -9,15 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import distance_transform_edt
 
-from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.images import Pair, take_images
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.images import Pair
 from marsyard.scenarios.landing.relief import SPACING_DIAMETERS, Footprints, Limits, Relief
 from marsyard.scenarios.landing.world import LandingWorld
-from marsyard.scenarios.views import SiteGround
-from marsyard.sim.streams import Streams
 
 #: Spacing of the ground-truth grid divided by the diameter of a footprint: 0.2 m for a footprint of 2 m.
 STEP_DIAMETERS = 0.1
@@ -130,24 +125,3 @@ class GroundTruth:
             return self.relief.footprints(position[None], self.limits)
         except ValueError:
             return None
-
-
-@dataclass(frozen=True)
-class RenderedFlight:
-    """A flight with its world, images and ground truth."""
-
-    p: LandingScenarioParameters
-    world: LandingWorld
-    flight: LandingFlight
-    pair: Pair
-    truth: GroundTruth
-
-    @classmethod
-    def simulate(
-        cls, p: LandingScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
-    ) -> RenderedFlight:
-        """Simulate the flight of a case and take its images."""
-        world = LandingWorld.from_parameters(p, load_ground)
-        flight = LandingFlight.from_parameters(p, world.ground.surface, streams)
-        pair = take_images(p, world, flight, camera_optics(p.optics), streams)
-        return cls(p, world, flight, pair, GroundTruth.from_images(world, flight, pair, p.lander.limits))

@@ -17,9 +17,9 @@ from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing import score
-from marsyard.scenarios.landing.ground_truth import RenderedFlight
 from marsyard.scenarios.landing.measurement import measure
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.rendered_flight import RenderedFlight
 from marsyard.scenarios.landing.timeline import landing_timeline
 from marsyard.scenarios.landing.touchdown import simulate_touchdown
 from marsyard.scenarios.landing_site import LANDING

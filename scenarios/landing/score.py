@@ -15,10 +15,11 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.condition_columns import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.ground_truth import GroundTruth, RenderedFlight
+from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.images import Pair
 from marsyard.scenarios.landing.map_errors import SampledMap, count_hazards, map_errors
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.rendered_flight import RenderedFlight
 from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m
 from marsyard.scenarios.landing_site import motion_errors, stage_row
 from marsyard.sim.camera import camera_pose

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.hda import HdaDetails, MappedGround, Safety
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.ground_truth import RenderedFlight
 from marsyard.scenarios.landing.helicopter import NavigatedLeg
+from marsyard.scenarios.landing.rendered_flight import RenderedFlight
 from marsyard.scenarios.landing.touchdown import Touchdown
 from marsyard.scenarios.meshes import add_meshes
 from marsyard.scenarios.timeline import (

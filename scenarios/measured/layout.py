@@ -14,7 +14,8 @@ from jaxtyping import Float64
 from pydantic import Field, ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.user_files import RecordedAxes, check_column_groups, finite_number, format_problems, parse_table
+from marsyard.scenarios.recorded_axes import RecordedAxes
+from marsyard.scenarios.user_files import check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular
 from marsyard.sim.frames import direction
 from marsyard.sim.parameters import Parameters, bounded_field

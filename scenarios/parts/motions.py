@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import DYNAMICS, CustomPart
-from marsyard.scenarios.user_files import RecordedAxes
+from marsyard.scenarios.recorded_axes import RecordedAxes
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.parameters import bounded_field
 

@@ -4,7 +4,8 @@ The instruments of rovers are in the modules `mast` and `odometry`.
 """
 
 from marsyard.sim.measurements import ImuIncrements
-from marsyard.sim.sensor.detector import AutoExposure, AutoExposureParameters, Detector, DetectorParameters, auto_expose
+from marsyard.sim.sensor.auto_exposure import AutoExposure, AutoExposureParameters, auto_expose
+from marsyard.sim.sensor.detector import Detector, DetectorParameters
 from marsyard.sim.sensor.imu import Imu, ImuParameters, WarmUp
 from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling

@@ -1,8 +1,4 @@
-"""Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding; auto-exposure.
-
-Companding compresses counts to 8-bit codes with steps that grow with the square root of the count, as shot noise does:
-``code = round(a (sqrt(count + b) - sqrt(b)))`` with ``a = 2 sqrt(b)``, so that the smallest step is one count. b is
-chosen such that full scale has code 255. A code is expanded to the centre of its range of counts.
+"""Frame-transfer CCD: radiance to counts, with noise, smear, defects, bursts and 8-bit companding.
 
 Physical pixels are those of the detector. A delivered row is the sum of `rows_summed` physical rows.
 """
@@ -10,20 +6,19 @@ Physical pixels are those of the detector. A delivered row is the sum of `rows_s
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Annotated
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
-from pydantic import Field, model_validator
+from jaxtyping import Bool, Float, Float32, Float64, UInt16
+from pydantic import Field
 from scipy.ndimage import uniform_filter
-from scipy.optimize import brentq
 
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
+from marsyard.sim.sensor.companding import Counts, compand, expand
 from marsyard.sim.sensor.optics import (
     Image,
     ImageMotion,
@@ -35,10 +30,8 @@ from marsyard.sim.sensor.optics import (
 
 #: Charge, electrons, from which `add_noise` draws both noises together.
 MIN_COMMON_E = 100.0
-CODES = 256  #: Number of 8-bit codes.
 MAX_EXPOSURE_S = 10.0  #: Longest allowed exposure time, seconds.
 _RelativeError = Annotated[float, Field(ge=0.0, le=0.1)]
-Counts = UInt16[np.ndarray, "rows columns"]
 #: Counts of an image after the summation of rows.
 Delivered = UInt16[np.ndarray, "delivered_rows columns"]
 
@@ -145,25 +138,6 @@ class DetectorParameters(Parameters):
     def dark_growth(self) -> float:
         """Dark current at the detector's temperature, divided by that at 0 deg C."""
         return float(2.0 ** (self.temperature_c / self.dark_doubling_c))
-
-
-class AutoExposureParameters(Parameters):
-    """Auto-exposure by a percentile of the counts, as on the MER rovers (Maki et al. 2003); the numbers are assumed."""
-
-    percentile: Annotated[float, Field(gt=0.0, lt=100.0, description="controlled percentile of the counts")] = 98.0
-    target: Annotated[float, Field(gt=0.0, lt=1.0, description="target of the percentile / full scale")] = 0.75
-    tolerance: Annotated[float, Field(gt=0.0, le=0.5, description="accepted relative deviation from the target")] = 0.05
-    images: Annotated[int, Field(ge=1, le=20, description="maximum number of test images")] = 5
-    min_exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="shortest exposure, s")] = 1e-4
-    max_exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="longest exposure, s")] = 1.0
-
-    @model_validator(mode="after")
-    def _check_limits(self) -> AutoExposureParameters:
-        if self.min_exposure_s > self.max_exposure_s:
-            raise ValueError(
-                f"min_exposure_s {self.min_exposure_s} is greater than max_exposure_s {self.max_exposure_s}"
-            )
-        return self
 
 
 @dataclass(frozen=True)
@@ -345,92 +319,3 @@ def fill_bad_pixels(counts: Counts, bad: Bool[np.ndarray, "rows columns"]) -> Co
     filled = counts.copy()
     filled[is_fillable] = np.rint(mean_counts[is_fillable] / mean_weights[is_fillable]).astype(np.uint16)
     return filled
-
-
-@cache
-def compression_table(full_scale_dn: int) -> UInt8[np.ndarray, "counts"]:
-    """Compute the companding code of every count. Raises ValueError if the full scale is below 255."""
-    if full_scale_dn < CODES - 1:
-        raise ValueError(f"the full scale of companded counts is {full_scale_dn}; allowed: {CODES - 1} or more")
-    if full_scale_dn == CODES - 1:
-        return np.arange(CODES, dtype=np.uint8)
-    b = brentq(lambda x: 2.0 * (np.sqrt(x * (full_scale_dn + x)) - x) - (CODES - 1), 1e-3, 1e12)
-    counts = np.arange(full_scale_dn + 1)
-    table: UInt8[np.ndarray, "counts"] = np.rint(2.0 * (np.sqrt(b * (counts + b)) - b)).astype(np.uint8)
-    table.setflags(write=False)
-    return table
-
-
-@cache
-def expansion_table(full_scale_dn: int) -> UInt16[np.ndarray, "codes"]:
-    """Compute the expanded count of every code."""
-    table = compression_table(full_scale_dn)
-    first = np.searchsorted(table, np.arange(CODES), side="left")
-    last = np.searchsorted(table, np.arange(CODES), side="right") - 1
-    counts: UInt16[np.ndarray, "codes"] = ((first + last) // 2).astype(np.uint16)
-    counts.setflags(write=False)
-    return counts
-
-
-def compand(counts: Counts, full_scale_dn: int) -> UInt8[np.ndarray, "rows columns"]:
-    """Compress counts to 8-bit codes (`compression_table`)."""
-    return np.asarray(compression_table(full_scale_dn)[counts])
-
-
-def expand(codes: UInt8[np.ndarray, "rows columns"], full_scale_dn: int) -> Counts:
-    """Expand 8-bit codes to counts (`expansion_table`)."""
-    return np.asarray(expansion_table(full_scale_dn)[codes])
-
-
-@dataclass(frozen=True)
-class AutoExposure:
-    """Result of auto-exposure.
-
-    - detector: detector with the adjusted exposure time
-    - exposures_s: exposure times of the test images
-    - converged: whether the last test image reached the target
-    """
-
-    detector: Detector
-    exposures_s: tuple[float, ...]
-    converged: bool
-
-
-def auto_expose(
-    detector: Detector,
-    radiance: Image,
-    parameters: AutoExposureParameters,
-    rng: np.random.Generator,
-    region: tuple[slice, slice] | None = None,
-    motion: ImageMotion | None = None,
-) -> AutoExposure:
-    """Expose test images and scale the exposure time until the image has the target brightness.
-
-    - detector: its exposure time is that of the first test image
-    - rng: random generator for the noise of the test images
-    - region: rows and columns of the delivered image in which the percentile is computed; all by default
-
-    After each test image the exposure time is multiplied by a factor from 1/8 to 8. The factor is 1/4 if the percentile
-    is saturated (99 % of full scale or full well). Raises ValueError if the region is empty.
-    """
-    exposures: list[float] = []
-    p = detector.parameters
-    saturation = min(float(p.full_scale_dn), p.full_well_e / p.gain_e_dn + p.offset_dn)
-    exposure = float(np.clip(p.exposure_s, parameters.min_exposure_s, parameters.max_exposure_s))
-    while True:
-        test_detector = detector.with_exposure(exposure)
-        exposures.append(exposure)
-        counts = test_detector.expose(radiance, rng, motion)[region or np.s_[:]]
-        if counts.size == 0:
-            raise ValueError("the auto-exposure region is empty")
-        level = float(np.percentile(counts, parameters.percentile))
-        signal = max(level - p.offset_dn, 1.0)
-        factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))
-        factor = 0.25 if level >= 0.99 * saturation else factor
-        converged = abs(factor - 1.0) <= parameters.tolerance
-        next_exposure = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
-        if converged or next_exposure == exposure:
-            return AutoExposure(test_detector, tuple(exposures), converged)
-        if len(exposures) == parameters.images:
-            return AutoExposure(detector.with_exposure(next_exposure), tuple(exposures), False)
-        exposure = next_exposure

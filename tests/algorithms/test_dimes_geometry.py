@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.dimes import binning, overlap
+from marsyard.algorithms.dimes import binning, overlap, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
@@ -291,7 +291,7 @@ def wave_brightness(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
 
 
 def test_ground_lattice_is_north_up() -> None:
-    lattice = binning.ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
+    lattice = rectification.ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
     np.testing.assert_allclose(lattice[0, 0], [90.0, 210.0])
     np.testing.assert_allclose(lattice[2, 1], [100.0, 190.0])
 
@@ -305,8 +305,8 @@ def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None
     view = make_view(attitude, 1700.0, 0.0, counts)
     centre, is_within_limit = binning.ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
     assert is_within_limit[0]
-    patch = binning.rectify_patch(view, centre[0], 61, 5.5)
-    lattice = binning.ground_lattice(centre[0], 61, 5.5) + position[:2]
+    patch = rectification.rectify_patch(view, centre[0], 61, 5.5)
+    lattice = rectification.ground_lattice(centre[0], 61, 5.5) + position[:2]
     expected = wave_brightness(lattice[..., 0], lattice[..., 1])
     shift = _estimate_shift(patch / 1600.0, expected, lattice)
     # 0.01 of a binned pixel: 0.06 m, or 0.015 m/s over 3.75 s.
@@ -328,9 +328,9 @@ def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray
 
 def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
     view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
-    lattice = binning.ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
+    lattice = rectification.ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
     exact_pixels, is_visible_exactly = binning.pixels_from_ground(view, lattice)
-    pixels, is_visible = binning.homography_lattice(view, lattice)
+    pixels, is_visible = rectification.homography_lattice(view, lattice)
     assert is_visible_exactly.all()
     assert is_visible.all()
     corners = ([0, 0, -1, -1], [0, -1, 0, -1])
@@ -340,11 +340,14 @@ def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
     assert 1e-4 < differences_px.max() < 0.1
     pinhole = replace(view, camera=Cahv(view.camera.c, view.camera.a, view.camera.h, view.camera.v, view.camera.size))
     np.testing.assert_allclose(
-        binning.homography_lattice(pinhole, lattice)[0], binning.pixels_from_ground(pinhole, lattice)[0], atol=2e-4
+        rectification.homography_lattice(pinhole, lattice)[0],
+        binning.pixels_from_ground(pinhole, lattice)[0],
+        atol=2e-4,
     )
 
 
 def test_homography_of_an_invisible_corner_is_invisible() -> None:
     view = make_view(tilt_body(75.0, 0.0, 0.0), 1500.0)
-    _, is_visible = binning.homography_lattice(view, binning.ground_lattice(np.array([0.0, -40000.0]), 5, 5.5))
+    lattice = rectification.ground_lattice(np.array([0.0, -40000.0]), 5, 5.5)
+    _, is_visible = rectification.homography_lattice(view, lattice)
     assert not is_visible.any()

@@ -15,7 +15,7 @@ import pytest
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
-from marsyard.campaigns.store.record import describe_machine
+from marsyard.campaigns.store.machine import describe_machine
 from marsyard.reports.campaign import write_report
 from marsyard.reports.page import script_hash
 from marsyard.reports.report_file import SCHEMA

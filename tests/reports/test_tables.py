@@ -18,6 +18,7 @@ from rich.table import Table
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.blocks import correlation_text, estimate_effects
+from marsyard.reports.column_selection import axis_columns, category_column, driver_columns, primary_metric
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.hda.sections import MAP_CONDITIONS, MAP_ERRORS, distance_grid
 from marsyard.reports.overall import combine_verdicts
@@ -27,9 +28,6 @@ from marsyard.reports.tables import outcome_counts, statistics_grid, verdict_tab
 from marsyard.reports.traceability import junit_xml
 from marsyard.reports.wording import (
     NOTHING,
-    axis_columns,
-    category_column,
-    driver_columns,
     format_fraction,
     interval,
     label,
@@ -37,7 +35,6 @@ from marsyard.reports.wording import (
     number,
     percent,
     population_text,
-    primary_metric,
     requirement_text,
 )
 from marsyard.scenarios.systems import catalogue

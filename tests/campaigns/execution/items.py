@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.errors import WorkerExitError
-from marsyard.campaigns.execution.worker_process import TaskResult, Work, WorkLimits
+from marsyard.campaigns.execution.work import TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import LocalExecutor
 
 #: Maximum duration of runs that could wait forever, in seconds.

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from marsyard.campaigns.execution.worker_process import TaskResult, Work
+from marsyard.campaigns.execution.work import TaskResult, Work
 from marsyard.campaigns.running import compilation
 from marsyard.campaigns.running.compilation import compile_kernels, list_compilations
 from marsyard.sim.kernel_cache import mark_ready

@@ -1,0 +1,55 @@
+"""Axes of recorded poses, and mounting of the camera in the recorded vehicle."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from marsyard.sim.frames import SITE_FROM_WORLD
+from marsyard.sim.parameters import Parameters
+
+#: Rotations from a file's world axes to east, north, up.
+_ENU_FROM_AXES = {"enu": Rotation.identity(), "ned": SITE_FROM_WORLD.inv()}
+#: OpenCV's camera axes (x right, y down, z forward) in body axes: optical axis along -z, columns along x.
+_CAMERA_IN_BODY = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+
+
+class RecordedAxes(Parameters):
+    """Axes of recorded poses, and mounting of the camera in the recorded vehicle."""
+
+    axes: Annotated[Literal["enu", "ned"], Field(description="world axes: east, north, up; or north, east, down")]
+    attitude_of: Annotated[
+        Literal["camera", "body"],
+        Field(description="frame of the attitude: OpenCV camera frame, or body frame (camera looks along -z)"),
+    ] = "camera"
+    mounting: Annotated[
+        tuple[float, float, float, float],
+        Field(description="quaternion x, y, z, w from that frame to the frame of the recorded vehicle"),
+    ] = (0.0, 0.0, 0.0, 1.0)
+    lever_m: Annotated[
+        tuple[float, float, float], Field(description="position of the camera in the frame of the recorded vehicle, m")
+    ] = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _check_mounting(self) -> RecordedAxes:
+        if abs(float(np.linalg.norm(self.mounting)) - 1.0) > 1e-3:
+            raise ValueError(f"mounting {list(self.mounting)} is not a quaternion of length 1")
+        return self
+
+    @property
+    def enu_from_axes(self) -> Rotation:
+        """Rotation from the file's world axes to east, north, up."""
+        return _ENU_FROM_AXES[self.axes]
+
+    def body_attitudes(self, world_from_vehicle: Rotation) -> Rotation:
+        """Convert attitudes of the recorded vehicle to those of the body, both relative to east, north, up."""
+        attitudes = world_from_vehicle * Rotation.from_quat(np.array(self.mounting))
+        return attitudes * _CAMERA_IN_BODY.inv() if self.attitude_of == "camera" else attitudes
+
+    def lever_arms(self, world_from_vehicle: Rotation) -> Float64[np.ndarray, "*batch 3"]:
+        """Return the offsets from the recorded vehicle to the camera in east, north, up."""
+        return np.asarray(world_from_vehicle.apply(np.array(self.lever_m)))
