@@ -16,7 +16,7 @@ from scipy import ndimage
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
 from marsyard.algorithms.dimes import binning, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
+from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def template_contrasts(view: binning.BinnedView, pixels: Points2, support: int) 
     """
     columns, rows = np.rint(pixels).astype(int).T
     uu, vv, uv = (component[rows, columns] for component in structure_tensor(view.signal, support))
-    mean = local_mean(view.signal, support)[rows, columns]
+    mean = cv2.blur(view.signal, (support, support))[rows, columns]
     return np.asarray(
         harris_interest(uu, vv, uv) / np.maximum(mean, MIN_SIGNAL_FRACTION * view.calibration.full_scale_dn)
     )

@@ -22,7 +22,6 @@ from scipy import ndimage
 from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.dimes.binning import BinnedView, pixels_from_ground
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
-from marsyard.algorithms.image.kernels import cubic as kernels
 
 #: Lower limit of the flat field before division.
 MIN_RESPONSE = 0.02
@@ -85,10 +84,8 @@ def rectify_patch(
     lattice = ground_lattice(centre, side_px, gsd_m)
     pixels, visible = pixels_from_ground(view, lattice) if full_camera else homography_lattice(view, lattice)
     columns, rows = view.size
-    left, right, top, bottom = kernels.clamp(pixels, visible, columns, rows)
-    row_range, column_range = _pixel_range(top, bottom, rows), _pixel_range(left, right, columns)
+    u, v = np.moveaxis(np.where(visible[..., None], np.clip(pixels, 0.0, [columns - 1.0, rows - 1.0]), 0.0), -1, 0)
+    row_range, column_range = _pixel_range(v.min(), v.max(), rows), _pixel_range(u.min(), u.max(), columns)
     patch = correct_patch(view, row_range, column_range)
-    coefficients = ndimage.spline_filter(patch, order=3, mode="mirror")
-    values = np.empty((side_px, side_px))
-    kernels.sample(coefficients, pixels, row_range.start, column_range.start, values)
-    return values
+    positions = [v - row_range.start, u - column_range.start]
+    return np.asarray(ndimage.map_coordinates(patch, positions, order=3, mode="mirror"))

@@ -15,9 +15,10 @@ average in each direction. For known T this is a linear recursion in P. T follow
 from __future__ import annotations
 
 import numpy as np
+import scipy  # scipy.signal is slow to import: it is loaded at its first use
+from jaxtyping import Float
 
 from marsyard.algorithms.arrays import Raster
-from marsyard.algorithms.image.kernels import frame_transfer as kernels
 from marsyard.sim.measurements import DetectorCalibration
 
 
@@ -39,5 +40,15 @@ def remove_frame_transfer(signal: Raster, calibration: DetectorCalibration, rows
             f"an exposure of {calibration.exposure_s} s is too short to invert a frame transfer of "
             f"{a} s and {b} s per row with {n} rows summed"
         )
-    values = np.ascontiguousarray(signal, dtype=np.float64)
-    return np.asarray(kernels.remove_frame_transfer(values, calibration.exposure_s, row_gain, sum_gain, n * b))
+    values = np.asarray(signal, dtype=np.float64)
+    # P is the solution for T = 0 minus T times `decrease`, the decrease of P for T = 1
+    sums_without_total = _sums_before(values, row_gain, sum_gain)
+    decrease = _sums_before(np.full((len(values), 1), n * b), row_gain, sum_gain)
+    sums = sums_without_total - decrease * (sums_without_total[-1] / (1.0 + decrease[-1]))
+    return np.asarray(calibration.exposure_s * np.diff(sums, axis=0))
+
+
+def _sums_before(signal: Raster, row_gain: float, sum_gain: float) -> Float[np.ndarray, "sums columns"]:
+    """Solve P_0 = 0, P_(R+1) = P_R + x_R with x_R = (y_R - sum_gain P_R) / row_gain; return P_0 to P_M."""
+    sums = scipy.signal.lfilter([1.0 / row_gain], [1.0, sum_gain / row_gain - 1.0], signal, axis=0)
+    return np.concatenate([np.zeros((1, signal.shape[1])), sums])

@@ -39,8 +39,3 @@ def harris_interest(
     trace = uu + vv
     ratio = np.divide(2.0 * determinant, trace, out=np.zeros_like(trace), where=trace > 0)
     return np.asarray(np.sqrt(ratio))
-
-
-def local_mean(image: Float[np.ndarray, "rows columns"], support: int) -> Float[np.ndarray, "rows columns"]:
-    """Mean over a square of side `support` (pixels) around every pixel; the image is mirrored at its borders."""
-    return np.asarray(cv2.blur(image.astype(np.float32, copy=False), (support, support)))

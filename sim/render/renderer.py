@@ -237,7 +237,8 @@ class Renderer:
         `rotation` and `position` are the camera's pose, `clearance_m` is the height of the camera above the ground.
         """
         if self._last_scene is None or self._last_scene() is not scene:
-            self._last_scene = ref(scene)
+            # the next terrain is built without the memory that Dr.Jit keeps for further images
+            self._last_scene = ref(scene, lambda _: dr.flush_malloc_cache())
             self._scene_count += 1
             dr.flush_malloc_cache()
             if self._scene_count % _TRIM_INTERVAL_SCENES == 0:

@@ -290,6 +290,20 @@ def wave_brightness(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
     return 1.0 + 0.2 * np.sin(30 * east + 0.4) * np.cos(17 * north) + 0.2 * np.cos(41 * north - 12 * east)
 
 
+def test_patch_across_the_border_repeats_the_border_pixels() -> None:
+    attitude, position = tilt_body(0.0, 0.0, 0.0), np.array([0.0, 0.0, 1700.0])
+    counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
+    view = make_view(attitude, 1700.0, 0.0, counts)
+    columns, rows = view.size
+    corner, _ = binning.ground_from_pixels(view, np.array([[columns - 1.0, rows - 1.0]]), MAX_OFF_NADIR_RAD)
+    patch = rectification.rectify_patch(view, corner[0], 21, 5.5)
+    pixels, _ = binning.pixels_from_ground(view, rectification.ground_lattice(corner[0], 21, 5.5))
+    is_outside = (pixels > np.array([columns - 1.0, rows - 1.0])).all(axis=-1)
+    assert np.count_nonzero(is_outside) > 50
+    image = rectification.correct_patch(view, np.s_[:], np.s_[:])
+    np.testing.assert_allclose(patch[is_outside], image[-1, -1], rtol=1e-12)
+
+
 def test_ground_lattice_is_north_up() -> None:
     lattice = rectification.ground_lattice(np.array([100.0, 200.0]), 3, 10.0)
     np.testing.assert_allclose(lattice[0, 0], [90.0, 210.0])

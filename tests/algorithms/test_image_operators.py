@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from scipy import ndimage
 
 from marsyard.algorithms.image.correlation import (
     Peak,
@@ -17,8 +16,7 @@ from marsyard.algorithms.image.correlation import (
     pseudo_normalized_correlation,
     second_peak,
 )
-from marsyard.algorithms.image.interest import harris_interest, local_mean, structure_tensor
-from marsyard.algorithms.image.kernels import cubic
+from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 
 
 def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -93,28 +91,6 @@ def test_subpixel_bias_is_within_limits() -> None:
         assert np.abs(error).max() < 0.12
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 2), (23, 17)])
-def test_cubic_sampling_equals_scipys_spline(shape: tuple[int, int]) -> None:
-    """The array is a part of an image that starts at row 40 and column 30; all positions are between pixel centres."""
-    rng = np.random.default_rng(6)
-    image = rng.normal(size=shape)
-    ends = np.stack(np.meshgrid([0.0, shape[1] - 1.0], [0.0, shape[0] - 1.0]), axis=-1)
-    positions = np.concatenate([ends, rng.uniform(0.0, 1.0, (2, 30, 2)) * (np.array(shape[::-1]) - 1.0)], axis=1)
-    result = np.empty(positions.shape[:2])
-    coefficients = ndimage.spline_filter(image, order=3, mode="mirror")
-    cubic.sample(coefficients, positions + np.array([30.0, 40.0]), 40, 30, result)
-    expected = ndimage.map_coordinates(image, np.moveaxis(positions, -1, 0)[::-1], order=3, mode="mirror")
-    # Positions up to 60 are rounded to 7e-15; gradients are a few units per pixel.
-    np.testing.assert_allclose(result, expected, rtol=0.0, atol=1e-12)
-
-
-def test_pixels_are_clamped_to_the_image() -> None:
-    pixels = np.array([[[-3.0, 5.0], [12.5, 99.0]], [[np.nan, np.nan], [31.0, 2.0]]])
-    extent = cubic.clamp(pixels, np.array([[True, True], [False, True]]), 20, 10)
-    np.testing.assert_array_equal(pixels, [[[0.0, 5.0], [12.5, 9.0]], [[0.0, 0.0], [19.0, 2.0]]])
-    assert extent == (0.0, 19.0, 0.0, 9.0)
-
-
 def test_biquadratic_offset_is_exact_for_a_quadric() -> None:
     rows, columns = np.mgrid[:9, :9].astype(float)
     surface = 1.0 - 0.02 * (rows - 4.3) ** 2 - 0.05 * (columns - 3.8) ** 2 + 0.01 * (rows - 4.3) * (columns - 3.8)
@@ -167,8 +143,3 @@ def test_interest_requires_gradients_in_both_directions() -> None:
     # sin(0.3) / 0.3. The window of 21 pixels is one period of 20.9.
     assert interest[1][32, 32] == pytest.approx(2.12 * np.sin(0.3) / 0.3, rel=0.02)
     assert np.all(harris_interest(*structure_tensor(np.full((64, 64), 7.0), 21)) == 0.0)
-
-
-def test_local_mean_matches_direct_average() -> None:
-    image = np.arange(100.0).reshape(10, 10)
-    assert local_mean(image, 3)[4, 4] == pytest.approx(44.0)
