@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import BinnedView, ground_from_pixels
+from marsyard.algorithms.dimes.binning import BinnedView
+from marsyard.algorithms.dimes.ground_view import ground_from_pixels
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.overlap import best_candidates, search_geometry, template_candidates
 from marsyard.algorithms.dimes.validity import rank_combinations

@@ -26,7 +26,7 @@ from marsyard.campaigns.running.shared_inputs import plan_inputs
 from marsyard.scenarios.image_samples import ProvidesSamples
 from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
-from marsyard.sim.sensor.compression import compress
+from marsyard.sim.sensor.compression import compress_and_decompress
 
 MANIFEST = "dataset.json"
 
@@ -118,7 +118,11 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
             "image_index": number,
             "dispersed_parameters": draws,
         }
-        image = sample.image if bits_per_pixel is None else compress(sample.image, bits_per_pixel, 2**sample.bits - 1)
+        image = (
+            sample.image
+            if bits_per_pixel is None
+            else compress_and_decompress(sample.image, bits_per_pixel, 2**sample.bits - 1)
+        )
         # scale the counts to the full range of 16 bits
         yield f"{key}.image.png", _encode(image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _encode(sample.range_m)

@@ -30,7 +30,7 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rover import rover_objects
-from marsyard.sim.sensor.compression import compress
+from marsyard.sim.sensor.compression import compress_and_decompress
 from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Site, sites
@@ -218,7 +218,7 @@ def _expose(
     )
     counts = auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
     if request.bits_per_pixel is not None:
-        counts = compress(counts, request.bits_per_pixel, parameters.full_scale_dn)
+        counts = compress_and_decompress(counts, request.bits_per_pixel, parameters.full_scale_dn)
     return auto_exposure, counts
 
 

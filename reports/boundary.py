@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
 from marsyard.reports import rates
-from marsyard.reports.column_selection import distinct_columns, numbers
+from marsyard.reports.column_selection import distinct_columns
+from marsyard.reports.column_values import numbers
 from marsyard.reports.common_sections import rank_drivers
 from marsyard.reports.conditions import CONDITIONS
 from marsyard.reports.decision import requirement_masks

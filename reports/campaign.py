@@ -19,7 +19,8 @@ from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
 from marsyard.reports.budget import budget_section, budget_sentences
-from marsyard.reports.column_selection import numbers, primary_metric
+from marsyard.reports.column_selection import primary_metric
+from marsyard.reports.column_values import numbers
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run

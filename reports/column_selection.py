@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 
+from marsyard.reports.column_values import _is_number, numbers
+from marsyard.reports.statistics.drivers import rank_correlation
 from marsyard.scenarios.columns import split_unit
 
 _AXES = ("x", "y", "z")
@@ -41,14 +42,6 @@ def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]
     error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
     names = (*requirement_metrics, *error_columns)
     return next((name for name in names if name in frame and _is_number(frame, name)), None)
-
-
-def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
-    """Return a column as float64; NaN for missing numbers or a missing column."""
-    if column not in frame:
-        return np.full(len(frame), np.nan)
-    values = pd.to_numeric(frame[column], errors="coerce")
-    return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
 
 
 def looks_like_condition(name: str) -> bool:
@@ -92,15 +85,6 @@ def distinct_columns(frame: pd.DataFrame, names: Sequence[str]) -> list[str]:
     return [name for name, repeated in zip(names, is_repeated, strict=True) if not repeated]
 
 
-def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
-    """Compute Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
-    finite = np.isfinite(x) & np.isfinite(y)
-    if finite.sum() < 4:
-        return float("nan")
-    ranks_x, ranks_y = (pd.Series(values[finite]).rank().to_numpy() for values in (x, y))
-    return float("nan") if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0 else float(np.corrcoef(ranks_x, ranks_y)[0, 1])
-
-
 def category_column(frame: pd.DataFrame) -> str | None:
     """Return the first column with 2 to 6 distinct values: a column of text, or the terrain; None if there is none."""
     types = {str(name): dtype for name, dtype in frame.dtypes.items() if not _EXCLUDED_COLUMNS.search(str(name))}
@@ -108,13 +92,3 @@ def category_column(frame: pd.DataFrame) -> str | None:
     names = [name for name, dtype in types.items() if any(check(dtype) for check in is_text)]
     names += ["terrain"] if "terrain" in frame else []
     return next((name for name in names if 2 <= frame[name].nunique() <= _MAX_CATEGORIES), None)
-
-
-def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
-    """Whether a column contains numbers of more than one value."""
-    return _is_number(frame, column) and frame[column].nunique() > 1
-
-
-def _is_number(frame: pd.DataFrame, column: str) -> bool:
-    dtype = frame[column].dtype
-    return pd.api.types.is_numeric_dtype(dtype) and not pd.api.types.is_bool_dtype(dtype)

@@ -21,7 +21,8 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import NO_FAULT, OutcomesBySize, Rows
-from marsyard.reports.column_selection import axis_columns, driver_columns, numbers
+from marsyard.reports.column_selection import axis_columns, driver_columns
+from marsyard.reports.column_values import numbers
 from marsyard.reports.comparison import list_compared_algorithms, select_algorithm
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.figures import ELLIPSE

@@ -20,7 +20,8 @@ from jaxtyping import Float, Int
 
 from marsyard.campaigns.definition.campaign import leaves
 from marsyard.reports import rates
-from marsyard.reports.column_selection import numbers, primary_metric
+from marsyard.reports.column_selection import primary_metric
+from marsyard.reports.column_values import numbers
 from marsyard.reports.decision import requirement_masks
 from marsyard.reports.rates import CONFIDENCE, success_mask
 from marsyard.reports.sampling_design import read_sampling_design

@@ -16,7 +16,8 @@ from jaxtyping import Bool
 from scipy import stats
 
 from marsyard.reports import rates
-from marsyard.reports.column_selection import axis_columns, numbers
+from marsyard.reports.column_selection import axis_columns
+from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds

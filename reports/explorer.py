@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,8 @@ import pandas as pd
 from jaxtyping import Bool, Int
 from markupsafe import Markup
 
-from marsyard.reports.column_selection import axis_columns, is_varying_number, numbers
+from marsyard.reports.column_selection import axis_columns
+from marsyard.reports.column_values import is_varying_number, numbers
 from marsyard.reports.page import replay_command
 from marsyard.reports.rates import engine_failed
 from marsyard.reports.stored import StoredRun
@@ -27,9 +29,17 @@ _SCRIPT = Path(__file__).parent / "templates" / "explorer.js"
 _NOT_EXPLORED = ("case", "image_hash", "gl_backend", "gl_version", "processor_features", "error", "traceback")
 
 
+class ExploredStatus(IntEnum):
+    """Result of a case for a requirement, as in the explorer's script."""
+
+    MET = 0
+    VIOLATED = 1
+    NOT_COUNTED = 2
+
+
 @dataclass(frozen=True)
 class ExploredRequirement:
-    """A requirement in the explorer: `status` is 0 (met), 1 (violated) or 2 (not counted) for each case."""
+    """A requirement in the explorer, with the `ExploredStatus` of each case."""
 
     name: str
     metric: str
@@ -57,7 +67,7 @@ def explorer_data(
     names = list(dict.fromkeys([*first, *explored]))
     is_violation = np.zeros(len(all_cases), dtype=np.bool_)
     for item in requirements:
-        is_violation |= item.status == 1
+        is_violation |= item.status == ExploredStatus.VIOLATED
     rows = choose_points(all_cases, metric, is_violation)
     points = all_cases.iloc[rows]
     cases = points["case"].tolist() if "case" in points else rows.tolist()

@@ -17,7 +17,8 @@ from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
 from marsyard.reports import section
-from marsyard.reports.column_selection import axis_columns, category_column, numbers
+from marsyard.reports.column_selection import axis_columns, category_column
+from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import ENGINE_FAILURES, CaseFraction, PooledRate
 from marsyard.reports.section import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.statistics.samples import error_ellipse

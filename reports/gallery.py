@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.column_selection import numbers, primary_metric
+from marsyard.reports.column_selection import primary_metric
+from marsyard.reports.column_values import numbers
 from marsyard.reports.presentation import CaseView, create_case_view
 from marsyard.reports.rates import population_mask
 from marsyard.reports.section import SvgFigure, svg_figure

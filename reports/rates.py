@@ -11,7 +11,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns import errors
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.statistics.clusters import ClusteredCases
 from marsyard.reports.statistics.proportions import Interval, proportion_interval
 from marsyard.reports.statistics.samples import is_interpolated

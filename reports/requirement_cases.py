@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int
 
 from marsyard.campaigns.errors import ENGINE_FAILURES
 from marsyard.reports import rates
-from marsyard.reports.column_selection import numbers
-from marsyard.reports.explorer import ExploredRequirement
+from marsyard.reports.column_values import numbers
+from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.presentation import Cause, system_presentation
 from marsyard.reports.products import thumbnail, to_float
 from marsyard.reports.section import Grid, build_grid
@@ -30,6 +30,8 @@ from marsyard.scenarios.columns import split_unit
 
 #: Maximum number of violations, and of the cases nearest to the limit, that are listed for a requirement.
 MAX_VIOLATIONS, MAX_NEAREST = 9, 3
+#: Maximum number of violations that are grouped by cause.
+_MAX_GROUPED = 5000
 #: Maximum number of drivers of a case, and of similar violations.
 MAX_DRIVERS, MAX_SIMILAR = 12, 3
 #: A driver is unusual outside the central fraction of 95 % of the campaign's values.
@@ -110,6 +112,12 @@ class CaseSummary:
     cases: int
 
 
+def _classify_margins(margins: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return the `ExploredStatus` of each case."""
+    statuses = np.where(margins < 0.0, ExploredStatus.VIOLATED, ExploredStatus.MET)
+    return np.where(np.isposinf(margins), ExploredStatus.NOT_COUNTED, statuses)
+
+
 @dataclass(frozen=True)
 class _Evaluated:
     """A verdict with the margin of each case; the margin has a meaning beyond its sign if it is `graded`."""
@@ -180,7 +188,7 @@ class CaseFinder:
                 item.verdict.requirement_id,
                 item.verdict.metric,
                 item.verdict.bound / item.verdict.scale,
-                np.where(item.margins < 0.0, 1, np.where(np.isposinf(item.margins), 2, 0)),
+                _classify_margins(item.margins),
             )
             for item in self._evaluated
         ]
@@ -321,10 +329,6 @@ class CaseFinder:
                 "Example": lambda entry: f"case {examples[entry[0]]}",
             },
         )
-
-
-#: Maximum number of violations that are grouped by cause.
-_MAX_GROUPED = 5000
 
 
 def compute_margins(

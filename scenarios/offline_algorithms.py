@@ -143,10 +143,10 @@ class CaseExporter:
         """Write a case. Raises OSError."""
         if self.bits_per_pixel is not None:
             # imported at the first use: a worker starts in three quarters of the time without the instruments
-            from marsyard.sim.sensor.compression import compress
+            from marsyard.sim.sensor.compression import compress_and_decompress
 
             bits, images = self.bits_per_pixel, measurements.images
-            counts = [compress(image.counts, bits, image.calibration.full_scale_dn) for image in images]
+            counts = [compress_and_decompress(image.counts, bits, image.calibration.full_scale_dn) for image in images]
             compressed_images = tuple(
                 replace(image, counts=values) for image, values in zip(images, counts, strict=True)
             )

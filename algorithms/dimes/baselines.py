@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from marsyard.algorithms.arrays import Points2, Raster, Vector2
-from marsyard.algorithms.dimes import binning, rectification
+from marsyard.algorithms.dimes import binning, ground_view, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.validity import rank_combinations
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
@@ -99,7 +99,7 @@ def find_common_square(
     lattice = rectification.ground_lattice(np.zeros(2), points_per_side, COARSE_STEP_PX * gsd)
     visible = np.ones(lattice.shape[:2], dtype=bool)
     for view in (first, second):
-        visible &= binning.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
+        visible &= ground_view.inside_frame(view, lattice, options.border_px, options.max_off_nadir_rad)
     # chessboard distance to the nearest invisible point, lattice steps; all closer points are visible
     distances = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(distances)), distances.shape)

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.dimes.binning import BinnedView, ground_from_pixels, pixels_from_ground
+from marsyard.algorithms.dimes.binning import BinnedView
+from marsyard.algorithms.dimes.ground_view import ground_from_pixels, pixels_from_ground
 from marsyard.algorithms.dimes.tilt import GroundFit
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
 

@@ -13,8 +13,9 @@ from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
-from marsyard.algorithms.dimes.binning import BinnedView, build_views, pixels_from_ground
+from marsyard.algorithms.dimes.binning import BinnedView, build_views
 from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
+from marsyard.algorithms.dimes.ground_view import pixels_from_ground
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.rectification import rectify_patch
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
-from marsyard.algorithms.dimes import binning, rectification
+from marsyard.algorithms.dimes import binning, ground_view, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 
@@ -71,8 +71,8 @@ def overlap_polygon(first: binning.BinnedView, second: binning.BinnedView, optio
 
     Returns pixels (u, v) in order along the border, without invisible points.
     """
-    ground, _ = binning.ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
-    pixels, visible = binning.pixels_from_ground(first, ground)
+    ground, _ = ground_view.ground_from_pixels(second, border_pixels(second.size), options.max_off_nadir_rad)
+    pixels, visible = ground_view.pixels_from_ground(first, ground)
     return np.asarray(pixels[visible])
 
 
@@ -114,7 +114,7 @@ def overlap_width_m(
     The result is 0 without common ground; its resolution is the ground sample distance `gsd_m`.
     """
     limit, views = options.max_off_nadir_rad, (first, second)
-    outlines = [binning.ground_from_pixels(view, border_pixels(view.size), limit)[0] for view in views]
+    outlines = [ground_view.ground_from_pixels(view, border_pixels(view.size), limit)[0] for view in views]
     low = np.max([outline.min(axis=0) for outline in outlines], axis=0)
     high = np.min([outline.max(axis=0) for outline in outlines], axis=0)
     if np.any(high <= low):
@@ -161,22 +161,24 @@ def template_candidates(
     """
     limit = options.max_off_nadir_rad
     pixels = grid_pixels(first.size, options.grid_step_px)
-    ground, visible = binning.ground_from_pixels(first, pixels, limit)
+    ground, visible = ground_view.ground_from_pixels(first, pixels, limit)
     width_m = overlap_width_m(first, second, geometry.gsd_m, sun_direction, options)
     visible &= width_m >= geometry.max_displacement_m
     pixels, ground = pixels[visible], ground[visible]
 
     def fits(view: binning.BinnedView, half_m: float) -> Flags:
-        outline = binning.square_outline(half_m, 3)
-        return np.asarray(binning.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1))
+        outline = ground_view.square_outline(half_m, 3)
+        return np.asarray(
+            ground_view.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
+        )
 
-    feasible = binning.inside_frame(second, ground, 0.0, limit)
+    feasible = ground_view.inside_frame(second, ground, 0.0, limit)
     pixels, ground = pixels[feasible], ground[feasible]
     feasible = fits(first, geometry.template_half_m)
     pixels, ground = pixels[feasible], ground[feasible]
 
     def is_outside_spot(view: binning.BinnedView, half_m: float, per_side: int) -> Flags:
-        points = ground[:, None] + binning.square_lattice(half_m, per_side)
+        points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
 
@@ -192,7 +194,7 @@ def searchable_positions(
 ) -> Bool[np.ndarray, "s s"]:
     """Whether the second view shows the complete template at each position of the search around `centre` (ground)."""
     lattice = rectification.ground_lattice(centre, geometry.window_px, geometry.gsd_m)
-    inside = binning.inside_frame(second, lattice, options.border_px, options.max_off_nadir_rad)
+    inside = ground_view.inside_frame(second, lattice, options.border_px, options.max_off_nadir_rad)
     half = geometry.template_px // 2
     return np.asarray(ndimage.minimum_filter(inside, size=geometry.template_px)[half:-half, half:-half])
 

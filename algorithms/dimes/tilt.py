@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from scipy import optimize, special
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
-from marsyard.algorithms.dimes import binning, overlap, rectification
+from marsyard.algorithms.dimes import binning, ground_view, overlap, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.image.registration import WindowSpline, register_template, spline_coefficients
 
@@ -75,7 +75,7 @@ def track_grid(
     shift = velocity_m_s * (second.time_s - first.time_s)
     shifts = ((first, np.zeros(2)), (second, shift))
     outlines = [
-        binning.ground_from_pixels(view, overlap.border_pixels(view.size), options.max_off_nadir_rad)[0] + offset
+        ground_view.ground_from_pixels(view, overlap.border_pixels(view.size), options.max_off_nadir_rad)[0] + offset
         for view, offset in shifts
     ]
     low = np.max([outline.min(axis=0) for outline in outlines], axis=0)
@@ -109,9 +109,9 @@ def _is_usable(
     view: binning.BinnedView, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions
 ) -> Flags:
     """Whether templates around ground points lie in a view and outside of its zero-phase spot."""
-    outline = binning.square_outline((0.5 * options.grid_template_px + MARGIN_PX) * gsd_m, 3)
+    outline = ground_view.square_outline((0.5 * options.grid_template_px + MARGIN_PX) * gsd_m, 3)
     squares = ground[:, None] + outline
-    inside = binning.inside_frame(view, squares, options.border_px, options.max_off_nadir_rad)
+    inside = ground_view.inside_frame(view, squares, options.border_px, options.max_off_nadir_rad)
     outside = overlap.outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
     return np.asarray((inside & outside).all(axis=1))
 

@@ -20,17 +20,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
+from marsyard.campaigns.definition.calibration_terrains import calibration_overlap, uses_imported_terrain
 from marsyard.campaigns.definition.campaign import Campaign, find_value, replace_values
 from marsyard.campaigns.definition.claims import (
     DEFINITION,
     FrozenAlgorithm,
     bank_seeds,
-    calibration_overlap,
     confirmation_bank_seeds,
     confirmation_seed,
     freeze_algorithm,
     requirement_key,
-    uses_imported_terrain,
 )
 from marsyard.campaigns.definition.evidence import Confirmation, Evidence, EvidenceKind, classify_evidence
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors

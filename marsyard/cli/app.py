@@ -22,10 +22,12 @@ from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.campaign import append, merge, resume, run
 from marsyard.cli.conformance import conformance
+from marsyard.cli.console import create_console
+from marsyard.cli.errors import Exit, handle_user_errors
 from marsyard.cli.export import dataset, export, score
 from marsyard.cli.housekeeping import clean, compile_kernels
 from marsyard.cli.new import ingest, new
-from marsyard.cli.options import CampaignArgument, Exit, JsonOption, SetOption, console, handle_user_errors
+from marsyard.cli.options import CampaignArgument, JsonOption, SetOption
 from marsyard.cli.render import gallery, render
 from marsyard.cli.replay import replay
 from marsyard.cli.report import compare, confirmations, dashboard, nightly, report
@@ -89,7 +91,7 @@ def list_campaigns(as_json: JsonOption = False) -> None:
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
-        console().print(table)
+        create_console().print(table)
 
 
 @handle_user_errors
@@ -118,9 +120,9 @@ def show(
     if as_json:
         typer.echo(json.dumps(describe_campaign(definition, draw), indent=2))
     elif draw is None:
-        show_campaign(definition, console())
+        show_campaign(definition, create_console())
     else:
-        show_draws(definition, draw, console())
+        show_draws(definition, draw, create_console())
     if figure is not None:
         typer.echo(f"figure: {figure}", err=as_json)
 
@@ -129,7 +131,7 @@ def doctor(as_json: JsonOption = False) -> None:
     """Check the machine and the installation, and print a remedy for each problem."""
     from marsyard.doctor import run as run_checks
 
-    raise typer.Exit(run_checks(console(), as_json=as_json))
+    raise typer.Exit(run_checks(create_console(), as_json=as_json))
 
 
 def _print_version(is_requested: bool) -> None:

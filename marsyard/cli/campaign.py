@@ -10,6 +10,7 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
+from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class RunOptions:
     ] = None
 
 
-@options.handle_user_errors
+@handle_user_errors
 @options.with_options(RunOptions)
 def run(arguments: RunOptions) -> None:
     """Run a campaign, evaluate its requirements, and write its report."""
@@ -105,7 +106,7 @@ def run_shard(campaign: Campaign, shard_text: str, directory: Path, executor: Ex
     typer.echo(f"shard {shard}: the rows are in {directory}; to combine all shards: marsyard merge DIR... --out DIR")
 
 
-@options.handle_user_errors
+@handle_user_errors
 def merge(
     directories: Annotated[list[Path], Argument(metavar="DIR...", help="Folders of all shards of a campaign.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the merged campaign.")],
@@ -124,7 +125,7 @@ def merge(
     run_and_evaluate(out, lambda observer: finish_campaign(out, executor, observer))
 
 
-@options.handle_user_errors
+@handle_user_errors
 def resume(
     directory: options.DirectoryArgument,
     retry: Annotated[
@@ -168,7 +169,7 @@ def resume(
     run_and_evaluate(directory, continue_campaign)
 
 
-@options.handle_user_errors
+@handle_user_errors
 def append(
     directory: options.DirectoryArgument,
     cases: Annotated[

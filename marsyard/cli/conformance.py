@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import Exit, JsonOption, console, handle_user_errors
+from marsyard.cli.console import create_console
+from marsyard.cli.errors import Exit, handle_user_errors
+from marsyard.cli.options import JsonOption
 
 
 @handle_user_errors
@@ -47,12 +49,12 @@ def conformance(
         if as_json:
             continue
         result = "[green]ok  [/]" if finding.passed else "[bold red]FAIL[/]"
-        console().print(f"{result} {finding.check:<14}", end="", highlight=False)
+        create_console().print(f"{result} {finding.check:<14}", end="", highlight=False)
         lines = [f"{finding.requirement} ({finding.note})" if finding.note else finding.requirement]
         if not finding.passed:
             lines += [f"{'':20}{line}" for line in (finding.problem, f"to fix: {finding.next_step}")]
         for line in lines:
-            console().print(line, markup=False, highlight=False, soft_wrap=True)
+            create_console().print(line, markup=False, highlight=False, soft_wrap=True)
     failures = sum(not finding.passed for finding in findings)
     if as_json:
         checks = [{**asdict(finding), "passed": finding.passed} for finding in findings]

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from marsyard.cli import options
+from marsyard.cli.console import create_console
+from marsyard.cli.errors import Exit
 
 if TYPE_CHECKING:
     from marsyard.campaigns.execution.executors import ExecutorConfig
@@ -39,7 +40,7 @@ def run_and_evaluate(directory: Path, work: Callable[[ProgressObserver], None]) 
 
     with show_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
         work(log)
-    raise typer.Exit(evaluate_and_report(directory, options.console()))
+    raise typer.Exit(evaluate_and_report(directory, create_console()))
 
 
 @contextmanager
@@ -50,7 +51,7 @@ def show_progress(directory: Path, next_command: str) -> Iterator[ProgressObserv
     from marsyard.cli.progress import campaign_progress
 
     try:
-        with stop_on_signals(), campaign_progress(options.console(stderr=True)) as progress:
+        with stop_on_signals(), campaign_progress(create_console(stderr=True)) as progress:
             yield progress
     except KeyboardInterrupt:
         try:
@@ -59,7 +60,7 @@ def show_progress(directory: Path, next_command: str) -> Iterator[ProgressObserv
             typer.echo(f"interrupted; {rows}. To continue: {next_command}", err=True)
         except CampaignError:
             pass
-        raise typer.Exit(options.Exit.INTERRUPTED) from None
+        raise typer.Exit(Exit.INTERRUPTED) from None
 
 
 @contextmanager
@@ -74,7 +75,7 @@ def stop_on_signals() -> Iterator[None]:
     def exit_immediately(_number: int, _frame: object) -> None:
         # the workers' supervisors detect the end of this process, kill their children and remove temporary files
         os.write(2, b"\x1b[?25hkilled\n" if os.isatty(2) else b"killed\n")
-        os._exit(options.Exit.INTERRUPTED)
+        os._exit(Exit.INTERRUPTED)
 
     previous_handlers = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

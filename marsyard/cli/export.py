@@ -10,6 +10,8 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
+from marsyard.cli.console import size_text
+from marsyard.cli.errors import Exit, handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
 
 TruthOption = Annotated[
@@ -17,7 +19,7 @@ TruthOption = Annotated[
 ]
 
 
-@options.handle_user_errors
+@handle_user_errors
 def export(
     campaign: options.CampaignArgument,
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the exported cases, without ground truth.")],
@@ -56,10 +58,10 @@ def export(
     typer.echo(f"to score the results: marsyard score {out} ANSWERS.csv")
     if crashes:
         typer.echo(f"{count(crashes, 'case')} not exported; for the reasons: marsyard report {truth}", err=True)
-        raise typer.Exit(options.Exit.FAILED)
+        raise typer.Exit(Exit.FAILED)
 
 
-@options.handle_user_errors
+@handle_user_errors
 def score(
     directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
     answers: Annotated[
@@ -104,7 +106,7 @@ def score(
     run_and_evaluate(target, run)
 
 
-@options.handle_user_errors
+@handle_user_errors
 def dataset(
     campaign: options.CampaignArgument,
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the shards.")],
@@ -124,4 +126,4 @@ def dataset(
 
     shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs, bits_per_pixel)
     total = sum(path.stat().st_size for path in shards)
-    typer.echo(f"{len(shards)} shards, {options.size_text(total)}: {out}")
+    typer.echo(f"{len(shards)} shards, {size_text(total)}: {out}")

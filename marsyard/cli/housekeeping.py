@@ -10,7 +10,9 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import JsonOption, console, handle_user_errors, size_text
+from marsyard.cli.console import create_console, size_text
+from marsyard.cli.errors import handle_user_errors
+from marsyard.cli.options import JsonOption
 
 #: Kinds of cached files, and how they are rebuilt after removal.
 KINDS = {
@@ -66,7 +68,7 @@ def clean(
         limit = "none" if cache["limit_bytes"] is None else size_text(cache["limit_bytes"])
         kind, size = cache["kind"], size_text(cache["bytes"])
         table.add_row(kind, str(cache["files"]), size, limit, str(cache["folder"]), KINDS[kind])
-    console().print(table)
+    create_console().print(table)
     if yes:
         typer.echo(f"removed {size_text(removed_bytes)}")
     else:

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer import Argument, Option
 
-from marsyard.cli.options import OverwriteOption, handle_user_errors, with_options
+from marsyard.cli.errors import handle_user_errors
+from marsyard.cli.options import OverwriteOption, with_options
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign

@@ -18,8 +18,8 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.store.temporary_files import write_atomic
+from marsyard.cli.errors import Exit
 from marsyard.cli.nightly_plan import Plan, PlannedCampaign, PlannedCheck, hash_definition
-from marsyard.cli.options import Exit
 from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.comparison import list_metrics
 from marsyard.reports.dashboard.site import write_site

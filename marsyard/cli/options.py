@@ -1,32 +1,13 @@
-"""Options, arguments, exit status, error handling and console of several commands of `marsyard`."""
+"""Options and arguments of several commands of `marsyard`."""
 
 from __future__ import annotations
 
-import errno
-import functools
 import inspect
 from collections.abc import Callable
-from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, ParamSpec, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
-import typer
 from typer import Argument, Option
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-
-class Exit(IntEnum):
-    """Exit status of the program; if several apply, the order of precedence is 2, 1, 3, 4."""
-
-    MET = 0  #: all requirements are met, or there are none
-    FAILED = 1  #: a requirement failed, or a case crashed
-    INVALID = 2  #: the command or a file is invalid
-    INSUFFICIENT = 3  #: not enough cases for a verdict
-    QUALIFIED = 4  #: all requirements are met, but the evidence has a qualification, such as "PASS (unregistered)"
-    INTERRUPTED = 130  #: by Ctrl-C or SIGTERM
-
 
 CampaignArgument = Annotated[
     str, Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
@@ -108,7 +89,6 @@ TrustOption = Annotated[
 OutOption = Annotated[Path | None, Option(metavar="DIR", help="Output folder; by default runs/<campaign>-<UTC time>.")]
 OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 
-Parameters = ParamSpec("Parameters")
 Options = TypeVar("Options")
 
 
@@ -127,47 +107,3 @@ def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], C
         return call
 
     return decorate
-
-
-def handle_user_errors(command: Callable[Parameters, None]) -> Callable[Parameters, None]:
-    """Decorate a command: on a user error or a full or read-only disk, print one message and exit with status 2."""
-
-    @functools.wraps(command)
-    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        try:
-            # imported here, so that `doctor` can report another package that shadows Marsyard
-            from marsyard.campaigns.errors import CampaignError
-
-            command(*args, **kwargs)
-        except KeyboardInterrupt:
-            typer.echo("interrupted", err=True)
-            raise typer.Exit(Exit.INTERRUPTED) from None
-        except ImportError:  # `CampaignError` may be undefined
-            raise
-        except (CampaignError, OSError) as error:
-            if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-                raise
-            exit_with_error(error)
-
-    return call
-
-
-def exit_with_error(error: object) -> NoReturn:
-    """Print an error message and exit with status 2."""
-    typer.echo(f"error: {error}", err=True)
-    raise typer.Exit(Exit.INVALID) from None
-
-
-def console(*, stderr: bool = False) -> Console:
-    """Create a console for a command's output."""
-    from rich.console import Console
-
-    return Console(stderr=stderr)
-
-
-def size_text(count: float) -> str:
-    """Format a number of bytes with a unit prefix."""
-    for unit, size in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.3g} {unit}"
-    return f"{count:.0f} bytes"

@@ -27,7 +27,7 @@ from marsyard.campaigns.store.products import case_directory, save_packed
 from marsyard.campaigns.store.record import stored_definition
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
 from marsyard.campaigns.store.temporary_files import replace_file
-from marsyard.cli.options import Exit
+from marsyard.cli.errors import Exit
 from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.column_selection import primary_metric

@@ -12,6 +12,7 @@ import typer
 from typer import Option
 
 from marsyard.cli import options
+from marsyard.cli.errors import exit_with_error
 
 #: Name of the kernels of `marsyard render` in `marsyard.sim.kernel_cache`, next to the names of scenarios.
 RENDER_KERNELS = "render"
@@ -112,9 +113,9 @@ def report_image_errors(out: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, RenderingError) as error:
-        options.exit_with_error(error)
+        exit_with_error(error)
     except OSError as error:
-        options.exit_with_error(f"cannot write to {out}: {error}")
+        exit_with_error(f"cannot write to {out}: {error}")
 
 
 def gallery(
@@ -126,7 +127,7 @@ def gallery(
     overwrite: options.OverwriteOption = False,
 ) -> None:
     """Render each site with suitable cameras; write one page and a contact sheet. Takes about a minute."""
-    from marsyard.cli.gallery import render_gallery
+    from marsyard.site_gallery import render_gallery
 
     _note_compilation()
     with report_image_errors(out):

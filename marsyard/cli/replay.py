@@ -12,12 +12,13 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
+from marsyard.cli.errors import Exit, handle_user_errors
 
 if TYPE_CHECKING:
     from marsyard.scenarios.timeline import Timeline
 
 
-@options.handle_user_errors
+@handle_user_errors
 def replay(
     directory: options.DirectoryArgument,
     case: Annotated[int, Argument(metavar="CASE", help="Number of the case, from 0.")],
@@ -90,7 +91,7 @@ def replay(
     if exports:
         _write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
     if result.stored is not None and result.differing:
-        raise typer.Exit(options.Exit.FAILED)
+        raise typer.Exit(Exit.FAILED)
 
 
 @dataclass(frozen=True)

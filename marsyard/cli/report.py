@@ -11,12 +11,14 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
+from marsyard.cli.console import create_console
+from marsyard.cli.errors import Exit, handle_user_errors
 from marsyard.cli.execution import make_executor, stop_on_signals
 
 LOOPBACK_ADDRESS = "127.0.0.1"
 
 
-@options.handle_user_errors
+@handle_user_errors
 def report(
     directory: options.DirectoryArgument,
     requirements: Annotated[
@@ -52,7 +54,7 @@ def report(
         applicable_requirements = select_applicable(read_requirements(requirements), name)
         if not applicable_requirements:
             raise CampaignError(f"{requirements}: no requirement lists the campaign '{name}' in its campaigns")
-    status = outcome.evaluate_and_report(directory, options.console(), applicable_requirements)
+    status = outcome.evaluate_and_report(directory, create_console(), applicable_requirements)
     if csv:
         typer.echo(f"rows: {outcome.write_csv(directory)}")
     if pdf:
@@ -60,7 +62,7 @@ def report(
     raise typer.Exit(status)
 
 
-@options.handle_user_errors
+@handle_user_errors
 def confirmations(
     file: Annotated[Path, Argument(metavar="FILE", help="Record of the confirmations.")] = options.CONFIRMATIONS,
     create: Annotated[bool, Option("--create", help="Create an empty record, to be committed to git.")] = False,
@@ -82,11 +84,11 @@ def confirmations(
     if as_json:
         typer.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
     else:
-        options.console().print(confirmations_table(entries))
+        create_console().print(confirmations_table(entries))
         typer.echo(f"record: {find_registration_problem(file) or 'registered'}")
 
 
-@options.handle_user_errors
+@handle_user_errors
 def compare(
     first: Annotated[Path, Argument(metavar="DIR", help="Folder of the first campaign.")],
     second: Annotated[Path, Argument(metavar="DIR", help="Folder of the second campaign.")],
@@ -111,7 +113,7 @@ def compare(
         data = {"first": names[0], "second": names[1], "paired": is_paired, "same_terrains": have_same_terrains}
         typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(differences)}, indent=2))
         return
-    out = options.console()
+    out = create_console()
     out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
     terrains = "the same terrains: comparison by terrain" if have_same_terrains else "different terrains: unpaired"
@@ -119,7 +121,7 @@ def compare(
     out.print(f"Cases: {method}. p: two-sided, corrected for the number of metrics (Holm).", soft_wrap=True)
 
 
-@options.handle_user_errors
+@handle_user_errors
 def dashboard(
     directories: Annotated[
         list[Path], Argument(metavar="DIR...", help="Folders of campaigns, or their parent folders.")
@@ -164,7 +166,7 @@ def dashboard(
             typer.echo("stopped")
 
 
-@options.handle_user_errors
+@handle_user_errors
 def nightly(
     plan: Annotated[
         Path | None, Argument(metavar="PLAN.toml", help="Plan of campaigns; by default the built-in plan.")
@@ -196,7 +198,7 @@ def nightly(
         # write a first page in case this run is killed
         nightly_run.write_page(history, night, out, ())
         try:
-            with stop_on_signals(), campaign_progress(options.console(stderr=True)) as observer:
+            with stop_on_signals(), campaign_progress(create_console(stderr=True)) as observer:
                 run = nightly_run.NightlyRun(history, night, out, executor, plan_definition)
                 for entry in plan_definition.campaigns:
                     nightly_run.run_scheduled_campaign(run, entry, path.parent, observer)
@@ -205,15 +207,10 @@ def nightly(
         except KeyboardInterrupt:
             history.finish(night, INTERRUPTED)
             nightly_run.publish_page(history, night, out, ())
-            raise typer.Exit(options.Exit.INTERRUPTED) from None
+            raise typer.Exit(Exit.INTERRUPTED) from None
         changes = find_changes(list_comparisons(history, night))
         history.finish(night, FINISHED, changes)
         nightly_run.publish_page(history, night, out, changes)
         statuses = {campaign.exit_code for campaign in history.campaigns(night)}
-    statuses |= {int(options.Exit.FAILED) for change in changes if change.is_regression}
-    raise typer.Exit(
-        next(
-            (status for status in (options.Exit.FAILED, options.Exit.INSUFFICIENT) if status in statuses),
-            options.Exit.MET,
-        )
-    )
+    statuses |= {int(Exit.FAILED) for change in changes if change.is_regression}
+    raise typer.Exit(next((status for status in (Exit.FAILED, Exit.INSUFFICIENT) if status in statuses), Exit.MET))

@@ -11,6 +11,8 @@ import typer
 from typer import Option
 
 from marsyard.cli import options
+from marsyard.cli.console import create_console
+from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, show_progress
 
 if TYPE_CHECKING:
@@ -87,7 +89,7 @@ class RareOptions(StudyOptions):
     max_cases: MaxCasesOption = 20_000
 
 
-@options.handle_user_errors
+@handle_user_errors
 @options.with_options(RareOptions)
 def rare(arguments: RareOptions) -> None:
     """Compare the probability of a rare violation of a requirement with a limit, by counting and by subset simulation.
@@ -135,7 +137,7 @@ class SearchOptions(StudyOptions):
     max_cases: MaxCasesOption = 5_000
 
 
-@options.handle_user_errors
+@handle_user_errors
 @options.with_options(SearchOptions)
 def search(arguments: SearchOptions) -> None:
     """Search for violations of a requirement, and reduce each to the few parameters that cause it.
@@ -170,7 +172,7 @@ class BudgetOptions(StudyOptions):
     confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9
 
 
-@options.handle_user_errors
+@handle_user_errors
 @options.with_options(BudgetOptions)
 def budget(arguments: BudgetOptions) -> None:
     """Compute the error budget: run the same cases without each source of error, and with each one alone.
@@ -265,6 +267,6 @@ def _write_and_print(directory: Path, files: Sequence[str] = ()) -> None:
 
     with report_write_errors("the report"):
         page = write_report(directory)
-    console = options.console()
+    console = create_console()
     for line in (*study_sentences(read(directory)), *files, f"report: {page}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)

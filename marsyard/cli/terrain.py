@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer import Option
 
-from marsyard.cli.options import JsonOption, MaxHolesOption, SiteArgument, console, exit_with_error
+from marsyard.cli.console import create_console
+from marsyard.cli.errors import exit_with_error
+from marsyard.cli.options import JsonOption, MaxHolesOption, SiteArgument
 
 if TYPE_CHECKING:
     from marsyard.sim.terrain import Surface
@@ -44,7 +46,7 @@ def list_sites(as_json: JsonOption = False) -> None:
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
     else:
-        console().print(table)
+        create_console().print(table)
 
 
 @app.command()
@@ -135,7 +137,7 @@ def _print_statistics(
         table.add_row(f"mean slope over {length_m} m, deg", "-" if math.isnan(value) else f"{value:.2f}", slope)
     table.add_row("relief, m", f"{statistics.relief_m:.{1 if statistics.relief_m >= 10.0 else 2}f}", relief)
     table.add_row("image contrast, RMS / mean", f"{statistics.contrast:.3f}", contrast)
-    terminal = console()
+    terminal = create_console()
     terminal.print(f"{site}: {side_m:g} m x {side_m:g} m, sample spacing {parameters.spacing_m:g} m, seed {seed}")
     terminal.print(table)
     terminal.print(

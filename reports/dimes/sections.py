@@ -16,7 +16,7 @@ from scipy import stats
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, Rows, distribution_block, quantile_block, rate_block
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import (
     MUTED,

@@ -16,7 +16,8 @@ from matplotlib.patches import Circle
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows
-from marsyard.reports.column_selection import axis_columns, numbers
+from marsyard.reports.column_selection import axis_columns
+from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import explain
 from marsyard.reports.papers import read_paper
 from marsyard.reports.presentation import Presentation

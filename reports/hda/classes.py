@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from marsyard.reports import section
 from marsyard.reports.blocks import Rows
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, drop_empty_columns, landing_rows
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text

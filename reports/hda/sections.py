@@ -25,7 +25,7 @@ from marsyard.reports.blocks import (
     quantile_block,
     scatter_block,
 )
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE

@@ -26,7 +26,7 @@ from marsyard.reports.blocks import (
     rate_block,
     scatter_block,
 )
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products, check_shape, read_arrays, to_float, to_matrix

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from marsyard.reports import section
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
 from marsyard.reports.images import Image, show_image

@@ -144,3 +144,12 @@ def _estimate_intraclass_correlation(
     effective_size = (n - float((sizes**2).sum()) / n) / (n_groups - 1)
     excess = between - within
     return float(np.clip(excess / (excess + effective_size * within), 0.0, 1.0)) if excess > 0.0 else 0.0
+
+
+def rank_correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> float:
+    """Compute Spearman's rank correlation of the finite pairs; NaN for fewer than four pairs or for a constant."""
+    finite = np.isfinite(x) & np.isfinite(y)
+    if finite.sum() < 4:
+        return float("nan")
+    ranks_x, ranks_y = (stats.rankdata(values[finite]) for values in (x, y))
+    return float("nan") if np.ptp(ranks_x) == 0 or np.ptp(ranks_y) == 0 else float(np.corrcoef(ranks_x, ranks_y)[0, 1])

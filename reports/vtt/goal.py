@@ -28,7 +28,7 @@ from marsyard.algorithms.vtt.accuracy import (
 )
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows, distribution_block
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section, has_values

@@ -19,7 +19,7 @@ import pandas as pd
 
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows
-from marsyard.reports.column_selection import numbers
+from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.papers import paper_section, read_paper
 from marsyard.reports.rates import CONFIDENCE

@@ -14,14 +14,9 @@ from jaxtyping import Float32, Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.cameras import draw_calibrated
+from marsyard.scenarios.landing.faults import add_range_faults, add_receiver_outage, draw_received_images
 from marsyard.scenarios.landing.helicopter import Transit
-from marsyard.scenarios.landing.parameters import (
-    LandingScenarioParameters,
-    PairParameters,
-    add_range_faults,
-    add_receiver_outage,
-    draw_received_images,
-)
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters, PairParameters
 from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State

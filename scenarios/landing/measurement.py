@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from marsyard.scenarios.cameras import draw_calibrated
+from marsyard.scenarios.landing.faults import add_range_faults
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.images import Pair
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, add_range_faults
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams

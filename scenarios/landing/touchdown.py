@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.algorithms.interface import SiteEstimate
+from marsyard.scenarios.landing.faults import stuck_range_m
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
 from marsyard.scenarios.landing.helicopter import NavigatedLeg, Transit
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, stuck_range_m
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.dynamics import Resting, State, rotorcraft
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams

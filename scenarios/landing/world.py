@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.landing.parameters import LandingScenarioParameters, raise_sun_deg
+from marsyard.scenarios.landing.faults import sun_elevation_with_shadow_deg
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.radiance import sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround
@@ -37,6 +38,6 @@ class LandingWorld:
         amplitudes = tuple(p.texture * amplitude for amplitude in texture.amplitudes)
         scaled_texture = SiteTexture(coarsest_m=texture.coarsest_m, amplitudes=amplitudes)
         ground = replace(ground, site=dusty_site.model_copy(update={"ground_texture": scaled_texture}))
-        elevation_deg = raise_sun_deg(p.faults, p.sun.elevation_deg)
+        elevation_deg = sun_elevation_with_shadow_deg(p.faults, p.sun.elevation_deg)
         sun = sun_at(air, p.sun.azimuth_deg, elevation_deg)
         return cls(ground, sun, p.meshes, sunlight_ratio(air, float(np.radians(elevation_deg)), p.detector))

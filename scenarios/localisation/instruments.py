@@ -1,4 +1,4 @@
-"""Instruments of localisation: camera and detector, inertial units, radar, image clock, and the initial state.
+"""Instruments of localisation: camera and detector, radar, and the clock of the images.
 
 Camera and inertial unit are at the origin of the body frame; the camera looks along -z and its columns increase along
 x. Sources of the camera's values: Maki et al. 2020 (Space Science Reviews), Johnson et al. 2017 and 2022. Other values
@@ -11,17 +11,15 @@ from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float64
 from pydantic import Field, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.localisation.interface import InitialState
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.sim.camera import Cahv, Cahvore, CameraModel
-from marsyard.sim.dynamics import State, Trajectory
-from marsyard.sim.error_sources import CALIBRATION, ErrorSource
+from marsyard.sim.dynamics import Trajectory
+from marsyard.sim.error_sources import CALIBRATION
 from marsyard.sim.measurements import AltitudeMeasurement
-from marsyard.sim.parameters import NonNegative, Parameters, bounded_field
+from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, RadarAltimeter, RadarParameters
 from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
 
@@ -181,77 +179,3 @@ def measure_altitudes(
         for value, tag in zip(readings.values, readings.times_s, strict=True)
         if np.isfinite(value)
     ]
-
-
-#: The filter begins with these standard deviations.
-INITIAL = ErrorSource("initial", "initial state", remaining=0.1)
-
-
-class InitialErrors(Parameters):
-    """Errors of inertial navigation at the start of localisation; all are normally distributed.
-
-    The horizontal position error is truncated at `horizontal_max_m` (3.2 km, Mars 2020). The attitude is that of the
-    star tracker, propagated through entry. Standard deviations are assumed. Errors of the initial state are independent
-    of each other and of the inertial unit's errors.
-    """
-
-    horizontal_sd_m: Annotated[
-        NonNegative, INITIAL, Field(description="sd per axis before truncation, m (assumed)")
-    ] = 1000.0
-    horizontal_max_m: Annotated[float, Field(gt=0.0, description="largest horizontal position error, m")] = 3200.0
-    vertical_sd_m: Annotated[NonNegative, INITIAL, Field(description="sd of the height, m (assumed)")] = 100.0
-    velocity_sd_m_s: Annotated[NonNegative, INITIAL, Field(description="sd per axis, m/s (assumed)")] = 1.0
-    attitude_sd_deg: Annotated[NonNegative, INITIAL, Field(description="sd per axis, deg (assumed)")] = 0.1
-
-    def covariance(self) -> Float64[np.ndarray, "9 9"]:
-        """Compute the covariance of position (m), velocity (m/s) and attitude (rad) as drawn, with the truncation."""
-        horizontal = self.horizontal_sd_m**2 * self._truncated_variance()
-        attitude = np.radians(self.attitude_sd_deg) ** 2
-        position = [horizontal, horizontal, self.vertical_sd_m**2]
-        return np.diag([*position, *[self.velocity_sd_m_s**2] * 3, *[attitude] * 3])
-
-    def draw(self, truth: State, time_s: float, gravity_m_s2: float, rng: np.random.Generator) -> InitialState:
-        """Draw the initial state; `time_s` is the time of the true state on the clock of the inertial unit."""
-        position, velocity, attitude = rng.standard_normal((3, 3))
-        angle, quantile = 2.0 * np.pi * rng.random(), rng.random()
-        # inverse of the distribution of the radius, 1 - exp(-r^2 / (2 sd^2)), truncated
-        radius = self.horizontal_sd_m * np.sqrt(-2.0 * np.log1p(quantile * np.expm1(-self._truncation())))
-        error = np.array([radius * np.cos(angle), radius * np.sin(angle), self.vertical_sd_m * position[2]])
-        rotation = Rotation.from_rotvec(np.radians(self.attitude_sd_deg) * attitude)
-        return InitialState(
-            time_s=time_s,
-            position_m=truth.position_m - error,
-            velocity_m_s=truth.velocity_m_s - self.velocity_sd_m_s * velocity,
-            # the error e is defined by true attitude = exp(e) estimated attitude
-            world_from_body=rotation.inv() * truth.attitude,
-            covariance=self.covariance(),
-            gravity_m_s2=gravity_m_s2,
-        )
-
-    def _truncation(self) -> float:
-        """Return k = (maximum / sd)^2 / 2; the radius^2 / (2 sd^2) is exponentially distributed up to k."""
-        return 0.5 * (self.horizontal_max_m / max(self.horizontal_sd_m, 1e-6 * self.horizontal_max_m)) ** 2
-
-    def _truncated_variance(self) -> float:
-        """Compute the mean of an exponential distribution truncated at k, 1 - k / (e^k - 1): variance / sd^2."""
-        k = min(self._truncation(), 700.0)
-        return float(1.0 - k / np.expm1(k))
-
-
-class ImageSchedule(Parameters):
-    """Times of the images: those of the coarse stage first (0.3 Hz, Mars 2020), then those of the fine stage.
-
-    Mars 2020 took up to one image per second in the fine stage; the default of 0.5 Hz is assumed.
-    """
-
-    first_s: Annotated[float, bounded_field(INERTIAL_MARGIN_S, 60.0, "first image, after the start")] = 0.5
-    coarse_images: Annotated[int, Field(ge=0, le=100, description="images of the coarse stage")] = 3
-    coarse_interval_s: Annotated[float, bounded_field(0.1, 60.0, "time after each image of the coarse stage")] = 3.3
-    interval_s: Annotated[float, bounded_field(0.1, 60.0, "time between images of the fine stage")] = 2.0
-
-    def times(self, start_s: float, end_s: float) -> Float64[np.ndarray, "images"]:
-        """Compute the nominal times of the images from start to end (included)."""
-        first, coarse = start_s + self.first_s, self.coarse_interval_s * np.arange(self.coarse_images + 1)
-        count = max(int((end_s - first - coarse[-1]) / self.interval_s) + 1, 0)
-        times = np.concatenate([first + coarse[:-1], first + coarse[-1] + self.interval_s * np.arange(count)])
-        return np.asarray(times[times <= end_s])

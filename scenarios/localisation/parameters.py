@@ -12,6 +12,8 @@ from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.scenarios.case_faults import Haze, SizedFaults
 from marsyard.scenarios.localisation import instruments
 from marsyard.scenarios.localisation.flight import ProfileParameters
+from marsyard.scenarios.localisation.image_schedule import ImageSchedule
+from marsyard.scenarios.localisation.initial_errors import InitialErrors
 from marsyard.scenarios.localisation.map_product import MapParameters
 from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
 from marsyard.scenarios.localisation.task import LOCALISATION
@@ -62,11 +64,11 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     dust_opacity: DustOpacity = None
     map: MapParameters = MapParameters()
     flight: ProfileParameters = ProfileParameters()
-    images: instruments.ImageSchedule = instruments.ImageSchedule()
+    images: ImageSchedule = ImageSchedule()
     camera: instruments.LanderCameraParameters = instruments.LanderCameraParameters()
     detector: DetectorParameters = instruments.LANDER_DETECTOR
     imu_class: Annotated[ImuClass, Field(description="class of the inertial unit")] = "ln-200"
-    initial: instruments.InitialErrors = instruments.InitialErrors()
+    initial: InitialErrors = InitialErrors()
     altimeter: RadarParameters = instruments.RADAR
     clock: Annotated[ClockParameters, Field(description="clock of the images' time tags")] = instruments.IMAGE_CLOCK
     exact_instruments: Annotated[

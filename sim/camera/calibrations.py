@@ -1,6 +1,7 @@
-"""Camera calibrations of other programs: OpenCV, ROS `camera_info`, Kalibr camera chains, EuRoC sensors.
+"""Camera calibrations of other programs: OpenCV, ROS, Kalibr, EuRoC, COLMAP and Ames Stereo Pipeline.
 
-All files are YAML, or are converted to its values (`marsyard.sim.camera.calibration_files`): a camera matrix and
+Files of OpenCV, ROS (`camera_info`), Kalibr (camera chains) and EuRoC (sensors) are YAML; the others are converted to
+the same values (`marsyard.sim.camera.calibration_formats`): a camera matrix and
 OpenCV's distortion in OpenCV's axes, z forward, x right, y down; the centre of the upper left pixel is (0, 0), as in
 Marsyard. Each is converted to the nearest camera of the CAHV family (`from_opencv`, `from_opencv_fisheye`). The
 conversion is exact if only k1 and k2 are not zero. A residual above `MAX_RMS_PX` (RMS over the frame) or `MAX_PX` (at
@@ -23,14 +24,14 @@ import yaml
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibration_files import (
+from marsyard.sim.camera.calibration_formats import (
     OPENCV_ROOT,
     is_colmap,
-    is_pinhole,
+    is_stereo_pipeline,
     is_xml,
     read_colmap,
     read_opencv_xml,
-    read_pinhole,
+    read_stereo_pipeline,
     refuse_foreign,
     xml_root,
 )
@@ -95,7 +96,7 @@ def is_calibration(head: bytes) -> bool:
     """Return whether a file with these first bytes can be a calibration."""
     if is_xml(head):
         return xml_root(head) == OPENCV_ROOT
-    return is_colmap(head) or is_pinhole(head) or _START.match(head) is not None
+    return is_colmap(head) or is_stereo_pipeline(head) or _START.match(head) is not None
 
 
 def read_calibrations(path: str | Path, *, size: tuple[int, int] | None = None) -> tuple[Calibration, ...]:
@@ -116,8 +117,8 @@ def read_calibrations(path: str | Path, *, size: tuple[int, int] | None = None) 
             _Reader(source, values, f"camera {name}: ").read_calibration(name, None)
             for name, values in read_colmap(source)
         )
-    if is_pinhole(head):
-        return (_Reader(source, read_pinhole(source, size), "").read_calibration("", None),)
+    if is_stereo_pipeline(head):
+        return (_Reader(source, read_stereo_pipeline(source, size), "").read_calibration("", None),)
     text = source.read_text().encode("latin-1").decode("utf-8-sig", errors="replace")
     try:
         data = yaml.load(_DIRECTIVE.sub("", text), Loader=_Loader)  # noqa: S506  (a SafeLoader)

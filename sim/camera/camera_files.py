@@ -19,7 +19,7 @@ import re
 from pathlib import Path
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibration_files import is_xml, refuse_foreign, xml_root
+from marsyard.sim.camera.calibration_formats import is_xml, refuse_foreign, xml_root
 from marsyard.sim.camera.calibrations import HEAD_BYTES, is_calibration, read_calibrations
 from marsyard.sim.camera.label_frames import ROVER_FRAME, FramedCamera
 from marsyard.sim.camera.models import Cahvore

@@ -12,7 +12,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibration_files import parse_xml
+from marsyard.sim.camera.calibration_formats import parse_xml
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     CoordinateSystem,

@@ -4,10 +4,11 @@ The instruments of rovers are in the modules `mast` and `odometry`.
 """
 
 from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor.approach import Approach, ApproachParameters
 from marsyard.sim.sensor.auto_exposure import AutoExposure, AutoExposureParameters, auto_expose
 from marsyard.sim.sensor.detector import Detector, DetectorParameters
 from marsyard.sim.sensor.imu import Imu, ImuParameters, WarmUp
-from marsyard.sim.sensor.inertial import Approach, ApproachParameters, InertialSolution, NavigationErrors
+from marsyard.sim.sensor.inertial import InertialSolution, NavigationErrors
 from marsyard.sim.sensor.instrument import Clock, ClockParameters, Readings, Sampling
 from marsyard.sim.sensor.optics import ImageMotion, natural_fall_off
 from marsyard.sim.sensor.presets import (

@@ -14,7 +14,7 @@ from jaxtyping import UInt16
 MIN_BITS, MAX_BITS = 0.1, 16.0
 
 
-def compress(
+def compress_and_decompress(
     counts: UInt16[np.ndarray, "rows columns"], bits_per_pixel: float, full_scale_dn: int
 ) -> UInt16[np.ndarray, "rows columns"]:
     """Compress an image to `bits_per_pixel` and decompress it; no change if lossless coding needs fewer bits.

@@ -17,7 +17,8 @@ from marsyard.algorithms.dimes.baselines import (
     max_length_change,
     rectify_pair,
 )
-from marsyard.algorithms.dimes.binning import build_views, inside_frame, square_lattice
+from marsyard.algorithms.dimes.binning import build_views
+from marsyard.algorithms.dimes.ground_view import inside_frame, square_lattice
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 from tests.algorithms.synthetic_descent import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.dimes import binning, overlap, rectification
+from marsyard.algorithms.dimes import binning, ground_view, overlap, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
@@ -56,8 +56,8 @@ def find_candidates(
 def test_ground_and_pixel_projections_are_inverse() -> None:
     view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     pixels = overlap.grid_pixels(view.size, 16)
-    ground, is_within_limit = binning.ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
-    projections, visible = binning.pixels_from_ground(view, ground)
+    ground, is_within_limit = ground_view.ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
+    projections, visible = ground_view.pixels_from_ground(view, ground)
     assert is_within_limit.sum() > 200
     assert np.all(visible[is_within_limit])
     np.testing.assert_allclose(projections[is_within_limit], pixels[is_within_limit], atol=1e-6)
@@ -66,7 +66,7 @@ def test_ground_and_pixel_projections_are_inverse() -> None:
 def test_distant_rays_are_clipped_at_the_off_nadir_limit() -> None:
     view = make_view(tilt_body(80.0, 0.0, 0.0), 1500.0)  # tilted: half of the image is sky
     pixels = overlap.border_pixels(view.size)
-    ground, is_within_limit = binning.ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
+    ground, is_within_limit = ground_view.ground_from_pixels(view, pixels, MAX_OFF_NADIR_RAD)
     _, directions = view.camera.rays(pixels)
     assert np.any(directions[:, 2] > 0.0)
     assert not is_within_limit.all()
@@ -98,8 +98,8 @@ def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
 
 
 def test_lattice_and_outline_have_the_expected_number_of_points() -> None:
-    assert binning.square_lattice(3.0, 4).shape == (16, 2)
-    outline = binning.square_outline(3.0, 4)
+    assert ground_view.square_lattice(3.0, 4).shape == (16, 2)
+    outline = ground_view.square_outline(3.0, 4)
     assert outline.shape == (12, 2)
     assert np.all(np.abs(outline).max(axis=1) == 3.0)
 
@@ -134,13 +134,13 @@ def test_each_candidate_fits_template_and_each_preferred_one_its_window() -> Non
         candidates = find_candidates(first, second)
         assert set(candidates.preference) >= {0, 1, 3}
         for ground, preference in zip(candidates.ground, candidates.preference, strict=True):
-            assert binning.inside_frame(
-                first, ground + binning.square_outline(geometry.template_half_m, 15), 0.0, MAX_OFF_NADIR_RAD
+            assert ground_view.inside_frame(
+                first, ground + ground_view.square_outline(geometry.template_half_m, 15), 0.0, MAX_OFF_NADIR_RAD
             ).all()
             halves = (geometry.template_half_m, geometry.window_half_m, geometry.window_half_m)[:preference]
             for half in halves:
-                assert binning.inside_frame(
-                    second, ground + binning.square_outline(half, 15), 0.0, MAX_OFF_NADIR_RAD
+                assert ground_view.inside_frame(
+                    second, ground + ground_view.square_outline(half, 15), 0.0, MAX_OFF_NADIR_RAD
                 ).all()
             if preference >= 2:
                 assert overlap.searchable_positions(second, ground, geometry, OPTIONS).all()
@@ -192,14 +192,14 @@ def test_overlap_must_be_as_wide_as_the_largest_displacement() -> None:
 def test_searchable_positions_show_the_complete_template() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     geometry = overlap.search_geometry(first, second, OPTIONS)
-    centre, _ = binning.ground_from_pixels(second, np.array([[250.0, 128.0]]), MAX_OFF_NADIR_RAD)
+    centre, _ = ground_view.ground_from_pixels(second, np.array([[250.0, 128.0]]), MAX_OFF_NADIR_RAD)
     searchable = overlap.searchable_positions(second, centre[0], geometry, OPTIONS)
     offsets = geometry.gsd_m * (np.arange(2 * geometry.search_px + 1) - geometry.search_px)
     half = 0.5 * (OPTIONS.template_px - 1) * geometry.gsd_m
     expected = [
         [
-            binning.inside_frame(
-                second, centre[0] + [east, -south] + binning.square_outline(half, 9), 3.0, MAX_OFF_NADIR_RAD
+            ground_view.inside_frame(
+                second, centre[0] + [east, -south] + ground_view.square_outline(half, 9), 3.0, MAX_OFF_NADIR_RAD
             ).all()
             for east in offsets
         ]
@@ -216,7 +216,7 @@ def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
     shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
     # A direction and a ground point along it project to the same pixel, except for rounding at distances of 1e7 m.
     np.testing.assert_allclose(
-        overlap.zero_phase_pixel(view, sun), binning.pixels_from_ground(view, shadow)[0][0], atol=1e-3
+        overlap.zero_phase_pixel(view, sun), ground_view.pixels_from_ground(view, shadow)[0][0], atol=1e-3
     )
     assert np.all(np.isnan(overlap.zero_phase_pixel(view, -sun)))
 
@@ -236,7 +236,7 @@ def test_templates_and_windows_avoid_zero_phase_spot() -> None:
         for view in (first, second):
             for ground, is_preferred in zip(candidates.ground, preferred, strict=True):
                 half = geometry.window_half_m if is_preferred and view is second else geometry.template_half_m
-                points = np.column_stack([ground + binning.square_lattice(half, 25), np.zeros(625)]) - view.centre
+                points = np.column_stack([ground + ground_view.square_lattice(half, 25), np.zeros(625)]) - view.centre
                 cosines = points @ -sun / np.linalg.norm(points, axis=1)
                 # Between lattice points the spot may extend into the window by a fraction of a degree.
                 assert np.degrees(np.arccos(cosines.max())) > np.degrees(radius) - 0.6
@@ -295,9 +295,9 @@ def test_patch_across_the_border_repeats_the_border_pixels() -> None:
     counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
     view = make_view(attitude, 1700.0, 0.0, counts)
     columns, rows = view.size
-    corner, _ = binning.ground_from_pixels(view, np.array([[columns - 1.0, rows - 1.0]]), MAX_OFF_NADIR_RAD)
+    corner, _ = ground_view.ground_from_pixels(view, np.array([[columns - 1.0, rows - 1.0]]), MAX_OFF_NADIR_RAD)
     patch = rectification.rectify_patch(view, corner[0], 21, 5.5)
-    pixels, _ = binning.pixels_from_ground(view, rectification.ground_lattice(corner[0], 21, 5.5))
+    pixels, _ = ground_view.pixels_from_ground(view, rectification.ground_lattice(corner[0], 21, 5.5))
     is_outside = (pixels > np.array([columns - 1.0, rows - 1.0])).all(axis=-1)
     assert np.count_nonzero(is_outside) > 50
     image = rectification.correct_patch(view, np.s_[:], np.s_[:])
@@ -317,7 +317,7 @@ def test_rectified_patch_shows_its_lattice_positions(attitude: Rotation) -> None
     position = np.array([700.0, -300.0, 1700.0])
     counts = expose_scene(trace_scene(make_wave_texture(), attitude, position), make_calibration(), level=1600.0)
     view = make_view(attitude, 1700.0, 0.0, counts)
-    centre, is_within_limit = binning.ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
+    centre, is_within_limit = ground_view.ground_from_pixels(view, np.array([[150.0, 90.0]]), MAX_OFF_NADIR_RAD)
     assert is_within_limit[0]
     patch = rectification.rectify_patch(view, centre[0], 61, 5.5)
     lattice = rectification.ground_lattice(centre[0], 61, 5.5) + position[:2]
@@ -343,7 +343,7 @@ def _estimate_shift(patch: np.ndarray, expected: np.ndarray, lattice: np.ndarray
 def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
     view = make_view(tilt_body(20.0, 70.0, 200.0), 1850.0)
     lattice = rectification.ground_lattice(np.array([-150.0, 200.0]), 31, 5.5)
-    exact_pixels, is_visible_exactly = binning.pixels_from_ground(view, lattice)
+    exact_pixels, is_visible_exactly = ground_view.pixels_from_ground(view, lattice)
     pixels, is_visible = rectification.homography_lattice(view, lattice)
     assert is_visible_exactly.all()
     assert is_visible.all()
@@ -355,7 +355,7 @@ def test_homography_neglects_only_the_distortion_within_a_patch() -> None:
     pinhole = replace(view, camera=Cahv(view.camera.c, view.camera.a, view.camera.h, view.camera.v, view.camera.size))
     np.testing.assert_allclose(
         rectification.homography_lattice(pinhole, lattice)[0],
-        binning.pixels_from_ground(pinhole, lattice)[0],
+        ground_view.pixels_from_ground(pinhole, lattice)[0],
         atol=2e-4,
     )
 

@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from marsyard.cli import gallery as gallery_command
-from marsyard.cli.gallery import (
+from marsyard import site_gallery as gallery_command
+from marsyard.sim.sensor import PRESETS
+from marsyard.sim.terrain import sites
+from marsyard.site_gallery import (
     PAGE,
     SHEET,
     SHEET_BYTES,
@@ -19,8 +21,6 @@ from marsyard.cli.gallery import (
     map_to_grey,
     write_gallery,
 )
-from marsyard.sim.sensor import PRESETS
-from marsyard.sim.terrain import sites
 from marsyard.site_images import ImageRequest
 from tests.command import marsyard
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from marsyard.cli.options import console
+from marsyard.cli.console import create_console
 from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.case_evidence import CaseEvidence, RequirementEvidence
 from marsyard.reports.dashboard.entries import read_entries
@@ -163,4 +163,4 @@ def test_looks_at_an_unfinished_campaign_never_pass(make_run: MakeRun) -> None:
     path = directory / "campaign.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"state": "interrupted", "cases": 1000}))
     assert evaluate_run(directory).exit_code == 3
-    assert evaluate_and_report(directory, console()) == 3
+    assert evaluate_and_report(directory, create_console()) == 3

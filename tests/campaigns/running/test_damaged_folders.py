@@ -20,7 +20,7 @@ from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import write_table
-from marsyard.cli.options import handle_user_errors
+from marsyard.cli.errors import handle_user_errors
 from tests.campaigns.fake_campaign import CampaignFile, RecordingWatch, read_case_rows, run, sign_folder
 
 #: Value of a key that the record does not have.

@@ -5,15 +5,15 @@ import pytest
 from pydantic import ValidationError
 
 from marsyard.scenarios.case_faults import add_detector_faults
-from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
-from marsyard.scenarios.landing.parameters import (
+from marsyard.scenarios.landing.faults import (
     LandingFaults,
-    LandingScenarioParameters,
     add_range_faults,
     add_receiver_outage,
     draw_received_images,
     stuck_range_m,
 )
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
+from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams
 

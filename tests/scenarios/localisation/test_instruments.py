@@ -7,11 +7,11 @@ from scipy.stats import chi2
 
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.localisation.flight import LanderFlight
+from marsyard.scenarios.localisation.initial_errors import InitialErrors
 from marsyard.scenarios.localisation.instruments import (
     HALF_WELL_SNR,
     LANDER_DETECTOR,
     RADAR,
-    InitialErrors,
     LanderCameraParameters,
     draw_calibrated_camera,
     measure_altitudes,

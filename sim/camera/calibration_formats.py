@@ -63,7 +63,7 @@ def is_colmap(head: bytes) -> bool:
     return _COLMAP.match(head) is not None
 
 
-def is_pinhole(head: bytes) -> bool:
+def is_stereo_pipeline(head: bytes) -> bool:
     """Return whether the first bytes are those of a pinhole model of Ames Stereo Pipeline (`.tsai`)."""
     return _PINHOLE.match(head) is not None
 
@@ -124,7 +124,7 @@ def read_colmap(source: Source) -> list[tuple[str, Values]]:
     return cameras
 
 
-def read_pinhole(source: Source, size: tuple[int, int] | None) -> Values:
+def read_stereo_pipeline(source: Source, size: tuple[int, int] | None) -> Values:
     """Read a pinhole model of Ames Stereo Pipeline with the lens models NULL and TSAI; its pose is ignored.
 
     The lens model TSAI is OpenCV's. `size` is (columns, rows) of the image. Raises CameraFileError.

@@ -1,4 +1,4 @@
-"""Command `marsyard gallery`: render each site with suitable cameras and show all images on one page."""
+"""Gallery: images of each site by suitable cameras, on one page and a contact sheet (`marsyard gallery`)."""
 
 from __future__ import annotations
 

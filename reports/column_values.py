@@ -1,0 +1,25 @@
+"""Values of a column of rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+
+def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
+    """Return a column as float64; NaN for missing numbers or a missing column."""
+    if column not in frame:
+        return np.full(len(frame), np.nan)
+    values = pd.to_numeric(frame[column], errors="coerce")
+    return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
+
+
+def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
+    """Whether a column contains numbers of more than one value."""
+    return _is_number(frame, column) and frame[column].nunique() > 1
+
+
+def _is_number(frame: pd.DataFrame, column: str) -> bool:
+    dtype = frame[column].dtype
+    return pd.api.types.is_numeric_dtype(dtype) and not pd.api.types.is_bool_dtype(dtype)
