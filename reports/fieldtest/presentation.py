@@ -17,6 +17,7 @@ from matplotlib.patches import Circle
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows
 from marsyard.reports.dimes.presentation import explain
+from marsyard.reports.fits import fit_note
 from marsyard.reports.papers import read_paper
 from marsyard.reports.presentation import Presentation
 from marsyard.reports.rates import CONFIDENCE
@@ -80,7 +81,7 @@ def field_test_section(subject: Subject) -> Section | None:
             "Largest error": lambda cell: number(cell["largest"]),
         },
     )
-    blocks = [Block(grid=grid, note=_field_note(cells))]
+    blocks = [Block(grid=grid, note=f"{_field_note(cells)} {fit_note('dimes-fieldtest')}")]
     svg_figures = scatter_figures(subject)
     if svg_figures:
         note = ""
