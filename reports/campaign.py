@@ -38,6 +38,7 @@ from marsyard.reports.signature import sign_report
 from marsyard.reports.stored import StoredRun, table
 from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
 from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
+from marsyard.reports.validity import validity_section
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count, label, number
 from marsyard.sim.cache import hide_folders
@@ -46,11 +47,11 @@ from marsyard.sim.cache import hide_folders
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
     common_sections.answers_section, comparison_section, common_sections.scatter_section,
     common_sections.drivers_section, boundary_section, common_sections.convergence_section,
-    common_sections.consistency_section, common_sections.faults_section,
+    common_sections.consistency_section, common_sections.faults_section, validity_section,
 )  # fmt: skip
 
 #: Sections of a study (`marsyard rare`, `marsyard search`, `marsyard budget`).
-STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget_section)
+STUDY_SECTIONS: tuple[SectionMaker, ...] = (rare_section, search_section, budget_section, validity_section)
 
 #: Maximum number of names of sites, and of algorithms, in `report.json`.
 _MAX_NAMES = 24
@@ -95,6 +96,7 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     page_file = directory / PAGE_FILE
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context["evidence"] = evaluation.evidence
+    context["cautions"] += evaluation.validity.sentences
     write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))
     with suppress(StoreError, RuntimeError):  # without a key or a home folder, the dashboard writes the report again
         sign_report(directory, run.directory)
@@ -236,6 +238,7 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
         metric=metric,
         statistics=dict(summaries),
         worst_cases=tuple(row.case for row in worst_rows),
+        validity=evaluation.validity,
         sections={section.key: section.data for section in extra_sections},
         showcases=run.stored_cases,
     )

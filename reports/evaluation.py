@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from marsyard.reports.rates import engine_failed
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
 from marsyard.reports.stored import StoredRun, read_columns, read_run, table
+from marsyard.reports.validity import Validity, assess_validity
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count
 
@@ -47,6 +49,11 @@ class Evaluation:
     verdicts: Sequence[Verdict]
     overall_verdict: OverallVerdict
     is_qualified: bool = False
+
+    @cached_property
+    def validity(self) -> Validity:
+        """Cases outside of the conditions in which the simulation was checked, and missed checks."""
+        return assess_validity(replace(self.run, frame=self.sampling.exclude_nominal_case(self.run.frame)))
 
     @property
     def exit_code(self) -> int:

@@ -13,14 +13,15 @@ from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.samples import ErrorSummary
 from marsyard.reports.traceability import Algorithm
+from marsyard.reports.validity import Validity
 from marsyard.reports.verdicts import Verdict
 from marsyard.sim.cache import hide_folders
 
 #: Files of a report: the page, and its data.
 PAGE_FILE, REPORT_JSON = "report.html", "report.json"
 #: Version of the layout of `report.json`. A removed field, or a new meaning, increases the version.
-Schema = Literal[7]
-SCHEMA: Schema = 7
+Schema = Literal[8]
+SCHEMA: Schema = 8
 #: Properties that `report.json` contains next to the fields of verdicts, sampling design and evidence.
 _VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "margin")
 _SAMPLING_PROPERTIES, _EVIDENCE_PROPERTIES = ("independent", "text"), ("title", "text")
@@ -50,6 +51,7 @@ class CampaignReport:
     - outcomes: number of cases by outcome
     - metric, statistics: the page's metric, and statistics of its errors by label
     - worst_cases: numbers of the cases with the largest errors, the largest first
+    - validity: cases outside of the conditions in which the simulation was checked, and missed checks
     - sections: data of each further section of the page, by the section's anchor
     - showcases: cases with stored products
     """
@@ -77,6 +79,7 @@ class CampaignReport:
     metric: str | None
     statistics: Mapping[str, ErrorSummary]
     worst_cases: tuple[str, ...]
+    validity: Validity
     sections: Mapping[str, Mapping[str, Any]]
     showcases: tuple[int, ...]
 

@@ -60,6 +60,10 @@ class System:
     - ingest: function that converts recorded data into cases (`marsyard ingest`). Arguments: folder of the data, folder
       for the new cases, and folder to which the new cases are moved. Returns `Ingested`.
     - report: a `marsyard.reports.presentation.Presentation`: report sections, and the figures of a case
+    - conditions: sources of the quantities of `marsyard.reports.validation_rows.Conditions`, by quantity. Each item is
+      a source of values, or several separated by ``|``, of which the first that exists is used: a column of the rows (a
+      pattern), a parameter path of the campaign, ``site.PATH`` of the site's preset, or ``=VALUE``
+    - find_site: function that returns the preset of a site, given by name; raises ValueError for an unknown name
     """
 
     name: str
@@ -73,6 +77,8 @@ class System:
     templates: Mapping[str, CampaignTemplate] = field(default_factory=dict)
     ingest: str = ""
     report: str = ""
+    conditions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    find_site: str = "marsyard.sim.terrain.sites:site"
 
     @property
     def campaigns(self) -> Mapping[str, Path]:

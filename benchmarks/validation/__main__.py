@@ -1,7 +1,7 @@
 """Run all validation checks, print the results and write docs/validation.md.
 
-Usage: ``python -m benchmarks.validation [--only NAME]``. A check compares measured properties of the simulation with
-limits (`records`).
+Usage: ``python -m benchmarks.validation [--only NAME]``, or with ``--pages`` to write only the pages. A check compares
+measured properties of the simulation with limits (`records`).
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ def _parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--quick", action="store_true", help="fewer samples, the same limits; stores no results and writes no page"
     )
+    parser.add_argument("--pages", action="store_true", help="only write the pages from the stored results")
     return parser.parse_args()
 
 
@@ -80,6 +81,9 @@ def main() -> int:
     """Run the selected checks. Returns 1 if a limit is missed."""
     arguments = _parse_arguments()
     console = Console()
+    if arguments.pages:
+        document.write_pages(CHECKS, document.read_stored())
+        return 0
     results: dict[str, list[Measure]] = {}
     for check in CHECKS:
         if arguments.only and check.name not in arguments.only:
@@ -89,7 +93,7 @@ def main() -> int:
         _print_table(console, f"{check.name} ({time.perf_counter() - start:.0f} s)", results[check.name])
         if not arguments.quick:
             # after each check, so that an interruption loses only the current check
-            document.write_page(CHECKS, document.store({check.name: results[check.name]}, arguments.quick))
+            document.write_pages(CHECKS, document.store({check.name: results[check.name]}, arguments.quick))
     missed_claims = [measure.claim for measures in results.values() for measure in measures if not measure.passed]
     for claim in missed_claims:
         console.print(f"[bold red]missed:[/] {claim}")

@@ -14,6 +14,7 @@ from benchmarks.threshold_derivation import ThresholdInputs
 from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes import DimesOptions
+from marsyard.reports.validation_rows import Conditions
 
 #: Seed of the simulated descents.
 SEED = 4002
@@ -95,4 +96,24 @@ def compare_estimators(quick: bool) -> Iterator[Measure]:
         yield Measure(f"velocity error, rms: {name}", rms, "m/s", None, how)
 
 
-CHECKS = (Check("imu-check", "DIMES", check_imu_threshold), Check("estimators", "DIMES", compare_estimators))
+CHECKS = (
+    Check("imu-check", "DIMES", check_imu_threshold, conditions=(Conditions(systems=("dimes", "fieldtest")),)),
+    Check(
+        "estimators",
+        "DIMES",
+        compare_estimators,
+        # the dispersions of dimes-smoke
+        conditions=(
+            Conditions(
+                "*",
+                ("dimes",),
+                site=("gusev",),
+                camera=("mer-descent-flown",),
+                sun_elevation_deg=(30.0, 60.0),
+                slope_deg=(1.7, 1.7),
+                optical_depth=(0.9, 0.9),
+                range_m=(1400.0, 2100.0),
+            ),
+        ),
+    ),
+)

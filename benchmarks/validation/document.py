@@ -1,4 +1,7 @@
-"""Store the measurements as JSON, and write docs/validation.md from the measurements and a template."""
+"""Store the measurements as JSON, and write docs/validation.md and the packaged rows from the measurements.
+
+The packaged rows (`marsyard.reports.validation_rows`) also contain the conditions of each row.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,14 @@ from pathlib import Path
 
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import renderer
+from marsyard.reports.validation_rows import (
+    VALIDATION_FILE,
+    RowKind,
+    ValidationCheck,
+    ValidationRow,
+    find_conditions,
+    to_json,
+)
 from marsyard.sim.kernel_cache import processor_features
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +52,7 @@ def format_value(measure: Measure, value: float) -> str:
 
 def store(results: dict[str, list[Measure]], quick: bool) -> dict[str, dict]:
     """Add the measurements of these checks to the stored measurements, and return all."""
-    stored: dict[str, dict] = json.loads(RESULTS.read_text())["checks"] if RESULTS.exists() else {}
+    stored = read_stored() if RESULTS.exists() else {}
     environment = _read_environment(quick)
     for name, measures in results.items():
         stored[name] = {"environment": environment, "measures": [asdict(measure) for measure in measures]}
@@ -60,27 +71,67 @@ def _read_environment(quick: bool) -> dict[str, str]:
     }
 
 
-def write_page(checks: Sequence[Check], stored: dict[str, dict]) -> None:
-    """Write the page with rows in the order of the checks, so that only values differ between runs."""
-    text = TEMPLATE.read_text()
-    sections: dict[str, list[str]] = {}
-    columns = {check.section: ("property", "limit", "measured", "", *check.method_columns) for check in checks}
+def read_stored() -> dict[str, dict]:
+    """Read the stored measurements by check."""
+    stored: dict[str, dict] = json.loads(RESULTS.read_text())["checks"]
+    return stored
+
+
+def create_rows(checks: Sequence[Check], stored: dict[str, dict]) -> dict[str, ValidationCheck]:
+    """Combine the stored measurements with the conditions of their checks, in the order of the checks."""
+    return {
+        check.name: ValidationCheck(
+            check.section,
+            stored[check.name]["environment"],
+            tuple(
+                ValidationRow(
+                    **row
+                    | {name: None if row[name] is None else float(row[name]) for name in ("measured", "limit")}
+                    | {"conditions": find_conditions(check.conditions, row["claim"])}
+                )
+                for row in stored[check.name]["measures"]
+            ),
+        )
+        for check in checks
+        if check.name in stored
+    }
+
+
+def write_pages(checks: Sequence[Check], stored: dict[str, dict]) -> None:
+    """Write page and packaged rows in the order of the checks, so that only values differ between runs."""
+    text, rows = TEMPLATE.read_text(), create_rows(checks, stored)
+    VALIDATION_FILE.write_bytes(to_json(rows))
+    sections: dict[str, list[ValidationRow]] = {}
+    method_columns = {check.section: check.method_columns for check in checks}
     for check in checks:
-        rows = sections.setdefault(check.section, [])
-        for row in stored.get(check.name, {}).get("measures", []):
-            rows.append(_format_row(Measure(**row)))
-    for section, rows in sections.items():
-        header = [f"| {' | '.join(columns[section])} |".replace("|  |", "| |"), "|---" * len(columns[section]) + "|"]
-        text = text.replace("{" + section + "}", "\n".join(header + rows) if rows else "Not measured yet.")
+        sections.setdefault(check.section, []).extend(rows[check.name].rows if check.name in rows else ())
+    for section, section_rows in sections.items():
+        text = text.replace("{" + section + "}", _format_table(section_rows, method_columns[section]))
     text = text.replace("{environment}", _describe_environments(checks, stored))
     DOCUMENT.write_text(text)
 
 
-def _format_row(measure: Measure) -> str:
-    """Format a measurement as a row of the table."""
-    verdict = "" if measure.limit is None else ("met" if measure.passed else "**missed**")
-    limit = "reported" if measure.limit is None else f"{measure.sense} {format_value(measure, measure.limit)}"
-    return f"| {measure.claim} | {limit} | {format_value(measure, measure.measured)} | {verdict} | {measure.how} |"
+def _format_table(rows: Sequence[ValidationRow], method_columns: Sequence[str]) -> str:
+    """Format rows as a table; kind and conditions are columns if a row has them."""
+    if not rows:
+        return "Not measured yet."
+    has_kinds = any(row.kind is not RowKind.VERIFICATION for row in rows)
+    has_conditions = any(row.conditions.quantities for row in rows)
+    extra = (*(["kind"] if has_kinds else []), *(["checked with"] if has_conditions else []))
+    columns = ("property", "limit", "measured", "", *extra, *method_columns)
+    lines = [f"| {' | '.join(columns)} |".replace("|  |", "| |"), "|---" * len(columns) + "|"]
+    for row in rows:
+        cells = [*([row.kind.value] if has_kinds else []), *([row.conditions.text] if has_conditions else [])]
+        lines.append(_format_row(row, cells))
+    return "\n".join(lines)
+
+
+def _format_row(row: ValidationRow, cells: Sequence[str]) -> str:
+    """Format a row of the table, with further cells before its method."""
+    measure = Measure(row.claim, row.measured, row.unit, row.limit, row.how, row.sense)
+    verdict = {None: "", True: "met", False: "**missed**"}[row.is_met]
+    limit = "reported" if row.limit is None else f"{row.sense} {format_value(measure, row.limit)}"
+    return f"| {' | '.join((row.claim, limit, format_value(measure, row.measured), verdict, *cells, row.how))} |"
 
 
 def _describe_environments(checks: Sequence[Check], stored: dict[str, dict]) -> str:

@@ -8,6 +8,7 @@ the agreement is no independent test. "Flown" values were measured in images fro
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from jaxtyping import Float64
 import marsyard
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.dimes.details import TRACK_COLUMNS
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.image_statistics import (
     ImageStatistics,
     PairStatistics,
@@ -180,9 +182,66 @@ def compare_templates(quick: bool) -> Iterator[Measure]:
     yield Measure(claim, refused_fraction, "1", FLOWN_REFUSED_FRACTION[0], f"{how}, one refused", "at least")
 
 
+#: Optical depth of both sites.
+_OPTICAL_DEPTH = (0.9, 0.9)
+_DESCENT = Conditions(
+    "*gusev",
+    ("dimes",),
+    "spirit-descent",
+    site=("gusev",),
+    camera=("mer-descent-flown",),
+    sun_elevation_deg=(SUNS_DEG["gusev"][1],) * 2,
+    slope_deg=(1.7, 1.7),
+    optical_depth=_OPTICAL_DEPTH,
+    range_m=ALTITUDES_M,
+)
+_MERIDIANI = replace(
+    _DESCENT,
+    rows="*meridiani*",
+    site=("meridiani",),
+    sun_elevation_deg=(SUNS_DEG["meridiani"][1],) * 2,
+    slope_deg=(1.8, 1.8),
+)
+_MAST = Conditions(
+    "*gusev*",
+    ("vtt", "hda"),
+    "mast-images",
+    site=("gusev",),
+    camera=("mer-navcam",),
+    sun_elevation_deg=(35.0, 35.0),
+    slope_deg=(1.3, 1.3),
+    optical_depth=_OPTICAL_DEPTH,
+)
 CHECKS = (
-    Check("flight", "Images from Mars", compare_descent_images),
-    Check("flight-pairs", "Images from Mars", compare_descent_pairs),
-    Check("flight-templates", "Images from Mars", compare_templates),
-    Check("flight-mast", "Images from Mars", compare_mast_images),
+    Check(
+        "flight", "Images from Mars", compare_descent_images, conditions=(_MERIDIANI, replace(_DESCENT, rows="*gusev*"))
+    ),
+    Check(
+        "flight-pairs",
+        "Images from Mars",
+        compare_descent_pairs,
+        conditions=(replace(_DESCENT, rows="*", range_m=(ALTITUDES_M[1],) * 2),),
+    ),
+    Check(
+        "flight-templates",
+        "Images from Mars",
+        compare_templates,
+        # the dispersions of dimes-gusev
+        conditions=(
+            replace(
+                _DESCENT,
+                rows="*",
+                data="dimes-templates",
+                sun_elevation_deg=(30.0, 60.0),
+                optical_depth=(0.6, 1.2),
+                range_m=(1400.0, 2100.0),
+            ),
+        ),
+    ),
+    Check(
+        "flight-mast",
+        "Images from Mars",
+        compare_mast_images,
+        conditions=(_MAST, replace(_MAST, rows="*meridiani*", site=("meridiani",), slope_deg=(1.5, 1.5))),
+    ),
 )

@@ -19,14 +19,18 @@ from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, cast_triangles
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import (
+    CAMERA_CONDITIONS,
     LAMBERTIAN,
+    MAST,
     OVERHEAD_SUN,
     cameras,
+    descent_conditions,
     descent_view,
     ground_view,
     renderer,
     rock_view,
 )
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import Scene
 from marsyard.sim.terrain import Surface
@@ -190,7 +194,19 @@ def run_ranges(quick: bool) -> Iterator[Measure]:
 
 
 CHECKS = (
-    Check("markers", "Geometry", run_markers),
-    Check("planes", "Geometry", run_planes),
-    Check("ranges", "Geometry", run_ranges),
+    Check("markers", "Geometry", run_markers, conditions=CAMERA_CONDITIONS),
+    Check("planes", "Geometry", run_planes, conditions=CAMERA_CONDITIONS),
+    Check(
+        "ranges",
+        "Geometry",
+        run_ranges,
+        conditions=(
+            descent_conditions("*pisgah from 2 km*", "pisgah", 2000.0),
+            descent_conditions("*kelso's dunes*", "kelso", 1000.0),
+            Conditions("*: rippled ground*10 m", MAST, site=("gusev",), camera=("mer-navcam",), range_m=(1.6, 10.0)),
+            Conditions("*: rippled ground*40 m", MAST, site=("gusev",), camera=("mer-navcam",), range_m=(1.6, 40.0)),
+            Conditions("*: rocks*10 m", MAST, site=("gusev",), camera=("research-pancam",), range_m=(5.0, 10.0)),
+            Conditions("*: rocks*40 m", MAST, site=("gusev",), camera=("research-pancam",), range_m=(5.0, 40.0)),
+        ),
+    ),
 )

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions, TrackSeed
+from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.cameras import camera_optics
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
@@ -137,4 +138,15 @@ def _read_column(name: str) -> Callable[[dict[str, Scalar]], float]:
     return lambda row: float(row[name])
 
 
-CHECKS = (Check("landing", "Landing", check_accuracy),)
+#: Dispersions of `draw_exact_parameters`.
+_CONDITIONS = Conditions(
+    "*",
+    ("hda",),
+    site=SITES,
+    camera=("xc-55",),
+    sun_elevation_deg=(30.0, 65.0),
+    slope_deg=(2.0, 6.0),
+    optical_depth=(0.35, 0.35),
+    range_m=(8.0, 15.0),
+)
+CHECKS = (Check("landing", "Landing", check_accuracy, conditions=(_CONDITIONS,)),)

@@ -14,7 +14,18 @@ from benchmarks.validation.limits import find_limit
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.raycast import Ground, cast_triangles
 from benchmarks.validation.records import Check, Measure
-from benchmarks.validation.scenes import cameras, descent_view, ground_view, renderer, rock_view
+from benchmarks.validation.scenes import (
+    CAMERA_CONDITIONS,
+    DESCENT,
+    MAST,
+    cameras,
+    descent_conditions,
+    descent_view,
+    ground_view,
+    renderer,
+    rock_view,
+)
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import CloudLayer, CloudParameters, DustySky, Photometry, PixelRays, Scene, Sun, Texture
@@ -293,10 +304,35 @@ def run_sun(quick: bool) -> Iterator[Measure]:
     yield Measure(claim, max(flux_errors), "", find_limit(claim), "the same images")
 
 
+_SUN_10, _SUN_20, _SUN_30 = (10.0, 10.0), (20.0, 20.0), (30.0, 30.0)
+_PISGAH = descent_conditions("*pisgah*20 deg", "pisgah", 2000.0, 20.0)
+_KELSO = descent_conditions("*kelso*20 deg", "kelso", 1000.0, 20.0)
+_RIPPLES = Conditions("*ripples*20 deg", MAST, site=("gusev",), sun_elevation_deg=_SUN_20, range_m=(1.6, 40.0))
 CHECKS = (
-    Check("opposition", "Light", run_opposition),
-    Check("shadows", "Light", run_shadows),
+    Check("opposition", "Light", run_opposition, conditions=CAMERA_CONDITIONS),
+    Check(
+        "shadows",
+        "Light",
+        run_shadows,
+        conditions=(
+            *(
+                item
+                for ground in (_PISGAH, _KELSO, _RIPPLES)
+                for item in (
+                    ground,
+                    replace(ground, rows=ground.rows.replace("20 deg", "10 deg"), sun_elevation_deg=_SUN_10),
+                )
+            ),
+            Conditions("*rocks*30 deg", MAST, site=("gusev",), sun_elevation_deg=_SUN_30, range_m=(5.0, 40.0)),
+        ),
+    ),
+    # flat ground without shadows: no evidence on the light of a terrain
     Check("reflectance", "Light", run_reflectance),
-    Check("clouds", "Light", run_clouds),
-    Check("sun", "Light", run_sun),
+    Check(
+        "clouds",
+        "Light",
+        run_clouds,
+        conditions=(Conditions("*", DESCENT, sun_elevation_deg=(45.0, 45.0), range_m=(2000.0, 2000.0)),),
+    ),
+    Check("sun", "Light", run_sun, conditions=(Conditions("*", MAST, sun_elevation_deg=(5.0, 16.0)),)),
 )

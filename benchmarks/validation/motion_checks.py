@@ -11,7 +11,17 @@ from benchmarks.validation.estimators import PATCH
 from benchmarks.validation.limits import find_limit
 from benchmarks.validation.motion import STEPS_PX, Motion, View, measure, render, supersample
 from benchmarks.validation.records import Check, Measure
-from benchmarks.validation.scenes import descent_view, renderer, rock_view, tile_view
+from benchmarks.validation.scenes import (
+    DESCENT,
+    FLOWN_CAMERA,
+    MAST,
+    descent_conditions,
+    descent_view,
+    renderer,
+    rock_view,
+    tile_view,
+)
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
@@ -26,6 +36,8 @@ DISTANCES_M = (10.0, 5.0, 2.0)
 #: Distances at which the image contains the outline of the rock.
 OUTLINE_DISTANCES_M = (10.0, 5.0)
 ROCK_SITE = "gusev"
+#: Elevation of the sun in all views.
+SUN_DEG = 40.0
 #: Size of descent images, with 256 patches of 31 x 31.
 DESCENT_SIZE = (512, 512)
 #: Size of control images (210 patches), and samples per pixel and axis (256 samples per pixel).
@@ -172,9 +184,49 @@ def run_edges(quick: bool) -> Iterator[Measure]:
         )
 
 
+_ROCKS = Conditions(
+    "*", MAST, site=(ROCK_SITE,), camera=("research-pancam",), sun_elevation_deg=(SUN_DEG, SUN_DEG), range_m=(2.0, 10.0)
+)
 CHECKS = (
-    Check("edges", "Motion of images", run_edges),
-    Check("motion", "Motion of images", run_motion),
-    Check("motion-tile", "Motion of images", run_tile),
-    Check("motion-control", "Motion of images", run_control),
+    Check("edges", "Motion of images", run_edges, conditions=(replace(_ROCKS, range_m=(5.0, 10.0)),)),
+    Check(
+        "motion",
+        "Motion of images",
+        run_motion,
+        conditions=(
+            *(
+                descent_conditions(f"*, {name} from 2 km", name, DESCENT_HEIGHT_M, SUN_DEG)
+                for name in ("pisgah", "kelso", "ivanpah", "gusev", "meridiani")
+            ),
+            *(
+                replace(_ROCKS, rows=f"*{rows}", range_m=(d, d))
+                for rows, d in (("at 10 m", 10.0), ("large rock, 10 m", 10.0), ("at 5 m", 5.0), ("at 2 m", 2.0))
+            ),
+            _ROCKS,
+        ),
+    ),
+    Check(
+        "motion-tile",
+        "Motion of images",
+        run_tile,
+        conditions=(
+            Conditions(
+                "*",
+                DESCENT,
+                site=("HiRISE tile in Gale",),
+                camera=(FLOWN_CAMERA,),
+                sun_elevation_deg=(SUN_DEG, SUN_DEG),
+                range_m=(TILE_HEIGHT_M, TILE_HEIGHT_M),
+            ),
+        ),
+    ),
+    Check(
+        "motion-control",
+        "Motion of images",
+        run_control,
+        conditions=(
+            descent_conditions("*gusev*", "gusev", DESCENT_HEIGHT_M, SUN_DEG),
+            replace(_ROCKS, range_m=(5.0, 5.0)),
+        ),
+    ),
 )

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from marsyard.reports.validation_rows import Conditions
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -53,9 +55,12 @@ class Check:
         Function that yields the measurements; its argument `quick` selects fewer samples (with the same limits).
     method_columns
         Headings of the last columns of its table; `Measure.how` contains a cell for each, separated by " | ".
+    conditions
+        Conditions in which its rows are checked; the first whose pattern matches the claim of a row applies to it.
     """
 
     name: str
     section: str
     run: Callable[[bool], Iterator[Measure]]
     method_columns: tuple[str, ...] = ("method",)
+    conditions: tuple[Conditions, ...] = ()

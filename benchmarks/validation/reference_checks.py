@@ -19,7 +19,7 @@ from scipy import ndimage
 from benchmarks.validation.light_checks import FLAT_ALBEDO, make_uniform
 from benchmarks.validation.motion import View, render
 from benchmarks.validation.records import Check, Measure
-from benchmarks.validation.scenes import descent_view, renderer
+from benchmarks.validation.scenes import descent_conditions, descent_view, renderer
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Sun
 from marsyard.sim.terrain import Surface
@@ -134,4 +134,14 @@ def run_reference(quick: bool) -> Iterator[Measure]:
         yield from _compare(name, descent_view(site, height_m, size), sun)
 
 
-CHECKS = (Check("reference", "Independent renderer", run_reference),)
+CHECKS = (
+    Check(
+        "reference",
+        "Independent renderer",
+        run_reference,
+        conditions=tuple(
+            descent_conditions(f"*{name} from 300 m, sun at {sun:g} deg", name, 300.0, sun)
+            for name, sun in (("gusev", 35.0), ("pisgah", 20.0), ("pisgah", 10.0))
+        ),
+    ),
+)

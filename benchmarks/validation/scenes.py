@@ -12,6 +12,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from benchmarks.validation.motion import View
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.camera import Cahv, Cahvore, CameraModel, read_camera
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, Renderer, Scene, Sun, Texture, process_renderer
@@ -34,6 +35,18 @@ DESCENT_POSITION = (1000.0, 1200.0)
 ROCK_POSITION, ROCK_DIAMETER_M, MAST_M = (50.0, 50.0), 2.5, 1.6
 #: Lambertian ground without skylight.
 LAMBERTIAN = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.0)
+#: Systems whose images are taken in a descent, from a mast, and from a helicopter or a lander near the ground.
+DESCENT, MAST, LANDING = ("dimes", "fieldtest", "localisation"), ("vtt",), ("hda",)
+#: Conditions of rows on one of the `cameras`, whose name ends the claim or precedes the backend.
+CAMERA_CONDITIONS = (
+    Conditions("*MER descent camera*", (*DESCENT, *LANDING), camera=("mer-descent-flown",)),
+    Conditions("*MER navcam*", MAST, camera=("mer-navcam",)),
+    Conditions("*hazcam*", MAST),
+    Conditions("*research pancam*", MAST, camera=("research-pancam",)),
+    Conditions("*Sony XC-55*", LANDING, camera=("xc-55",)),
+)
+#: Camera of all descent views.
+FLOWN_CAMERA = "mer-descent-flown"
 OVERHEAD_SUN = Sun(np.array([0.0, 0.0, 1.0]))
 
 
@@ -223,6 +236,20 @@ def rock_view(name: str, distance_m: float, size: tuple[int, int] | None = None)
     # the camera points at 0.3 diameters above the ground, 0.3 diameters in front of the rock's centre
     pitch_rad = np.arctan2(MAST_M - 0.3 * ROCK_DIAMETER_M, ground_distance_m - 0.3 * ROCK_DIAMETER_M)
     return View(scene, camera, rigid(Rotation.from_euler("y", pitch_rad), eye))
+
+
+def descent_conditions(rows: str, name: str, height_m: float, sun_deg: float | None = None) -> Conditions:
+    """Conditions of rows with views of a site from a height, without haze; `sun_deg` is the sun's elevation."""
+    sun, slope = None if sun_deg is None else (sun_deg, sun_deg), site(name).terrain("descent").rms_slope_deg
+    return Conditions(
+        rows,
+        DESCENT,
+        site=(name,),
+        camera=(FLOWN_CAMERA,),
+        sun_elevation_deg=sun,
+        slope_deg=(slope, slope),
+        range_m=(height_m, height_m),
+    )
 
 
 def ground_view(name: str) -> View:

@@ -7,6 +7,7 @@ proportional to the disparity error and the square of the range.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count, islice
 from typing import Any
 
@@ -16,6 +17,7 @@ from benchmarks.validation.records import Check, Measure
 from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.closed_loop import RoverRun, run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
@@ -163,4 +165,27 @@ def _expected_range_error_m(run: RoverRun, disparity_error_px: float) -> float:
     return stereo_range_error_m(run.stops[0].range_m, disparity_px_m(rig.left, rig.right), 1.0, disparity_error_px)
 
 
-CHECKS = (Check("tracking-drift", "Tracking", check_drift), Check("tracking-stereo", "Tracking", check_stereo))
+#: The dispersions of vtt-montecarlo and vtt-accuracy.
+_CONDITIONS = Conditions(
+    "*",
+    ("vtt",),
+    site=("mars-yard",),
+    camera=CAMERAS,
+    sun_elevation_deg=(25.0, 65.0),
+    slope_deg=(2.0, 2.0),
+    optical_depth=(0.2, 0.6),
+    range_m=(2.0, 10.0),
+)
+
+
+def _by_camera(conditions: Conditions) -> tuple[Conditions, ...]:
+    """Conditions of the rows on each camera, then of those on both."""
+    return (*(replace(conditions, rows=f"*{camera}", camera=(camera,)) for camera in CAMERAS), conditions)
+
+
+CHECKS = (
+    Check("tracking-drift", "Tracking", check_drift, conditions=_by_camera(_CONDITIONS)),
+    Check(
+        "tracking-stereo", "Tracking", check_stereo, conditions=_by_camera(replace(_CONDITIONS, range_m=(10.0, 10.0)))
+    ),
+)

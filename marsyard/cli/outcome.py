@@ -71,6 +71,7 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
         lines.append(multiplicity)
     if not any(verdict.withheld_status for verdict in verdicts):
         lines.append(f"evidence: {evaluation.evidence.text}")
+    lines += [f"validity: {sentence}" for sentence in evaluation.validity.sentences]
     if run.unverified:
         lines.append(f"rows: not verified, since {run.unverified}")
     lines.append(f"report: {page}")

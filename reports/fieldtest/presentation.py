@@ -19,6 +19,7 @@ from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import explain
+from marsyard.reports.fits import fit_note
 from marsyard.reports.papers import read_paper
 from marsyard.reports.presentation import Presentation
 from marsyard.reports.rates import CONFIDENCE
@@ -72,7 +73,7 @@ def field_test_section(subject: Subject) -> Section | None:
             "Largest error": lambda cell: number(cell["largest"]),
         },
     )
-    blocks = [Block(grid=grid, note=_field_note(cells))]
+    blocks = [Block(grid=grid, note=f"{_field_note(cells)} {fit_note('dimes-fieldtest')}")]
     svg_figures = scatter_figures(subject)
     if svg_figures:
         note = ""

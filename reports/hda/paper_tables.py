@@ -15,6 +15,7 @@ from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, collect_values, flag_rate, rate_block
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import cumulative_figure
+from marsyard.reports.fits import fit_note
 from marsyard.reports.hda.sections import INTERVAL_NOTE, MIN_CURVE_VALUES, PAPER, drop_empty_columns, landing_rows
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
@@ -86,7 +87,9 @@ def _create_table_2_block(landings: pd.DataFrame) -> Block:
         "paper_m": {str(run["run"]): run["error_m"] for run in runs},
     }
     grid = drop_empty_columns(Grid(head, rows))
-    return Block(heading="Distances as in Table II", grid=grid, note=_TOUCHDOWN_NOTE, data=data)
+    return Block(
+        heading="Distances as in Table II", grid=grid, note=f"{_TOUCHDOWN_NOTE} {fit_note('hda-table-2')}", data=data
+    )
 
 
 def touchdown_section(subject: Subject) -> Section | None:

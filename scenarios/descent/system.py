@@ -38,4 +38,12 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.dimes.presentation:DIMES",
+    conditions={
+        "site": ("terrain.source.dtm|site",),
+        "camera": ("camera.model.file|=mer-descent-flown",),
+        "sun_elevation_deg": ("sun_elevation_deg",),
+        "slope_deg": ("terrain.rms_slope_deg|site.descent.rms_slope_deg",),
+        "optical_depth": ("dust_opacity|site.environment.optical_depth",),
+        "range_m": ("altitude_[0-9]*_m",),
+    },
 )

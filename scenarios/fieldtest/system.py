@@ -15,4 +15,12 @@ SYSTEM = System(
     folder=Path(__file__).resolve().parent,
     columns={"fieldtest": "marsyard.scenarios.fieldtest.columns:COLUMNS"},
     report="marsyard.reports.fieldtest.presentation:FIELD_TEST",
+    conditions={
+        "site": ("site",),
+        "camera": ("=mer-descent-field",),
+        "sun_elevation_deg": ("sun_elevation_deg",),
+        "slope_deg": ("site.descent.rms_slope_deg",),
+        "optical_depth": ("site.environment.optical_depth",),
+        "range_m": ("altitude_[0-9]*_m",),
+    },
 )

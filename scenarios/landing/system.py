@@ -32,4 +32,12 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.hda.presentation:HDA",
+    conditions={
+        "site": ("terrain.source.dtm|site",),
+        "camera": ("camera.file|camera|=xc-55",),
+        "sun_elevation_deg": ("sun_elevation_deg",),
+        "slope_deg": ("terrain.rms_slope_deg|site.ground.rms_slope_deg",),
+        "optical_depth": ("dust_opacity|site.environment.optical_depth",),
+        "range_m": ("range_m",),
+    },
 )

@@ -27,4 +27,13 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.localisation.presentation:LOCALISATION",
+    conditions={
+        "site": ("terrain.source.dtm|site",),
+        "camera": ("=lander vision camera",),
+        "sun_elevation_deg": ("sun_elevation_deg",),
+        "slope_deg": ("terrain.rms_slope_deg|site.descent.rms_slope_deg",),
+        "optical_depth": ("dust_opacity|site.environment.optical_depth",),
+        "range_m": ("flight.altitude_start_m|=4200", "altitude_last_m"),
+    },
+    find_site="marsyard.scenarios.localisation.sites:localisation_site",
 )

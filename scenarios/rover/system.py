@@ -42,4 +42,12 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.vtt.presentation:VTT",
+    conditions={
+        "site": ("site",),
+        "camera": ("camera",),
+        "sun_elevation_deg": ("sun_elevation_deg",),
+        "slope_deg": ("site.ground.rms_slope_deg",),
+        "optical_depth": ("world.dust_opacity|site.environment.optical_depth",),
+        "range_m": ("range_start_m", "range_end_m"),
+    },
 )

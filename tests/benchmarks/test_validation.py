@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,15 @@ import pytest
 from benchmarks.localisation import STAGES
 from benchmarks.stages import DESCENT_STAGES
 from benchmarks.threshold_derivation import ThresholdInputs, draw_correct_track_errors
-from benchmarks.validation import dimes_checks, landing_checks, tracking_checks
+from benchmarks.validation import dimes_checks, document, landing_checks, tracking_checks
+from benchmarks.validation.__main__ import CHECKS
 from benchmarks.validation.document import RESULTS
 from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Measure
+from marsyard.reports.validation_rows import VALIDATION_FILE
+from marsyard.scenarios.systems import systems
+from marsyard.sim.sensor.presets import PRESETS
+from marsyard.sim.terrain import sites
 
 NAN = float("nan")
 #: Reasons for limits of more than four times the measured value, by the beginning of the claim.
@@ -140,3 +146,45 @@ def test_profiled_stages_name_existing_functions() -> None:
         paths = [path for path in root.glob("[sac]*/**/*.py") if path.as_posix().endswith(f"/{file}")]
         texts = [path.read_text() for path in paths]
         assert any(f"def {function}(" in text for text in texts), (file, function)
+
+
+def test_packaged_rows_and_page_are_those_of_the_stored_results(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    published = VALIDATION_FILE.read_bytes(), document.DOCUMENT.read_bytes()
+    monkeypatch.setattr(document, "VALIDATION_FILE", tmp_path / "validation.json")
+    monkeypatch.setattr(document, "DOCUMENT", tmp_path / "validation.md")
+    document.write_pages(CHECKS, document.read_stored())
+    written = (tmp_path / "validation.json").read_bytes(), (tmp_path / "validation.md").read_bytes()
+    assert written == published
+
+
+def test_rows_on_images_have_the_conditions_of_their_check() -> None:
+    sections = {"Motion of images", "Light", "Independent renderer", "Images from Mars", "Tracking", "Landing"}
+    without = [
+        row.claim
+        for name, check in document.create_rows(CHECKS, document.read_stored()).items()
+        for row in check.rows
+        # reflectance: flat ground; opposition: only cameras that are no preset have no conditions
+        if check.section in sections and name not in ("reflectance", "opposition") and not row.conditions.quantities
+    ]
+    assert without == []
+
+
+def test_conditions_name_systems_sites_and_presets_that_exist() -> None:
+    rows = [row for check in document.create_rows(CHECKS, document.read_stored()).values() for row in check.rows]
+    conditions = [row.conditions for row in rows]
+    assert {name for item in conditions for name in item.systems or ()} <= {system.name for system in systems()}
+    assert {name for item in conditions for name in item.camera or ()} <= set(PRESETS)
+    assert {name for item in conditions for name in item.site or ()} - set(sites()) == {"HiRISE tile in Gale"}
+
+
+def test_every_pattern_of_conditions_matches_a_row() -> None:
+    stored = document.read_stored()
+    unmatched = [
+        (check.name, item.rows)
+        for check in CHECKS
+        for item in check.conditions
+        if not any(fnmatchcase(row["claim"], item.rows) for row in stored[check.name]["measures"])
+    ]
+    assert unmatched == []
