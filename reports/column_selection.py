@@ -76,13 +76,13 @@ def driver_columns(
 
 def distinct_columns(frame: pd.DataFrame, names: Sequence[str]) -> list[str]:
     """Remove sampled values that equal another column; their names are paths of parameters."""
-    others = [name for name in names if "." not in name]
-    known = [numbers(frame, name) for name in others]
-    is_repeated = (
-        "." in name and any(np.allclose(numbers(frame, name), values, rtol=1e-9, equal_nan=True) for values in known)
+    others = [numbers(frame, name) for name in names if "." not in name]
+    known = np.array(others).reshape(len(others), len(frame))
+    return [
+        name
         for name in names
-    )
-    return [name for name, repeated in zip(names, is_repeated, strict=True) if not repeated]
+        if "." not in name or not np.isclose(known, numbers(frame, name), rtol=1e-9, equal_nan=True).all(axis=1).any()
+    ]
 
 
 def category_column(frame: pd.DataFrame) -> str | None:
