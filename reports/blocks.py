@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from marsyard.reports import rates
 from marsyard.reports.column_values import numbers
-from marsyard.reports.figures import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
+from marsyard.reports.plots import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
 from marsyard.reports.rates import CONFIDENCE, CaseFraction, PooledRate, finite_values, varies
 from marsyard.reports.section import Block, Grid, svg_figure
 from marsyard.reports.statistics.drivers import MIN_CASES, estimate_driver

@@ -54,6 +54,10 @@ def explorer_data(
 
     In a large campaign, `run.frame` contains all columns of the first cases, and `run.all_cases` some columns of all
     cases; the other columns of the other cases are missing values.
+
+    Keys of `templates/explorer.js`: values of each point by column (`columns`), indices of columns (`metric`; `parts`,
+    the components of an error; `axes`, x and y of the two plots), indices of outcomes (`outcome`), and numbers of
+    points and of all cases (`shown`, `all`).
     """
     first_cases, all_cases = run.frame, run.all_cases
     components = axis_columns(metric, [str(name) for name in first_cases.columns])[:2]
@@ -81,13 +85,13 @@ def explorer_data(
         return [float(f"{value:.4g}") if math.isfinite(value) else None for value in values]
 
     metric_index, other = names.index(metric), names.index((drivers or [metric])[0])
-    pairs = [names.index(name) for name in components] if len(components) == 2 else [other, metric_index]
+    first_axes = [names.index(name) for name in components] if len(components) == 2 else [other, metric_index]
     return {
         "labels": [label(name) for name in names],
         "columns": [column_values(name) for name in names],
         "metric": metric_index,
         "parts": [names.index(component) for component in components] if len(components) == 2 else [],
-        "axes": [pairs, [other, metric_index]],
+        "axes": [first_axes, [other, metric_index]],
         "requirements": [
             {
                 "name": item.name,

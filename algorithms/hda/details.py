@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.hda.hazards import ElevationMap, HazardMaps
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.hazards import HazardMaps
 from marsyard.algorithms.hda.motion import CameraMotion, CameraView, Views, points_at_depth, undistort
 from marsyard.algorithms.hda.structure import Matches
 from marsyard.algorithms.hda.tracking import Tracks

@@ -14,6 +14,7 @@ import numpy as np
 from marsyard.algorithms.arrays import Points2, Points3, Vector3
 from marsyard.algorithms.hda import footprints, hazards
 from marsyard.algorithms.hda.details import HdaDetails, MappedGround
+from marsyard.algorithms.hda.elevation import elevation_map, fill_small_holes
 from marsyard.algorithms.hda.motion import (
     CameraMotion,
     LandingScene,
@@ -158,11 +159,11 @@ def map_ground(
     first = scene.views[0]
     to_surface = surface_from_camera(up_direction(first, scene.up_camera, points_camera, options))
     points = to_surface.apply(points_camera)
-    elevation = hazards.elevation_map(points)
+    elevation = elevation_map(points)
     if elevation is None:
         return None
     # no hazard at the lander's limit fits into a filled hole
-    elevation = hazards.fill_small_holes(elevation, options.narrowest_hazard * options.max_roughness_m)
+    elevation = fill_small_holes(elevation, options.narrowest_hazard * options.max_roughness_m)
     maps = hazards.hazard_maps(elevation, options)
     if options.check_footprints:
         maps = replace(maps, safety=footprints.classify_footprints(elevation, resolution, options))

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int, UInt8
 
-from marsyard.algorithms.hda.hazards import ElevationMap, Safety, dilate
+from marsyard.algorithms.hda.elevation import ElevationMap
+from marsyard.algorithms.hda.hazards import Safety
 from marsyard.algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.hda.morphology import dilate
 from marsyard.algorithms.hda.motion import CameraMotion
 from marsyard.algorithms.hda.options import HdaOptions
 

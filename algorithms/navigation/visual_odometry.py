@@ -64,7 +64,7 @@ class VisualOdometryOutcome(Enum):
 
 
 @dataclass(frozen=True)
-class VisualOdometry:
+class MotionEstimate:
     """Result of `estimate_motion`.
 
     - first_from_second: pose of the second rover frame in the first; None unless the outcome is CONVERGED
@@ -91,7 +91,7 @@ def estimate_motion(
     second: StereoMeasurement,
     predicted: RigidTransform,
     options: VisualOdometryOptions | None = None,
-) -> VisualOdometry:
+) -> MotionEstimate:
     """Estimate the rover's motion between two stereo pairs.
 
     `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
@@ -112,7 +112,7 @@ def estimate_motion(
     valid &= is_matched
     count = int(np.count_nonzero(valid))
     if count < options.min_features:
-        return VisualOdometry(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
+        return MotionEstimate(VisualOdometryOutcome.TOO_FEW_FEATURES, None, count, 0, float("nan"))
     pixels, disparities, points = pixels[valid], disparities[valid], points[valid]
     second_pixels, second_disparities = second_pixels[valid], second_disparities[valid]
     second_points = second_pair.triangulate(second_pixels, second_disparities)
@@ -124,7 +124,7 @@ def estimate_motion(
     motion, sigma_m = predicted, float("nan")
     for _ in range(_ADJUSTMENTS):
         if np.count_nonzero(inliers) < options.min_inliers:
-            return VisualOdometry(
+            return MotionEstimate(
                 VisualOdometryOutcome.TOO_FEW_INLIERS, None, count, int(np.count_nonzero(inliers)), float("nan")
             )
         whitening = _compute_whitening(covariances, motion)
@@ -135,7 +135,7 @@ def estimate_motion(
     inlier_count = int(np.count_nonzero(inliers))
     outcome = _check_motion(motion, sigma_m, predicted, options)
     is_valid = outcome is VisualOdometryOutcome.CONVERGED
-    return VisualOdometry(outcome, motion if is_valid else None, count, inlier_count, sigma_m)
+    return MotionEstimate(outcome, motion if is_valid else None, count, inlier_count, sigma_m)
 
 
 def _detect_features(pair: RectifiedPair, options: VisualOdometryOptions) -> Points2:

@@ -1,4 +1,7 @@
-"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits)."""
+"""Model of a campaign file (scenario, cases, parameters, dispersions, requirements, limits), read from TOML.
+
+Errors of the file become a `DefinitionError` with a sentence for each problem.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from functools import reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -17,9 +20,6 @@ from marsyard.campaigns.sampling.design import Design
 from marsyard.campaigns.sampling.dispersions import BUILT_IN, AnyDispersion, GridDispersion, Normal
 from marsyard.sim.files import check_regular
 from marsyard.sim.parameters import Parameters, list_alternatives, list_models
-
-if TYPE_CHECKING:
-    pass
 
 Model = TypeVar("Model", bound=BaseModel)
 #: Location of a key in nested tables and lists: names and indices.

@@ -286,16 +286,16 @@ def _run_batch_isolated(
     return time.perf_counter() - start_s, results
 
 
-def _local_executor(executors: int) -> LocalExecutor:
+def _local_executor(executor_count: int) -> LocalExecutor:
     """Return the executor of this Dask thread; a new one if more executors share the memory of the machine now."""
-    workers: LocalExecutor | None = getattr(_thread_state, "workers", None)
-    if workers is not None and executors <= _thread_state.executors:
-        return workers
-    if workers is not None:
-        workers.stop(kill=False)
+    executor: LocalExecutor | None = getattr(_thread_state, "executor", None)
+    if executor is not None and executor_count <= _thread_state.executor_count:
+        return executor
+    if executor is not None:
+        executor.stop(kill=False)
     # Dask's workers are daemons of `multiprocessing`, which must not have children. The kernel ends the children
     # together with the thread that started them.
     multiprocessing.process.current_process()._config["daemon"] = False  # type: ignore[attr-defined]
-    workers = LocalExecutor(1, executors)
-    _thread_state.workers, _thread_state.executors = workers, executors
-    return workers
+    executor = LocalExecutor(1, executor_count)
+    _thread_state.executor, _thread_state.executor_count = executor, executor_count
+    return executor

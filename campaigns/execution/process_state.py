@@ -2,6 +2,7 @@
 
 After each case the state is compared with a reference. If it differs, the difference is reported, and the next case
 runs in a fresh worker. The global random generators of Python, NumPy and OpenCV are seeded before each case.
+The worker also compares the files that it needs (`list_open_files`) after each case.
 """
 
 from __future__ import annotations

@@ -166,6 +166,7 @@ def _render(template: str, **context: Any) -> str:
     return page_environment().get_template(template).render(context)
 
 
+#: First and last characters of the lists of cases, and of a case, in `templates/report.html.j2` and its parts.
 _LISTS = '<article class="lists">', "</article>"
 _CASE = '<article id="case-', "</article>"
 

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from marsyard.reports import section
 from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
-from marsyard.reports.figures import RateLine, draw_rates
 from marsyard.reports.hda.sections import PAPER, drop_empty_columns, landing_rows
+from marsyard.reports.plots import RateLine, draw_rates
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
 from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, percent

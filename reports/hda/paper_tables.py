@@ -14,9 +14,9 @@ import pandas as pd
 from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, collect_values, flag_rate, rate_block
 from marsyard.reports.column_values import numbers
-from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.fits import fit_note
 from marsyard.reports.hda.sections import INTERVAL_NOTE, MIN_CURVE_VALUES, PAPER, drop_empty_columns, landing_rows
+from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
 from marsyard.reports.statistics.samples import mean_interval

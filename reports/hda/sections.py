@@ -26,8 +26,8 @@ from marsyard.reports.blocks import (
     scatter_block,
 )
 from marsyard.reports.column_values import numbers
-from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.papers import read_paper
+from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
 from marsyard.reports.statistics.drivers import MIN_CASES

@@ -20,8 +20,8 @@ import pandas as pd
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
-from marsyard.reports.figures import RateLine, rate_figure
 from marsyard.reports.papers import paper_section, read_paper
+from marsyard.reports.plots import RateLine, rate_figure
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
 from marsyard.reports.stored import table

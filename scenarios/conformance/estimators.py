@@ -1,4 +1,4 @@
-"""Conformance checks of estimators; each task declares its measurements and the rules for its answers (`Protocol`)."""
+"""Conformance checks of estimators; each task declares measurements, and rules for its answers (`SuiteRules`)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Unusual:
 
 
 @dataclass(frozen=True)
-class Protocol:
+class SuiteRules:
     """Measurements of a task, and the rules for its answers.
 
     - measurements: creates the measurements of an ordinary case
@@ -64,7 +64,7 @@ class Protocol:
 class EstimatorSuite(Suite):
     """Suite of an estimator that receives all measurements at once."""
 
-    protocol: Protocol
+    protocol: SuiteRules
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
@@ -172,7 +172,7 @@ def _first(number: int) -> DescentMeasurements:
 
 _NO_TEXTURE = "they contain no texture"
 _stream = partial(inputs.inertial_descent, _STREAM_LENGTH)
-VELOCITY = Protocol(
+VELOCITY = SuiteRules(
     measurements=inputs.descent,
     check=lambda answer, measurements: check_velocity_answer(answer, measurements.tags_s),
     is_valid=lambda estimate: estimate.outcome is VelocityOutcome.VALID,
@@ -196,7 +196,7 @@ STREAM = replace(
     },
     interrupted=lambda: inputs.make_noisy(_stream()),
 )
-LANDING = Protocol(
+LANDING = SuiteRules(
     measurements=inputs.landing,
     check=lambda answer, _: check_site(answer),
     is_valid=lambda estimate: estimate.outcome.converged,

@@ -38,6 +38,7 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.dimes.presentation:DIMES",
+    # sources of values, in the notation of `System.conditions`
     conditions={
         "site": ("terrain.source.dtm|site",),
         "camera": ("camera.model.file|=mer-descent-flown",),

@@ -15,6 +15,7 @@ SYSTEM = System(
     folder=Path(__file__).resolve().parent,
     columns={"fieldtest": "marsyard.scenarios.fieldtest.columns:COLUMNS"},
     report="marsyard.reports.fieldtest.presentation:FIELD_TEST",
+    # sources of values, in the notation of `System.conditions`
     conditions={
         "site": ("site",),
         "camera": ("=mer-descent-field",),

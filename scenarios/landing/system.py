@@ -32,6 +32,7 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.hda.presentation:HDA",
+    # sources of values, in the notation of `System.conditions`
     conditions={
         "site": ("terrain.source.dtm|site",),
         "camera": ("camera.file|camera|=xc-55",),

@@ -2,7 +2,7 @@
 
 A position estimator follows the interface `marsyard.algorithms.localisation.interface.PositionEstimator`: it receives
 the measurements of a descent one by one, and answers each image, and the end of the descent, with a position.
-`StreamSuite` runs the checks that all streams have in common; the `Protocol` of this module gives it the descents
+`StreamSuite` runs the checks that all streams have in common; the `SuiteRules` of this module gives it the descents
 (`conformance_inputs`: level, textured ground, without a renderer), and the check of their answers.
 `position_suite(...)` creates the suite for one estimator (`marsyard conformance`).
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.scenarios.conformance.checks import BreachError
-from marsyard.scenarios.conformance.estimators import Protocol, StreamSuite, Unusual, unusual_images
+from marsyard.scenarios.conformance.estimators import StreamSuite, SuiteRules, Unusual, unusual_images
 from marsyard.scenarios.localisation import conformance_inputs as inputs
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.scenarios.streamed import StreamAnswers
@@ -51,7 +51,7 @@ def describe_answers(answers: StreamAnswers[PositionEstimate]) -> str:
 
 
 #: The descents of the suite, and the rules for their answers.
-POSITION = Protocol(
+POSITION = SuiteRules(
     measurements=inputs.ordinary_descent,
     check=check_answers,
     is_valid=lambda answers: answers.outcome is PositionOutcome.VALID,

@@ -27,6 +27,7 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.localisation.presentation:LOCALISATION",
+    # sources of values, in the notation of `System.conditions`
     conditions={
         "site": ("terrain.source.dtm|site",),
         "camera": ("=lander vision camera",),

@@ -10,7 +10,7 @@ from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.exchange import POSITION_STREAM
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionEstimator, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.localisation.answer_table import POSITION_FORMAT
+from marsyard.scenarios.localisation.offline_files import POSITION_FORMAT
 from marsyard.scenarios.tasks import Task
 
 LOCALISATION: Task[PositionEstimator, LvsOptions] = Task(

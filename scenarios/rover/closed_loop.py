@@ -22,7 +22,7 @@ from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.exchange import answer_time_s
 from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
 from marsyard.algorithms.navigation.planner import NavigationOutcome
-from marsyard.algorithms.navigation.visual_odometry import VisualOdometry, estimate_motion
+from marsyard.algorithms.navigation.visual_odometry import MotionEstimate, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
 from marsyard.algorithms.vtt.placement import Placement
 from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
@@ -366,7 +366,7 @@ def drive_part(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, co
     first, before = take_odometry_pair(p, run), vehicle.estimated_pose
     drive = vehicle.drive(command, False)
     second = take_odometry_pair(p, run)
-    result: VisualOdometry = estimate_motion(first, second, compose(before.inv(), vehicle.estimated_pose))
+    result: MotionEstimate = estimate_motion(first, second, compose(before.inv(), vehicle.estimated_pose))
     if result.first_from_second is None:
         run.visual_odometry_failures += 1
     else:

@@ -42,6 +42,7 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.vtt.presentation:VTT",
+    # sources of values, in the notation of `System.conditions`
     conditions={
         "site": ("site",),
         "camera": ("camera",),

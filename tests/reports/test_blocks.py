@@ -23,8 +23,8 @@ from marsyard.reports.blocks import (
     scatter_block,
 )
 from marsyard.reports.campaign import section_makers, write_report
-from marsyard.reports.figures import cumulative_figure
 from marsyard.reports.papers import paper_section
+from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.presentation import Presentation, presentations
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.stored import StoredRun

@@ -26,8 +26,8 @@ from marsyard.campaigns.running.export_scoring import (
 )
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.scenarios.input_copies import hash_inputs
-from marsyard.scenarios.localisation.answer_table import POSITION_FORMAT, read_descent
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
+from marsyard.scenarios.localisation.offline_files import POSITION_FORMAT, read_descent
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisedDescent
 from marsyard.scenarios.localisation.task import LOCALISATION

@@ -51,7 +51,7 @@ def _join(estimates: Sequence[PositionEstimate]) -> StreamAnswers[PositionEstima
 
 
 def _refuse(measurements: LocalisationMeasurements) -> StreamAnswers[PositionEstimate]:
-    """Return refusals: an export produces no estimates."""
+    """Return refusals, the answers of a run that only exports the measurements: it produces no estimates."""
     refusal = PositionEstimate(PositionOutcome.NO_COARSE_FIX, float(measurements.increments.times_s[-1]))
     return StreamAnswers((refusal,) * len(measurements.images), refusal)
 

@@ -1,0 +1,102 @@
+"""Elevation map of a landing site from points of the ground (section II.D), and filling of its small holes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from marsyard.algorithms.arrays import Points3, Raster, Vector2
+from marsyard.algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.hda.morphology import dilate, grassfire
+
+#: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
+MIN_WEIGHT = 0.1
+
+
+@dataclass(frozen=True)
+class ElevationMap:
+    """Elevations on a level grid in the surface frame.
+
+    - elevation_m: z at the centre of each cell; NaN if no point is near it. Rows run along -y, columns along x, as in
+      the image.
+    - corner_m: (x, y) of the centre of the first cell (row 0, column 0)
+    - cell_m: Side of a cell
+    """
+
+    elevation_m: Raster
+    corner_m: Vector2
+    cell_m: float
+
+    def positions(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Convert cells (row, column; may be fractional) to positions (x, y), metres."""
+        return np.asarray(self.corner_m + self.cell_m * cells[..., ::-1] * np.array([1.0, -1.0]))
+
+    def cells(self, positions: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+        """Convert positions (x, y), metres, to fractional cells (row, column)."""
+        offsets = (positions - self.corner_m) / self.cell_m * np.array([1.0, -1.0])
+        return np.asarray(offsets[..., ::-1])
+
+
+def elevation_map(points: Points3) -> ElevationMap | None:
+    """Compute the elevation map of points in the surface frame; None if they cover no area.
+
+    The cell side is sqrt(A / N), where A is the area of the horizontal bounding box and N the number of points: about
+    one point per cell. The elevation of a cell is the bilinearly weighted mean of the points around its centre.
+    """
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    extent = high - low
+    cell = float(np.sqrt(extent[0] * extent[1] / len(points)))
+    if not cell > 1e-6 * float(extent.max()):
+        return None
+    columns, rows = (int(count) for count in np.ceil(extent / cell))
+    corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
+    empty = ElevationMap(np.full((rows, columns), np.nan), corner, cell)
+    row, column = empty.cells(points[:, :2]).T
+    sums, weights = kernels.accumulate_bilinear(row, column, points[:, 2], (rows, columns))
+    values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
+    return ElevationMap(values, corner, cell)
+
+
+def fill_small_holes(ground: ElevationMap, width_m: float) -> ElevationMap:
+    """Fill the holes of an elevation map that are too small for a disc of the diameter `width_m`; return the new map.
+
+    The elevation of a cell is interpolated along its row and its column between the nearest known cells, and the two
+    values are averaged with the inverse distances between these cells as weights (section II.D: "bilinear interpolation
+    of point elevation is used to deal with the uneven sampling"). Ground outside the map is unknown: cells with known
+    cells on one side only are not filled.
+    """
+    holes = np.isnan(ground.elevation_m)
+    # a hole of n cells contains a cell at the distance (n + 1) / 2 from the nearest known cell
+    radius_cells = 0.5 * (width_m / ground.cell_m + 1.0)
+    margin = int(np.ceil(2.0 * radius_cells)) + 1
+    padded = np.pad(holes, margin, constant_values=True)
+    # morphological opening: the parts of holes that a disc of this diameter covers
+    wide = dilate(grassfire(~padded) >= radius_cells, radius_cells - 0.5)[margin:-margin, margin:-margin]
+    sums, weights = np.zeros(holes.shape), np.zeros(holes.shape)
+    for values, axis_sums, axis_weights in (
+        (ground.elevation_m, sums, weights),
+        (ground.elevation_m.T, sums.T, weights.T),
+    ):
+        value, gap = _interpolate_rows(values)
+        is_known = np.isfinite(value)
+        axis_sums += np.where(is_known, value, 0.0) / gap
+        axis_weights += is_known / gap
+    filled = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights > 0.0)
+    return replace(ground, elevation_m=np.where(holes & ~wide, filled, ground.elevation_m))
+
+
+def _interpolate_rows(values: Raster) -> tuple[Raster, Raster]:
+    """Interpolate the NaN values of each row linearly; also return the distance between the cells used, at least 1.
+
+    The result is NaN if a row has no known cell on one side.
+    """
+    columns = np.broadcast_to(np.arange(values.shape[1]), values.shape)
+    known = np.isfinite(values)
+    left = np.maximum.accumulate(np.where(known, columns, -1), axis=1)
+    right = np.minimum.accumulate(np.where(known, columns, values.shape[1])[:, ::-1], axis=1)[:, ::-1]
+    inside = (left >= 0) & (right < values.shape[1])
+    low, high = (np.take_along_axis(values, np.where(inside, index, 0), axis=1) for index in (left, right))
+    gap = np.maximum(right - left, 1).astype(np.float64)
+    return np.where(inside, low + (high - low) * (columns - left) / gap, np.nan), gap
