@@ -13,10 +13,12 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange.files import read_counts
+from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
@@ -53,7 +55,10 @@ class StoredImage(Parameters):
 
     - source: path of the image in the ingested folder
     - counts, camera, flat_field: files next to `cases.json`; without a flat field the response is 1
+    - world_from_body_xyzw: None for an image that could not be registered on the map
     - altitude_time_s: time tag of the altitude; None for the image's time
+    - registration_inliers: number of features that agree with the pose, if it was found on the map
+    - bits_per_pixel: size of the source file, for lossy formats
     """
 
     source: str
@@ -63,15 +68,24 @@ class StoredImage(Parameters):
     flat_field: StoredFile | None = None
     time_s: float
     exposure_s: float
-    world_from_body_xyzw: Quaternion
+    world_from_body_xyzw: Quaternion | None = None
     position_m: Vector | None = None
     altitude_m: float | None = None
     altitude_time_s: float | None = None
+    registration_inliers: int | None = None
+    bits_per_pixel: float | None = None
+
+    @property
+    def attitude(self) -> Rotation:
+        """The body's measured attitude in world axes. Raises ValueError for an image that is not registered."""
+        if self.world_from_body_xyzw is None:
+            raise ValueError(f"{self.source}: has no attitude")
+        return Rotation.from_quat(np.array(self.world_from_body_xyzw))
 
     @property
     def pose(self) -> RigidTransform:
         """The body's measured pose in world axes; its position is the origin if no position was measured."""
-        return body_pose(self.position_m or (0.0, 0.0, 0.0), self.world_from_body_xyzw)
+        return rigid(self.attitude, np.array(self.position_m or (0.0, 0.0, 0.0)))
 
 
 class StoredTruth(Parameters):
@@ -108,6 +122,15 @@ class StoredDetector(Parameters):
     rows_summed: int
 
 
+class StoredMap(Parameters):
+    """A map, row 0 in the south: `.npy` files of appearance and elevation next to `cases.json`, and the pixel size."""
+
+    appearance: StoredFile
+    elevation: StoredFile
+    is_level: bool
+    pixel_m: float
+
+
 class StoredCases(Parameters):
     """Contents of `cases.json`."""
 
@@ -118,6 +141,7 @@ class StoredCases(Parameters):
     folder: str
     detector: StoredDetector
     cases: tuple[StoredCase, ...]
+    map: StoredMap | None = None
 
 
 class CasesFile(UserFile):
@@ -213,11 +237,30 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
     return tuple(images)
 
 
+def load_map(cases: CasesFile) -> MapProduct:
+    """Load the map of the cases; its maker states no errors. Raises ValueError if there is none, or it has changed."""
+    stored, folder = cases.stored.map, Path(cases.file).parent
+    if stored is None:
+        raise ValueError(f"{cases.file}: contains no map")
+    appearance, elevation = (
+        np.load(_check_unchanged(folder, file), allow_pickle=False) for file in (stored.appearance, stored.elevation)
+    )
+    return create_map(appearance, elevation, stored.pixel_m)
+
+
+def create_map(
+    appearance: Float32[np.ndarray, "rows columns"], elevation_m: Float32[np.ndarray, "rows columns"], pixel_m: float
+) -> MapProduct:
+    """Create a map whose centre is the origin of the world."""
+    centre = 0.5 * (np.array(appearance.shape[::-1]) - 1.0)
+    return MapProduct(appearance, elevation_m, -pixel_m * centre, pixel_m, 0.0, 0.0, 0.0)
+
+
 def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
     """Return the inputs of a velocity estimator."""
     attitudes, altitudes = [], []
     for item in case.images:
-        attitudes.append(AttitudeMeasurement(Rotation.from_quat(np.array(item.world_from_body_xyzw)), item.time_s))
+        attitudes.append(AttitudeMeasurement(item.attitude, item.time_s))
         time_s = item.time_s if item.altitude_time_s is None else item.altitude_time_s
         altitudes.append(AltitudeMeasurement(math.nan if item.altitude_m is None else item.altitude_m, time_s))
     return DescentMeasurements(
@@ -237,11 +280,10 @@ def body_pose(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
 def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
     """Return the inputs of an estimator of landing sites."""
     first, second = (PoseMeasurement(image.pose, image.time_s) for image in case.images)
-    attitude = Rotation.from_quat(np.array(case.images[0].world_from_body_xyzw))
     return LandingMeasurements(
         images=(images[0], images[1]),
         poses=(first, second),
         slant_range_m=math.nan if case.slant_range_m is None else case.slant_range_m,
-        up_body=attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
+        up_body=case.images[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
         apriori_site_world=np.array(case.site_m, dtype=np.float64),
     )

@@ -1,0 +1,165 @@
+"""Comparison of recorded images with a map, and of rendered images of the same kind with theirs."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from marsyard.algorithms.localisation.interface import MapProduct
+from marsyard.algorithms.localisation.map_sampling import (
+    elevation_at,
+    inside_map,
+    intersect_elevation,
+    map_pixels,
+    sample_raster,
+)
+from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.algorithms.localisation.posed_image import PosedImage
+from marsyard.scenarios.condition_columns import hash_images
+from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.counterpart import Counterpart, CounterpartParameters, render_counterpart
+from marsyard.scenarios.measured.map_matching import MapComparison, compare_with_map
+from marsyard.scenarios.measured.map_registration import extract_features, register_on_map
+from marsyard.scenarios.measured.scenarios import NAN, MeasuredParameters, MeasuredScenario
+from marsyard.sim.camera import CameraModel
+from marsyard.sim.parameters import NonNegative
+from marsyard.sim.streams import Streams
+
+#: Prefix of the columns of the rendered image.
+RENDERED = "rendered."
+#: Standard deviation of the position of a registered image, map pixels (assumed).
+_REGISTRATION_SD_PX = 2.0
+#: Number of pixels along each side at which the poses of a rendered image are compared.
+_COMPARED_POINTS = 20
+
+
+class MapOutcome(Enum):
+    """Outcome of an image over a map."""
+
+    MATCHED = "the landmarks of the map agree on the pose of the image"
+    TOO_FEW_LANDMARKS = "the image has a pose, but too few landmarks of the map agree on it"
+    TOO_FEW_MATCHES = "too few features of the image and of the map agree on a pose"
+
+
+class OverMapParameters(MeasuredParameters):
+    """Parameters of the comparison of images with a map."""
+
+    task_name = "map"
+
+    position_sd_m: Annotated[
+        NonNegative, Field(description="SD of a measured position per axis, m: range of the landmarks' search")
+    ] = 100.0
+    lvs: Annotated[LvsOptions, Field(description="options of the landmarks")] = LvsOptions()
+    rendered: Annotated[CounterpartParameters, Field(description="rendered images")] = CounterpartParameters()
+
+
+class OverMapScenario(MeasuredScenario[OverMapParameters]):
+    """Comparison of a recorded image with a map, and of a rendered image of the same kind with its own map."""
+
+    name = "measured-map"
+    parameters_type = OverMapParameters
+
+    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
+        """Run one case. Without a pose of the recorded image, there is no rendered image."""
+        p = self.check_parameters(parameters)
+        record, (image,) = p.case.images[0], store.load_images(p.cases, p.case)
+        row: dict[str, Scalar] = {"measured_case": p.case.name, "image_hash": hash_images([image.counts])}
+        products: dict[str, object] = {"image_1": image.counts}
+        inliers = record.registration_inliers
+        if record.world_from_body_xyzw is None:
+            row["registration_inliers"] = 0
+            return CaseResult(MapOutcome.TOO_FEW_MATCHES.name, False, row, products)
+        map_product = store.load_map(p.cases)
+        posed = PosedImage.from_detector(image, np.asarray(record.pose.translation), record.attitude)
+        sd_m = p.position_sd_m if inliers is None else _REGISTRATION_SD_PX * map_product.pixel_m
+        comparison = compare_with_map(posed, map_product, sd_m, p.lvs)
+        row |= {"registration_inliers": NAN if inliers is None else inliers, **_describe(comparison, map_product)}
+        products |= _products(comparison, 1)
+        stored_map, detector = p.cases.stored.map, p.cases.stored.detector
+        counterpart = render_counterpart(
+            comparison.image,
+            map_product,
+            detector.full_scale_dn,
+            record.bits_per_pixel,
+            p.rendered,
+            streams,
+            is_level=stored_map is not None and stored_map.is_level,
+        )
+        rendered_row, rendered_products = _compare_counterpart(counterpart, p.lvs)
+        row |= {RENDERED + name: value for name, value in rendered_row.items()}
+        outcome = MapOutcome.MATCHED if len(comparison.landmarks) else MapOutcome.TOO_FEW_LANDMARKS
+        return CaseResult(outcome.name, outcome is MapOutcome.MATCHED, row, products | rendered_products)
+
+
+def _compare_counterpart(counterpart: Counterpart, options: LvsOptions) -> tuple[dict[str, Scalar], dict[str, object]]:
+    """Register a rendered image on its map, like a recorded one, and return the columns and products."""
+    image, map_product = counterpart.image, counterpart.map_product
+    solution = register_on_map(image, map_product, extract_features(map_product))
+    products: dict[str, object] = {"image_2": image.counts}
+    if solution is None:
+        return {"outcome": MapOutcome.TOO_FEW_MATCHES.name, "registration_inliers": 0}, products
+    comparison = compare_with_map(solution.image, map_product, _REGISTRATION_SD_PX * map_product.pixel_m, options)
+    outcome = MapOutcome.MATCHED if len(comparison.landmarks) else MapOutcome.TOO_FEW_LANDMARKS
+    row: dict[str, Scalar] = {
+        "outcome": outcome.name,
+        "registration_inliers": solution.inliers,
+        **_describe(comparison, map_product),
+        "pose_error_px": pose_error_px(
+            comparison.image.world_camera, image.camera.transform(counterpart.world_from_body), map_product
+        ),
+    }
+    return row, products | _products(comparison, 2)
+
+
+def _describe(comparison: MapComparison, map_product: MapProduct) -> dict[str, Scalar]:
+    """Return the columns of an image with a pose."""
+    image = comparison.image
+    camera = image.world_camera
+    height_m = float(camera.c[2]) - elevation_at(map_product, camera.c[:2])
+    return {
+        "height_m": height_m,
+        "off_nadir_deg": float(np.degrees(np.arccos(np.clip(-camera.boresight()[2], -1.0, 1.0)))),
+        "ground_pixel_m": height_m * image.camera.pixel_angle_rad,
+        **comparison.row,
+    }
+
+
+def pose_error_px(estimated: CameraModel, true: CameraModel, map_product: MapProduct) -> float:
+    """Return the median distance between the pixels of ground points by two poses of a camera, world frame; or NaN.
+
+    The points are those that a grid of pixels shows on the map, by the true pose.
+    """
+    columns, rows = (np.linspace(0.0, side - 1.0, _COMPARED_POINTS) for side in true.size)
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
+    origins, directions = true.rays(pixels)
+    start_m = np.full((_COMPARED_POINTS, 1), elevation_at(map_product, true.c[:2]))
+    ground = intersect_elevation(map_product, origins, directions, start_m)
+    inside = inside_map(map_product, ground) & (directions[..., 2] < 0.0)
+    if not inside.any():
+        return NAN
+    points = np.column_stack(
+        [ground[inside], sample_raster(map_product.elevation_m, map_pixels(map_product, ground))[inside]]
+    )
+    first, visible = estimated.project(points)
+    second, _ = true.project(points)
+    return float(np.median(np.linalg.norm(first - second, axis=1)[visible])) if visible.any() else NAN
+
+
+def _products(comparison: MapComparison, number: int) -> dict[str, object]:
+    """Return the map below an image, north up, and the matched landmarks, for figures.
+
+    Columns of the landmarks: (u, v) in the image, (column, row) on that map, and correlation.
+    """
+    footprint, landmarks = comparison.footprint, comparison.landmarks
+    if footprint is None:
+        return {}
+    on_map = comparison.landmark_pixels - footprint.corner
+    on_map[:, 1] = len(footprint.appearance) - 1 - on_map[:, 1]
+    return {
+        f"map_{number}": np.ascontiguousarray(footprint.appearance[::-1]),
+        f"landmarks_{number}": np.column_stack([landmarks.measured_px, on_map, landmarks.scores]),
+    }
