@@ -68,7 +68,7 @@ class OverMapScenario(MeasuredScenario[OverMapParameters]):
         p = self.check_parameters(parameters)
         record, (image,) = p.case.images[0], store.load_images(p.cases, p.case)
         row: dict[str, Scalar] = {"measured_case": p.case.name, "image_hash": hash_images([image.counts])}
-        products: dict[str, object] = {"image_1": image.counts}
+        products: dict[str, object] = {"recorded_image": image.counts}
         inliers = record.registration_inliers
         if record.world_from_body_xyzw is None:
             row["registration_inliers"] = 0
@@ -78,7 +78,7 @@ class OverMapScenario(MeasuredScenario[OverMapParameters]):
         sd_m = p.position_sd_m if inliers is None else _REGISTRATION_SD_PX * map_product.pixel_m
         comparison = compare_with_map(posed, map_product, sd_m, p.lvs)
         row |= {"registration_inliers": NAN if inliers is None else inliers, **_describe(comparison, map_product)}
-        products |= _products(comparison, 1)
+        products |= _products(comparison, "recorded")
         stored_map, detector = p.cases.stored.map, p.cases.stored.detector
         counterpart = render_counterpart(
             comparison.image,
@@ -99,7 +99,7 @@ def _compare_counterpart(counterpart: Counterpart, options: LvsOptions) -> tuple
     """Register a rendered image on its map, like a recorded one, and return the columns and products."""
     image, map_product = counterpart.image, counterpart.map_product
     solution = register_on_map(image, map_product, extract_features(map_product))
-    products: dict[str, object] = {"image_2": image.counts}
+    products: dict[str, object] = {"rendered_image": image.counts}
     if solution is None:
         return {"outcome": MapOutcome.TOO_FEW_MATCHES.name, "registration_inliers": 0}, products
     comparison = compare_with_map(solution.image, map_product, _REGISTRATION_SD_PX * map_product.pixel_m, options)
@@ -112,7 +112,7 @@ def _compare_counterpart(counterpart: Counterpart, options: LvsOptions) -> tuple
             comparison.image.world_camera, image.camera.transform(counterpart.world_from_body), map_product
         ),
     }
-    return row, products | _products(comparison, 2)
+    return row, products | _products(comparison, "rendered")
 
 
 def _describe(comparison: MapComparison, map_product: MapProduct) -> dict[str, Scalar]:
@@ -149,7 +149,7 @@ def pose_error_px(estimated: CameraModel, true: CameraModel, map_product: MapPro
     return float(np.median(np.linalg.norm(first - second, axis=1)[visible])) if visible.any() else NAN
 
 
-def _products(comparison: MapComparison, number: int) -> dict[str, object]:
+def _products(comparison: MapComparison, kind: str) -> dict[str, object]:
     """Return the map below an image, north up, and the matched landmarks, for figures.
 
     Columns of the landmarks: (u, v) in the image, (column, row) on that map, and correlation.
@@ -160,6 +160,6 @@ def _products(comparison: MapComparison, number: int) -> dict[str, object]:
     on_map = comparison.landmark_pixels - footprint.corner
     on_map[:, 1] = len(footprint.appearance) - 1 - on_map[:, 1]
     return {
-        f"map_{number}": np.ascontiguousarray(footprint.appearance[::-1]),
-        f"landmarks_{number}": np.column_stack([landmarks.measured_px, on_map, landmarks.scores]),
+        f"{kind}_map": np.ascontiguousarray(footprint.appearance[::-1]),
+        f"{kind}_landmarks": np.column_stack([landmarks.measured_px, on_map, landmarks.scores]),
     }
