@@ -30,7 +30,9 @@ def _map_columns(prefix: str, whose: str) -> tuple[Column, ...]:
     columns = [
         outcome("registration_inliers", "number of features that agree with the pose, found on the whole map"),
         condition("height_m", "height above the ground"),
-        condition("off_nadir_deg", "angle between optical axis and nadir"),
+        condition(
+            "off_nadir_deg", "angle between optical axis and nadir", f"{prefix.replace('.', ' ')}off-nadir angle"
+        ),
         condition("ground_pixel_m", "size of a pixel on the ground at the nadir"),
     ]
     for name, items in _MATCHERS.items():

@@ -16,6 +16,7 @@ from marsyard.algorithms.dimes.binning import binned_size_for
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import lossy_bits_per_pixel, read_counts, read_flat_field, read_header
+from marsyard.scenarios.measured.label_poses import describe_frame, is_mars_fixed, is_same_world, label_pose, world_from
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
@@ -34,18 +35,9 @@ from marsyard.scenarios.measured.map_registration import add_map, describe_poses
 from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import format_problems
-from marsyard.sim.camera import (
-    CameraModel,
-    FramedCamera,
-    LabelFrame,
-    Pds3Product,
-    mount_looking_down,
-    read_framed_cameras,
-    read_pds3_product,
-)
-from marsyard.sim.camera.label_frames import MARS_FIXED
+from marsyard.sim.camera import CameraModel, LabelFrame, mount_looking_down, read_framed_cameras, read_pds3_product
 from marsyard.sim.camera.pds import is_pds3
-from marsyard.sim.frames import SITE_FROM_WORLD, compose, rigid, world_from_mars_fixed
+from marsyard.sim.frames import compose
 
 #: Columns of a position.
 _POSITION = ("x_m", "y_m", "z_m")
@@ -250,19 +242,19 @@ class _FolderReader:
             attitude, position = self._body_pose(row, rotation, row.vector(*_POSITION))
             if is_map and position is None:
                 raise row.error("x_m, y_m, z_m are empty; map needs them with an attitude")
-        elif is_map and (map_origin is None or not _is_mars_fixed(framed, product)):
+        elif is_map and (map_origin is None or not is_mars_fixed(framed, product)):
             camera = mount_looking_down(camera)
         else:
-            camera, frame, frame_from_body = _label_pose(row, framed, product)
+            camera, frame, frame_from_body = label_pose(row, framed, product)
             world_from_frame = None if first is None else first.world_from_frame
             if world_from_frame is None:
                 origin = np.asarray(frame_from_body.translation if map_origin is None else map_origin)
-                world_from_frame = _world_from(row, frame, origin)
+                world_from_frame = world_from(row, frame, origin)
             world_from_body = compose(world_from_frame, frame_from_body)
             attitude, position = world_from_body.rotation, np.asarray(world_from_body.translation)
-        if first is not None and not _is_same_world(frame, first.frame):
+        if first is not None and not is_same_world(frame, first.frame):
             raise row.error(
-                f"the pose is in {_describe(frame)}, that of the case's first image in {_describe(first.frame)}; "
+                f"the pose is in {describe_frame(frame)}, that of the case's first image in {describe_frame(first.frame)}; "
                 "allowed: one frame in a case"
             )
         up = -1.0 if attitude is None else float(attitude.apply(camera.boresight())[2])
@@ -393,50 +385,6 @@ class _FolderReader:
 def _to_vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def _label_pose(
-    row: ImageRow, framed: FramedCamera, product: Pds3Product | None
-) -> tuple[CameraModel, LabelFrame, RigidTransform]:
-    """Return the camera in the body's frame, and the body's pose in the frame that the label names.
-
-    The body is the rover or, for a model in a frame that the label does not connect to the rover, the camera's centre
-    with the axes of that frame.
-    """
-    camera = framed.camera
-    if not framed.frame.is_vehicle:
-        frame_from_body = rigid(Rotation.identity(), camera.c)
-        return camera.transform(frame_from_body.inv()), framed.frame, frame_from_body
-    if product is None or product.pose is None:
-        raise row.error("qx to qw are empty, and no label contains them")
-    return camera, *product.pose
-
-
-def _is_mars_fixed(framed: FramedCamera, product: Pds3Product | None) -> bool:
-    """Return whether the label contains the pose of the camera, or of its rover, in the Mars-fixed frame."""
-    pose = None if product is None else product.pose
-    return MARS_FIXED in (framed.frame.name, None if pose is None else pose[0].name)
-
-
-def _world_from(row: ImageRow, frame: LabelFrame, origin_m: Float64[np.ndarray, "3"]) -> RigidTransform:
-    """Return the transform to world axes: from a site, or from the Mars-fixed frame with this origin."""
-    if frame.name != MARS_FIXED:
-        return rigid(SITE_FROM_WORLD.inv(), np.zeros(3))
-    try:
-        return world_from_mars_fixed(origin_m)
-    except ValueError as error:
-        raise row.error(f"the label's pose in {frame}: {error}; allowed: metres from the centre of Mars") from error
-
-
-def _is_same_world(frame: LabelFrame | None, first: LabelFrame | None) -> bool:
-    """Return whether positions in both frames have the same origin; that of the table (None) can be a site's."""
-    if frame is None or first is None:
-        return MARS_FIXED not in [known.name for known in (frame, first) if known is not None]
-    return frame.matches(first)
-
-
-def _describe(frame: LabelFrame | None) -> str:
-    return "the table's axes" if frame is None else f"the label's frame {frame}"
 
 
 def _to_quaternion(rotation: Rotation) -> store.Quaternion:

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.features import FeaturePose, MapFeatures, flatten, register_image
@@ -37,6 +38,26 @@ def extract_features(map_product: MapProduct) -> MapFeatures:
     """Extract the features of a map, without large-scale contrast, in proportion to its area."""
     flat = replace(map_product, appearance=flatten(map_product.appearance))
     return MapFeatures.extract(flat, map_product.appearance.size // _FEATURE_AREA_PX)
+
+
+def load_map(cases: store.CasesFile) -> MapProduct:
+    """Load the map of the cases. Raises ValueError if there is none, or if it has changed."""
+    stored, folder = cases.stored.map, Path(cases.file).parent
+    if stored is None:
+        raise ValueError(f"{cases.file}: contains no map")
+    appearance, elevation = (
+        np.load(store.check_unchanged(folder, file), allow_pickle=False)
+        for file in (stored.appearance, stored.elevation)
+    )
+    return create_map(appearance, elevation, stored.pixel_m)
+
+
+def create_map(
+    appearance: Float32[np.ndarray, "rows columns"], elevation_m: Float32[np.ndarray, "rows columns"], pixel_m: float
+) -> MapProduct:
+    """Create a map whose centre is the origin of the world; its maker states no errors."""
+    centre = 0.5 * (np.array(appearance.shape[::-1]) - 1.0)
+    return MapProduct(appearance, elevation_m, -pixel_m * centre, pixel_m, 0.0, 0.0, 0.0)
 
 
 def add_map(source: Path, table: MapTable, cases: store.CasesFile) -> store.StoredCases:
@@ -98,7 +119,7 @@ def _read_map(source: Path, table: MapTable) -> MapProduct:
         elevation = read_elevation(source / table.elevation, (columns, rows))
     # row 0 of a file is the northernmost, row 0 of a map the southernmost
     appearance, elevation = (np.ascontiguousarray(raster[::-1], dtype=np.float32) for raster in (counts, elevation))
-    return store.create_map(appearance, elevation, table.pixel_m)
+    return create_map(appearance, elevation, table.pixel_m)
 
 
 def _register(

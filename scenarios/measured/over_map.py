@@ -23,7 +23,7 @@ from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.counterpart import Counterpart, CounterpartParameters, render_counterpart
 from marsyard.scenarios.measured.map_matching import MapComparison, compare_with_map
-from marsyard.scenarios.measured.map_registration import extract_features, register_on_map
+from marsyard.scenarios.measured.map_registration import extract_features, load_map, register_on_map
 from marsyard.scenarios.measured.scenarios import NAN, MeasuredParameters, MeasuredScenario
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.parameters import NonNegative
@@ -73,7 +73,7 @@ class OverMapScenario(MeasuredScenario[OverMapParameters]):
         if record.world_from_body_xyzw is None:
             row["registration_inliers"] = 0
             return CaseResult(MapOutcome.TOO_FEW_MATCHES.name, False, row, products)
-        map_product = store.load_map(p.cases)
+        map_product = load_map(p.cases)
         posed = PosedImage.from_detector(image, np.asarray(record.pose.translation), record.attitude)
         sd_m = p.position_sd_m if inliers is None else _REGISTRATION_SD_PX * map_product.pixel_m
         comparison = compare_with_map(posed, map_product, sd_m, p.lvs)

@@ -13,12 +13,10 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 from pydantic import ValidationError
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange.files import read_counts
-from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.camera import BODY_FRAME, CameraModel, read_cahvor, write_cahvor
@@ -207,7 +205,7 @@ def write_camera(folder: Path, number: int, camera: CameraModel) -> StoredFile:
     )
 
 
-def _check_unchanged(folder: Path, stored: StoredFile) -> Path:
+def check_unchanged(folder: Path, stored: StoredFile) -> Path:
     """Return the file's path. Raises ValueError if the file is missing or has changed."""
     path = folder / stored.file
     try:
@@ -223,37 +221,18 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
     """Load the images of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
     folder, images = Path(cases.file).parent, []
     for image in case.images:
-        counts = read_counts(_check_unchanged(folder, image.counts))
+        counts = read_counts(check_unchanged(folder, image.counts))
         flat = image.flat_field
         calibration = DetectorCalibration(
             flat_field=np.ones(counts.shape)
             if flat is None
-            else np.load(_check_unchanged(folder, flat), allow_pickle=False),
+            else np.load(check_unchanged(folder, flat), allow_pickle=False),
             exposure_s=image.exposure_s,
             **cases.stored.detector.model_dump(),
         )
-        camera = read_cahvor(_check_unchanged(folder, image.camera))
+        camera = read_cahvor(check_unchanged(folder, image.camera))
         images.append(DetectorImage(counts, image.time_s, camera, calibration))
     return tuple(images)
-
-
-def load_map(cases: CasesFile) -> MapProduct:
-    """Load the map of the cases; its maker states no errors. Raises ValueError if there is none, or it has changed."""
-    stored, folder = cases.stored.map, Path(cases.file).parent
-    if stored is None:
-        raise ValueError(f"{cases.file}: contains no map")
-    appearance, elevation = (
-        np.load(_check_unchanged(folder, file), allow_pickle=False) for file in (stored.appearance, stored.elevation)
-    )
-    return create_map(appearance, elevation, stored.pixel_m)
-
-
-def create_map(
-    appearance: Float32[np.ndarray, "rows columns"], elevation_m: Float32[np.ndarray, "rows columns"], pixel_m: float
-) -> MapProduct:
-    """Create a map whose centre is the origin of the world."""
-    centre = 0.5 * (np.array(appearance.shape[::-1]) - 1.0)
-    return MapProduct(appearance, elevation_m, -pixel_m * centre, pixel_m, 0.0, 0.0, 0.0)
 
 
 def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:

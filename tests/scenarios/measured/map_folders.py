@@ -1,4 +1,4 @@
-"""Writer of folders for the task `map` of `marsyard ingest`: images of synthetic terrain from known poses, and its map."""
+"""Writer of folders for the task `map` of `marsyard ingest`: images of synthetic terrain, and its map."""
 
 from pathlib import Path
 

@@ -18,6 +18,7 @@ from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.columns import MAP_COLUMNS
 from marsyard.scenarios.measured.image_files import read_counts
 from marsyard.scenarios.measured.map_matching import MATCHERS, MapComparison, compare_with_map
+from marsyard.scenarios.measured.map_registration import load_map
 from marsyard.scenarios.measured.over_map import OverMapScenario, pose_error_px
 from marsyard.sim.camera import Cahvor, Cahvore, write_cahvor
 from marsyard.sim.frames import rigid, world_from_mars_fixed
@@ -36,7 +37,7 @@ def compare(cases: store.CasesFile, number: int) -> MapComparison:
     case = cases.stored.cases[number]
     record, (image,) = case.images[0], store.load_images(cases, case)
     posed = PosedImage.from_detector(image, np.asarray(record.pose.translation), record.attitude)
-    return compare_with_map(posed, store.load_map(cases), POSITION_SD_M, LvsOptions())
+    return compare_with_map(posed, load_map(cases), POSITION_SD_M, LvsOptions())
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +52,7 @@ def test_sequence_over_its_own_map_is_registered_to_a_fraction_of_a_pixel(flight
         record = flight.stored.cases[number].images[0]
         assert record.registration_inliers is not None, name
         comparison = compare(flight, number)
-        error_px = pose_error_px(comparison.image.world_camera, CAMERA.transform(pose), store.load_map(flight))
+        error_px = pose_error_px(comparison.image.world_camera, CAMERA.transform(pose), load_map(flight))
         # landmarks of 0.3 pixels (their standard deviation in `LvsOptions`) / root of a dozen of them
         assert error_px < 0.1, name
         assert np.linalg.norm(comparison.image.world_camera.c - CAMERA.transform(pose).c) < 2.0, name
