@@ -27,12 +27,11 @@ _MATCHERS = {"template": "templates", "sift": "SIFT features", "orb": "ORB featu
 
 def _map_columns(prefix: str, whose: str) -> tuple[Column, ...]:
     """Return the columns of an image over a map."""
+    words = prefix.replace(".", " ")
     columns = [
         outcome("registration_inliers", "number of features that agree with the pose, found on the whole map"),
         condition("height_m", "height above the ground"),
-        condition(
-            "off_nadir_deg", "angle between optical axis and nadir", f"{prefix.replace('.', ' ')}off-nadir angle"
-        ),
+        condition("off_nadir_deg", "angle between optical axis and nadir", f"{words}off-nadir angle"),
         condition("ground_pixel_m", "size of a pixel on the ground at the nadir"),
     ]
     for name, items in _MATCHERS.items():
@@ -62,7 +61,7 @@ MAP_COLUMNS = Columns(
         *_map_columns("", "recorded image"),
         text("rendered.outcome", "outcome of the rendered image", Kind.OUTCOME),
         *_map_columns("rendered.", "rendered image"),
-        error("rendered.pose_error_px", "median distance between pixels of ground points by found and true pose"),
+        error("rendered.pose_error_px", "median distance between the pixels of the landmarks by found and true pose"),
     )
 )
 

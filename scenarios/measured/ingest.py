@@ -254,8 +254,8 @@ class _FolderReader:
             attitude, position = world_from_body.rotation, np.asarray(world_from_body.translation)
         if first is not None and not is_same_world(frame, first.frame):
             raise row.error(
-                f"the pose is in {describe_frame(frame)}, that of the case's first image in {describe_frame(first.frame)}; "
-                "allowed: one frame in a case"
+                f"the pose is in {describe_frame(frame)}, that of the case's first image in "
+                f"{describe_frame(first.frame)}; allowed: one frame in a case"
             )
         up = -1.0 if attitude is None else float(attitude.apply(camera.boresight())[2])
         if self.file.task in (VELOCITY, LANDING) and up >= 0.0:

@@ -9,13 +9,7 @@ import numpy as np
 from pydantic import BaseModel, Field
 
 from marsyard.algorithms.localisation.interface import MapProduct
-from marsyard.algorithms.localisation.map_sampling import (
-    elevation_at,
-    inside_map,
-    intersect_elevation,
-    map_pixels,
-    sample_raster,
-)
+from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.scenarios.condition_columns import hash_images
@@ -33,8 +27,6 @@ from marsyard.sim.streams import Streams
 RENDERED = "rendered."
 #: Standard deviation of the position of a registered image, map pixels (assumed).
 _REGISTRATION_SD_PX = 2.0
-#: Number of pixels along each side at which the poses of a rendered image are compared.
-_COMPARED_POINTS = 20
 
 
 class MapOutcome(Enum):
@@ -108,9 +100,7 @@ def _compare_counterpart(counterpart: Counterpart, options: LvsOptions) -> tuple
         "outcome": outcome.name,
         "registration_inliers": solution.inliers,
         **_describe(comparison, map_product),
-        "pose_error_px": pose_error_px(
-            comparison.image.world_camera, image.camera.transform(counterpart.world_from_body), map_product
-        ),
+        "pose_error_px": pose_error_px(comparison, image.camera.transform(counterpart.world_from_body)),
     }
     return row, products | _products(comparison, "rendered")
 
@@ -128,25 +118,14 @@ def _describe(comparison: MapComparison, map_product: MapProduct) -> dict[str, S
     }
 
 
-def pose_error_px(estimated: CameraModel, true: CameraModel, map_product: MapProduct) -> float:
-    """Return the median distance between the pixels of ground points by two poses of a camera, world frame; or NaN.
+def pose_error_px(comparison: MapComparison, true_camera: CameraModel) -> float:
+    """Return the median distance between the pixels of the landmarks by found and true pose; NaN without landmarks.
 
-    The points are those that a grid of pixels shows on the map, by the true pose.
+    - true_camera: camera model in the world frame
     """
-    columns, rows = (np.linspace(0.0, side - 1.0, _COMPARED_POINTS) for side in true.size)
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1)
-    origins, directions = true.rays(pixels)
-    start_m = np.full((_COMPARED_POINTS, 1), elevation_at(map_product, true.c[:2]))
-    ground = intersect_elevation(map_product, origins, directions, start_m)
-    inside = inside_map(map_product, ground) & (directions[..., 2] < 0.0)
-    if not inside.any():
-        return NAN
-    points = np.column_stack(
-        [ground[inside], sample_raster(map_product.elevation_m, map_pixels(map_product, ground))[inside]]
-    )
-    first, visible = estimated.project(points)
-    second, _ = true.project(points)
-    return float(np.median(np.linalg.norm(first - second, axis=1)[visible])) if visible.any() else NAN
+    points = comparison.landmarks.points_m
+    found_px, true_px = (camera.project(points)[0] for camera in (comparison.image.world_camera, true_camera))
+    return float(np.median(np.linalg.norm(found_px - true_px, axis=1))) if len(points) else NAN
 
 
 def _products(comparison: MapComparison, kind: str) -> dict[str, object]:

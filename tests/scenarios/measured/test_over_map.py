@@ -52,7 +52,7 @@ def test_sequence_over_its_own_map_is_registered_to_a_fraction_of_a_pixel(flight
         record = flight.stored.cases[number].images[0]
         assert record.registration_inliers is not None, name
         comparison = compare(flight, number)
-        error_px = pose_error_px(comparison.image.world_camera, CAMERA.transform(pose), load_map(flight))
+        error_px = pose_error_px(comparison, CAMERA.transform(pose))
         # landmarks of 0.3 pixels (their standard deviation in `LvsOptions`) / root of a dozen of them
         assert error_px < 0.1, name
         assert np.linalg.norm(comparison.image.world_camera.c - CAMERA.transform(pose).c) < 2.0, name
@@ -188,7 +188,7 @@ def test_published_copies_are_read_in_grey(tmp_path: Path) -> None:
 def test_size_of_lossy_images_is_recorded(tmp_path: Path, one_image: Path) -> None:
     folder = tmp_path / "in"
     shutil.copytree(one_image, folder)
-    counts = cv2.imread(str(folder / "middle.png"), cv2.IMREAD_UNCHANGED)
+    counts = read_counts(folder / "middle.png")
     cv2.imwrite(str(folder / "lossy.jpg"), (counts / 16).astype(np.uint8))
     with (folder / "images.csv").open("a") as table:
         table.write("lossy,lossy.jpg\n")
@@ -306,7 +306,7 @@ def test_recorded_images_are_compared_with_rendered_ones(tmp_path: Path, one_ima
     # the errors of the rendered map are one pixel of 6 m, 0.9 image pixels, with a correlation over 1.5 km
     assert row["rendered.pose_error_px"] < 1.5
     declared = {column.name for column in MAP_COLUMNS}
-    assert {name for name in row if name.startswith(("rendered.", *MATCHERS))} <= declared
+    assert {name for name in map(str, row) if name.startswith(("rendered.", *MATCHERS))} <= declared
     report = json.loads((run / "report.json").read_text())
     medians = report["sections"]["over-map"]["medians"]
     assert medians["template_yield"] == [row["template_yield"], row["rendered.template_yield"]]
