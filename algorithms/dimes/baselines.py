@@ -13,7 +13,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from marsyard.algorithms.arrays import Points2, Raster, Vector2
 from marsyard.algorithms.dimes import binning, ground_view, rectification
@@ -220,11 +220,15 @@ class HomographyEstimator:
 
     def _match(self, patches: PairPatches) -> PairMatch | None:
         """Return the shift at the inliers' centroid; None if no homography is found. The score is the inlier count."""
-        options, points = self.options, match_features(patches, self.options)
-        if points is None:
+        options = self.options
+        features = [detect_features(patch, options) for patch in (patches.first, patches.second)]
+        pairs = match_features(features[0][1], features[1][1], options)
+        if len(pairs) < 4:  # the minimum for a homography
             return None
+        points = [positions[pairs[:, side]].astype(np.float32) for side, (positions, _) in enumerate(features)]
         homography, inliers = cv2.findHomography(
-            *points,
+            points[0],
+            points[1],
             cv2.USAC_MAGSAC,
             options.reprojection_px,
             maxIters=options.iterations,
@@ -261,18 +265,25 @@ def stretch_to_8_bits(patch: Raster) -> UInt8[np.ndarray, "rows columns"]:
     return np.asarray(np.clip(np.rint(scaled), 0, 255).astype(np.uint8))
 
 
-def match_features(patches: PairPatches, options: HomographyOptions) -> tuple[Points2, Points2] | None:
-    """Match ORB features; return their positions (column, row) in both images, or None if fewer than four match."""
+def detect_features(patch: Raster, options: HomographyOptions) -> tuple[Points2, UInt8[np.ndarray, "n 32"]]:
+    """Detect ORB features; return their positions (column, row) and descriptors."""
     orb = cv2.ORB.create(nfeatures=options.features, fastThreshold=options.fast_threshold)
-    images = (stretch_to_8_bits(patch) for patch in (patches.first, patches.second))
-    (keypoints_1, descriptors_1), (keypoints_2, descriptors_2) = (orb.detectAndCompute(image, None) for image in images)
-    if descriptors_1 is None or descriptors_2 is None or len(keypoints_2) < 2:
-        return None
-    neighbours = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(descriptors_1, descriptors_2, k=2)
-    matches = [best for best, second_best in neighbours if best.distance < options.max_ratio * second_best.distance]
-    if len(matches) < 4:  # the minimum for a homography
-        return None
-    return (
-        np.array([keypoints_1[match.queryIdx].pt for match in matches], dtype=np.float32),
-        np.array([keypoints_2[match.trainIdx].pt for match in matches], dtype=np.float32),
-    )
+    keypoints, descriptors = orb.detectAndCompute(stretch_to_8_bits(patch), None)
+    if descriptors is None:
+        return np.zeros((0, 2)), np.zeros((0, 32), dtype=np.uint8)
+    return np.array([keypoint.pt for keypoint in keypoints]), descriptors
+
+
+def match_features(
+    first: UInt8[np.ndarray, "n 32"], second: UInt8[np.ndarray, "m 32"], options: HomographyOptions
+) -> Int[np.ndarray, "matches 2"]:
+    """Match ORB descriptors; return the indices of the pairs that pass the ratio test."""
+    if len(second) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    neighbours = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(first, second, k=2)
+    pairs = [
+        (best.queryIdx, best.trainIdx)
+        for best, second_best in neighbours
+        if best.distance < options.max_ratio * second_best.distance
+    ]
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

@@ -186,11 +186,11 @@ def ingest(
         str | None,
         Option(
             help="System of an installed package whose importer reads the folder; by default the built-in importer, "
-            "for the task that ingest.toml states: velocity, landing or matching."
+            "for the task that ingest.toml states: velocity, landing, matching or map."
         ),
     ] = None,
 ) -> None:
-    """Create a campaign from recorded images with measured attitudes, and measured altitudes or positions."""
+    """Create a campaign from recorded images with measured poses, or over a map."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors, unknown_name_message
     from marsyard.reports.wording import count

@@ -17,9 +17,11 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
 from marsyard.reports.images import Image, show_image
+from marsyard.reports.measured.over_map import OVER_MAP, map_section
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Presentation, TableRow
 from marsyard.reports.products import Products, check_shape, to_matrix
 from marsyard.reports.wording import NOTHING, label, number
+from marsyard.scenarios.measured.over_map import MapOutcome
 
 MEDIAN, PERCENTILE_90 = "residual_median_px", "residual_90_percent_px"
 #: Maximum number of rows of the table; additional cases are counted.
@@ -144,7 +146,9 @@ def view(products: Products, complete: bool = False) -> CaseView:
 
 
 MEASURED = Presentation(
-    cases=(CaseKind(lambda products: bool(read_matched_pairs(products)), view, _LEGEND),), first=(agreement_section,)
+    cases=(OVER_MAP, CaseKind(lambda products: bool(read_matched_pairs(products)), view, _LEGEND)),
+    first=(agreement_section, map_section),
+    outcomes=(MapOutcome,),
 )
 
 

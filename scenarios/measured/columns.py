@@ -1,7 +1,9 @@
 """Columns in the rows of recorded images: agreement of images and poses, and answers of algorithms."""
 
+from dataclasses import replace
+
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, outcome, text
+from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, outcome, text
 
 _CASE = (
     text("measured_case", "name of the case"),
@@ -19,6 +21,49 @@ _CASE = (
 )
 
 MATCHING_COLUMNS = Columns(_CASE)
+
+_MATCHERS = {"template": "templates", "sift": "SIFT features", "orb": "ORB features", "lvs": "landmarks"}
+
+
+def _map_columns(prefix: str, whose: str) -> tuple[Column, ...]:
+    """Return the columns of an image over a map."""
+    words = prefix.replace(".", " ")
+    columns = [
+        outcome("registration_inliers", "number of features that agree with the pose, found on the whole map"),
+        condition("height_m", "height above the ground"),
+        condition("off_nadir_deg", "angle between optical axis and nadir", f"{words}off-nadir angle"),
+        condition("ground_pixel_m", "size of a pixel on the ground at the nadir"),
+    ]
+    for name, items in _MATCHERS.items():
+        columns += [
+            outcome(f"{name}_searched", f"number of {items} of the image that were searched on the map"),
+            outcome(f"{name}_inliers", f"number of {items} that were found at the right position"),
+            outcome(f"{name}_yield", f"fraction of {items} that were found at the right position"),
+            outcome(f"{name}_rank", "rank of this yield among the four matchers; 1 is the largest yield"),
+        ]
+    columns += [
+        outcome(f"{name}_inlier_fraction", f"fraction of the matched {_MATCHERS[name]} at the right position")
+        for name in ("sift", "orb")
+    ]
+    columns += [
+        outcome("template_correlation", "median of the highest correlations of all templates"),
+        outcome("template_strong_correlation", "the same for the quarter of the templates with the most contrast"),
+        outcome("lvs_found_fraction", "fraction of landmarks that were found, before the check of the common pose"),
+        outcome("lvs_correlation", "median correlation of the landmarks that agree on the pose"),
+        outcome("lvs_residual_px", "median distance of these landmarks from the common pose, pixels of their search"),
+    ]
+    return tuple(replace(column, name=prefix + column.name, meaning=f"{whose}: {column.meaning}") for column in columns)
+
+
+MAP_COLUMNS = Columns(
+    (
+        *_CASE[:2],
+        *_map_columns("", "recorded image"),
+        text("rendered.outcome", "outcome of the rendered image", Kind.OUTCOME),
+        *_map_columns("rendered.", "rendered image"),
+        error("rendered.pose_error_px", "median distance between the pixels of the landmarks by found and true pose"),
+    )
+)
 
 VELOCITY_COLUMNS = Columns(
     (

@@ -15,10 +15,12 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.dimes.binning import binned_size_for
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.image_files import read_counts, read_flat_field, read_header
+from marsyard.scenarios.measured.image_files import lossy_bits_per_pixel, read_counts, read_flat_field, read_header
+from marsyard.scenarios.measured.label_poses import describe_frame, is_mars_fixed, is_same_world, label_pose, world_from
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
     LANDING,
+    MAP,
     TABLE_FILE,
     VELOCITY,
     ImageRow,
@@ -28,21 +30,14 @@ from marsyard.scenarios.measured.layout import (
     read_ingest_file,
     read_table,
 )
+from marsyard.scenarios.measured.map_matching import TOLERANCE_PX
+from marsyard.scenarios.measured.map_registration import add_map, describe_poses
 from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_files import format_problems
-from marsyard.sim.camera import (
-    CameraModel,
-    FramedCamera,
-    LabelFrame,
-    Pds3Product,
-    mount_looking_down,
-    read_framed_cameras,
-    read_pds3_product,
-)
-from marsyard.sim.camera.label_frames import MARS_FIXED
+from marsyard.sim.camera import CameraModel, LabelFrame, mount_looking_down, read_framed_cameras, read_pds3_product
 from marsyard.sim.camera.pds import is_pds3
-from marsyard.sim.frames import SITE_FROM_WORLD, compose, rigid, world_from_mars_fixed
+from marsyard.sim.frames import compose
 
 #: Columns of a position.
 _POSITION = ("x_m", "y_m", "z_m")
@@ -54,6 +49,7 @@ _DESCRIPTIONS = {
     "velocity": "Real descents: horizontal velocity from three images.",
     "landing": "Real flights: landing sites from two images.",
     "matching": "Real images, compared with their measured poses.",
+    "map": "Real images over a map, next to rendered images of the same camera, heights and attitudes.",
 }
 
 
@@ -68,8 +64,9 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
     the cases cannot be written.
     """
     path, stored_cases = ingest(source, target)
+    file = read_ingest_file(source)
     rows_summed, note, binned_size = stored_cases.detector.rows_summed, "", None
-    if rows_summed > 1 and read_ingest_file(source).detector.rows_summed is None:
+    if rows_summed > 1 and file.detector.rows_summed is None:
         note = (
             f"rows_summed = {rows_summed}: computed from the camera, whose pixels are longer than wide by "
             f"that factor; rows_summed under [detector] of {INGEST_FILE} overrides it"
@@ -79,6 +76,8 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
         columns, rows = stored_cases.cases[0].images[0].size
         binned_size = binned_size_for(columns, rows * rows_summed)
         binned_size = binned_size if rows % binned_size[1] == 0 else (columns, rows)
+    if stored_cases.task == MAP:
+        note = describe_poses(stored_cases)
     template = toml_environment(Path(__file__).parent).get_template("campaign.toml.j2")
     text = template.render(
         **stored_cases.model_dump(include={"folder", "name", "task"}),
@@ -87,6 +86,9 @@ def ingest_campaign(source: Path, target: Path, final: Path) -> Ingested:
         file=str(final / path.name),
         binned_size=binned_size,
         numbers=list(range(len(stored_cases.cases))),
+        is_level=file.map is not None and file.map.elevation is None,
+        tolerance_px=TOLERANCE_PX,
+        suns={"sun": file.sun, "map_sun": file.map and file.map.sun},
         velocity_is_known=any(case.truth.velocity_m_s is not None for case in stored_cases.cases),
     )
     return Ingested(text, len(stored_cases.cases), sum(len(case.images) for case in stored_cases.cases), note)
@@ -123,6 +125,10 @@ def ingest(source: Path, target: Path) -> tuple[Path, store.StoredCases]:
         ),
         cases=tuple(cases),
     )
+    path = store.write_cases(target, stored_cases)
+    if file.map is None:
+        return path, stored_cases
+    stored_cases = add_map(source, file.map, store.CasesFile(file=str(path)))
     return store.write_cases(target, stored_cases), stored_cases
 
 
@@ -141,6 +147,7 @@ def infer_summed_rows(camera: CameraModel) -> int:
 class _RecordedImage:
     """An image as read, with its pose in the world axes of Marsyard.
 
+    - attitude: None for an image over a map without a measured pose
     - frame: frame of the pose in the image's label; None for a pose from the table
     - world_from_frame: transform from the label's frame
     """
@@ -149,7 +156,7 @@ class _RecordedImage:
     counts: UInt16[np.ndarray, "rows columns"]
     camera: CameraModel
     time_s: float
-    attitude: Rotation
+    attitude: Rotation | None
     position_m: Float64[np.ndarray, "3"] | None
     frame: LabelFrame | None = None
     world_from_frame: RigidTransform | None = None
@@ -220,28 +227,37 @@ class _FolderReader:
                 "frame; allowed: a model in the rover's frame"
             )
         product = read_pds3_product(path) if is_product else None
-        counts = read_counts(path, camera.size) if product is None else product.counts
+        is_map = self.file.task == MAP
+        counts = read_counts(path, camera.size, is_published=is_map) if product is None else product.counts
         max_count = (1 << self.file.detector.bits) - 1
         if counts.max() > max_count:
             raise row.error(
                 f"{path}: has counts up to {counts.max()}; detector.bits = {self.file.detector.bits} allows {max_count}"
             )
         frame, world_from_frame = None, None
+        attitude: Rotation | None = None
+        position = None
+        map_origin = self.file.map and self.file.map.origin_mars_fixed_m
         if rotation is not None:
             attitude, position = self._body_pose(row, rotation, row.vector(*_POSITION))
+            if is_map and position is None:
+                raise row.error("x_m, y_m, z_m are empty; map needs them with an attitude")
+        elif is_map and (map_origin is None or not is_mars_fixed(framed, product)):
+            camera = mount_looking_down(camera)
         else:
-            camera, frame, frame_from_body = _label_pose(row, framed, product)
+            camera, frame, frame_from_body = label_pose(row, framed, product)
             world_from_frame = None if first is None else first.world_from_frame
             if world_from_frame is None:
-                world_from_frame = _world_from(row, frame, frame_from_body)
+                origin = np.asarray(frame_from_body.translation if map_origin is None else map_origin)
+                world_from_frame = world_from(row, frame, origin)
             world_from_body = compose(world_from_frame, frame_from_body)
             attitude, position = world_from_body.rotation, np.asarray(world_from_body.translation)
-        if first is not None and not _is_same_world(frame, first.frame):
+        if first is not None and not is_same_world(frame, first.frame):
             raise row.error(
-                f"the pose is in {_describe(frame)}, that of the case's first image in {_describe(first.frame)}; "
-                "allowed: one frame in a case"
+                f"the pose is in {describe_frame(frame)}, that of the case's first image in "
+                f"{describe_frame(first.frame)}; allowed: one frame in a case"
             )
-        up = float(attitude.apply(camera.boresight())[2])
+        up = -1.0 if attitude is None else float(attitude.apply(camera.boresight())[2])
         if self.file.task in (VELOCITY, LANDING) and up >= 0.0:
             elevation = np.degrees(np.arcsin(np.clip(up, -1.0, 1.0)))
             raise row.error(
@@ -249,6 +265,8 @@ class _FolderReader:
                 "poses.axes, attitude_of and mounting define the axes)"
             )
         time_s = row.numbers.get("time_s", None if product is None else product.time_s)
+        if time_s is None and is_map:
+            time_s = 0.0  # each case has one image
         if time_s is None:
             raise row.error("time_s is empty, and no label contains it")
         return _RecordedImage(row, counts, camera, time_s, attitude, position, frame, world_from_frame)
@@ -300,10 +318,11 @@ class _FolderReader:
             flat_field=flat_field,
             time_s=image.time_s,
             exposure_s=row.numbers.get("exposure_s", self.file.detector.exposure_s),
-            world_from_body_xyzw=_to_quaternion(image.attitude),
+            world_from_body_xyzw=None if image.attitude is None else _to_quaternion(image.attitude),
             position_m=None if image.position_m is None else _to_vector(image.position_m),
             altitude_m=row.numbers.get("altitude_m"),
             altitude_time_s=row.numbers.get("altitude_time_s"),
+            bits_per_pixel=lossy_bits_per_pixel(self.source / row.texts["file"]) if self.file.task == MAP else None,
         )
 
     def _mean_velocity(self, earlier: _RecordedImage, later: _RecordedImage) -> store.Vector:
@@ -320,7 +339,7 @@ class _FolderReader:
         site = image.row.vector("site_x_m", "site_y_m", "site_z_m")
         if site is not None:
             return _to_vector(self._to_world(image.row, site))
-        if slant_range_m is None or image.position_m is None:
+        if slant_range_m is None or image.position_m is None or image.attitude is None:
             raise image.row.error("slant_range_m and site_x_m to site_z_m are empty; landing needs one of them")
         ground = image.camera.c + slant_range_m * image.camera.a
         return _to_vector(image.position_m + image.attitude.apply(ground))
@@ -366,44 +385,6 @@ class _FolderReader:
 def _to_vector(values: Float64[np.ndarray, "3"]) -> store.Vector:
     x, y, z = values.tolist()
     return x, y, z
-
-
-def _label_pose(
-    row: ImageRow, framed: FramedCamera, product: Pds3Product | None
-) -> tuple[CameraModel, LabelFrame, RigidTransform]:
-    """Return the camera in the body's frame, and the body's pose in the frame that the label names.
-
-    The body is the rover or, for a model in a frame that the label does not connect to the rover, the camera's centre
-    with the axes of that frame.
-    """
-    camera = framed.camera
-    if not framed.frame.is_vehicle:
-        frame_from_body = rigid(Rotation.identity(), camera.c)
-        return camera.transform(frame_from_body.inv()), framed.frame, frame_from_body
-    if product is None or product.pose is None:
-        raise row.error("qx to qw are empty, and no label contains them")
-    return camera, *product.pose
-
-
-def _world_from(row: ImageRow, frame: LabelFrame, frame_from_body: RigidTransform) -> RigidTransform:
-    """Return the transform to world axes: from a site, or from the Mars-fixed frame with the origin at the body."""
-    if frame.name != MARS_FIXED:
-        return rigid(SITE_FROM_WORLD.inv(), np.zeros(3))
-    try:
-        return world_from_mars_fixed(np.asarray(frame_from_body.translation))
-    except ValueError as error:
-        raise row.error(f"the label's pose in {frame}: {error}; allowed: metres from the centre of Mars") from error
-
-
-def _is_same_world(frame: LabelFrame | None, first: LabelFrame | None) -> bool:
-    """Return whether positions in both frames have the same origin; that of the table (None) can be a site's."""
-    if frame is None or first is None:
-        return MARS_FIXED not in [known.name for known in (frame, first) if known is not None]
-    return frame.matches(first)
-
-
-def _describe(frame: LabelFrame | None) -> str:
-    return "the table's axes" if frame is None else f"the label's frame {frame}"
 
 
 def _to_quaternion(rotation: Rotation) -> store.Quaternion:

@@ -11,23 +11,23 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.recorded_axes import RecordedAxes
 from marsyard.scenarios.user_files import check_column_groups, finite_number, format_problems, parse_table
 from marsyard.sim.files import check_regular
-from marsyard.sim.frames import direction
+from marsyard.sim.frames import direction, world_from_mars_fixed
 from marsyard.sim.parameters import Parameters, bounded_field
 
 #: Names of the file of parameters and of the table of images in every folder.
 INGEST_FILE, TABLE_FILE = "ingest.toml", "images.csv"
 
-VELOCITY, LANDING, MATCHING = "velocity", "landing", "matching"
-TaskName = Literal["velocity", "landing", "matching"]
+VELOCITY, LANDING, MATCHING, MAP = "velocity", "landing", "matching", "map"
+TaskName = Literal["velocity", "landing", "matching", "map"]
 
 #: Minimum and maximum number of images of a case.
-IMAGE_COUNTS = {VELOCITY: (3, 3), LANDING: (2, 2), MATCHING: (2, 50)}
+IMAGE_COUNTS = {VELOCITY: (3, 3), LANDING: (2, 2), MATCHING: (2, 50), MAP: (1, 1)}
 
 
 class IngestError(ValueError):
@@ -90,6 +90,29 @@ class SunTable(Parameters):
         return direction(float(np.radians(self.azimuth_deg)), float(np.radians(self.elevation_deg)))
 
 
+class MapTable(Parameters):
+    """Map of the ground, for the task `map`. Its world has the origin in the centre of the map, at elevation 0."""
+
+    file: Annotated[str, Field(description="image of the ground from above, north up; colours are averaged")]
+    pixel_m: Annotated[float, Field(gt=0.0, le=1000.0, description="size of a map pixel, m")]
+    elevation: Annotated[
+        str | None,
+        Field(description="`.npy` with elevations, m, of any grid over the same area, north up; default: level ground"),
+    ] = None
+    origin_mars_fixed_m: Annotated[
+        tuple[float, float, float] | None,
+        Field(description="position of the map's origin in the Mars-fixed frame; with it, poses of labels are used"),
+    ] = None
+    sun: Annotated[SunTable | None, Field(description="sun in the images of the map")] = None
+
+    @field_validator("origin_mars_fixed_m")
+    @classmethod
+    def _check_origin(cls, origin_m: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+        if origin_m is not None:
+            world_from_mars_fixed(np.array(origin_m))
+        return origin_m
+
+
 class IngestFile(Parameters):
     """`ingest.toml`: parameters of the whole folder."""
 
@@ -97,13 +120,17 @@ class IngestFile(Parameters):
         str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="name of the campaign")
     ]
     task: Annotated[
-        TaskName, Field(description="velocity: three images of a descent; landing: two; matching: two or more")
+        TaskName,
+        Field(
+            description="velocity: three images of a descent; landing: two; matching: two or more; map: one, over a map"
+        ),
     ]
     description: Annotated[str, Field(description="description in the report")] = ""
     poses: Annotated[RecordedAxes | None, Field(description="not needed if PDS3 labels contain all poses")] = None
     camera: CameraTable = CameraTable()
     detector: DetectorTable
     sun: SunTable | None = None
+    map: MapTable | None = None
 
 
 def read_ingest_file(folder: Path) -> IngestFile:
@@ -129,6 +156,8 @@ def read_ingest_file(folder: Path) -> IngestFile:
         raise IngestError(
             f'{path}: camera.pose_in_file: the file contains the pose in the body: poses.attitude_of must be "body"'
         )
+    if (file.map is None) == (file.task == MAP):
+        raise IngestError(f"{path}: map: the task map, and no other, needs the table [map]; the task is {file.task}")
     return file
 
 

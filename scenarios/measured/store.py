@@ -53,7 +53,10 @@ class StoredImage(Parameters):
 
     - source: path of the image in the ingested folder
     - counts, camera, flat_field: files next to `cases.json`; without a flat field the response is 1
+    - world_from_body_xyzw: None for an image that could not be registered on the map
     - altitude_time_s: time tag of the altitude; None for the image's time
+    - registration_inliers: number of features that agree with the pose, if it was found on the map
+    - bits_per_pixel: size of the source file, for lossy formats
     """
 
     source: str
@@ -63,15 +66,24 @@ class StoredImage(Parameters):
     flat_field: StoredFile | None = None
     time_s: float
     exposure_s: float
-    world_from_body_xyzw: Quaternion
+    world_from_body_xyzw: Quaternion | None = None
     position_m: Vector | None = None
     altitude_m: float | None = None
     altitude_time_s: float | None = None
+    registration_inliers: int | None = None
+    bits_per_pixel: float | None = None
+
+    @property
+    def attitude(self) -> Rotation:
+        """The body's measured attitude in world axes. Raises ValueError for an image that is not registered."""
+        if self.world_from_body_xyzw is None:
+            raise ValueError(f"{self.source}: has no attitude")
+        return Rotation.from_quat(np.array(self.world_from_body_xyzw))
 
     @property
     def pose(self) -> RigidTransform:
         """The body's measured pose in world axes; its position is the origin if no position was measured."""
-        return body_pose(self.position_m or (0.0, 0.0, 0.0), self.world_from_body_xyzw)
+        return rigid(self.attitude, np.array(self.position_m or (0.0, 0.0, 0.0)))
 
 
 class StoredTruth(Parameters):
@@ -108,6 +120,15 @@ class StoredDetector(Parameters):
     rows_summed: int
 
 
+class StoredMap(Parameters):
+    """A map, row 0 in the south: `.npy` files of appearance and elevation next to `cases.json`, and the pixel size."""
+
+    appearance: StoredFile
+    elevation: StoredFile
+    is_level: bool
+    pixel_m: float
+
+
 class StoredCases(Parameters):
     """Contents of `cases.json`."""
 
@@ -118,6 +139,7 @@ class StoredCases(Parameters):
     folder: str
     detector: StoredDetector
     cases: tuple[StoredCase, ...]
+    map: StoredMap | None = None
 
 
 class CasesFile(UserFile):
@@ -183,7 +205,7 @@ def write_camera(folder: Path, number: int, camera: CameraModel) -> StoredFile:
     )
 
 
-def _check_unchanged(folder: Path, stored: StoredFile) -> Path:
+def check_unchanged(folder: Path, stored: StoredFile) -> Path:
     """Return the file's path. Raises ValueError if the file is missing or has changed."""
     path = folder / stored.file
     try:
@@ -199,16 +221,16 @@ def load_images(cases: CasesFile, case: StoredCase) -> tuple[DetectorImage, ...]
     """Load the images of a case with their cameras in the body frame. Raises ValueError if a file has changed."""
     folder, images = Path(cases.file).parent, []
     for image in case.images:
-        counts = read_counts(_check_unchanged(folder, image.counts))
+        counts = read_counts(check_unchanged(folder, image.counts))
         flat = image.flat_field
         calibration = DetectorCalibration(
             flat_field=np.ones(counts.shape)
             if flat is None
-            else np.load(_check_unchanged(folder, flat), allow_pickle=False),
+            else np.load(check_unchanged(folder, flat), allow_pickle=False),
             exposure_s=image.exposure_s,
             **cases.stored.detector.model_dump(),
         )
-        camera = read_cahvor(_check_unchanged(folder, image.camera))
+        camera = read_cahvor(check_unchanged(folder, image.camera))
         images.append(DetectorImage(counts, image.time_s, camera, calibration))
     return tuple(images)
 
@@ -217,7 +239,7 @@ def descent_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) ->
     """Return the inputs of a velocity estimator."""
     attitudes, altitudes = [], []
     for item in case.images:
-        attitudes.append(AttitudeMeasurement(Rotation.from_quat(np.array(item.world_from_body_xyzw)), item.time_s))
+        attitudes.append(AttitudeMeasurement(item.attitude, item.time_s))
         time_s = item.time_s if item.altitude_time_s is None else item.altitude_time_s
         altitudes.append(AltitudeMeasurement(math.nan if item.altitude_m is None else item.altitude_m, time_s))
     return DescentMeasurements(
@@ -237,11 +259,10 @@ def body_pose(position_m: Vector, xyzw: Quaternion) -> RigidTransform:
 def landing_measurements(case: StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
     """Return the inputs of an estimator of landing sites."""
     first, second = (PoseMeasurement(image.pose, image.time_s) for image in case.images)
-    attitude = Rotation.from_quat(np.array(case.images[0].world_from_body_xyzw))
     return LandingMeasurements(
         images=(images[0], images[1]),
         poses=(first, second),
         slant_range_m=math.nan if case.slant_range_m is None else case.slant_range_m,
-        up_body=attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
+        up_body=case.images[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
         apriori_site_world=np.array(case.site_m, dtype=np.float64),
     )

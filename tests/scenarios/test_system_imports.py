@@ -13,10 +13,13 @@ from marsyard.scenarios.systems import find_system, own_paths, scenario_paths, s
 FURTHER_ALGORITHMS = {
     "fieldtest": {"dimes"},
     "measured-landing": {"hda"},
+    "measured-map": {"dimes", "localisation"},
     "measured-velocity": {"dimes"},
     "rover": {"navigation"},
     "rover-drive": {"navigation"},
 }
+#: Folders of scenarios that a scenario uses in addition to that of its system.
+FURTHER_SCENARIOS = {"measured-map": {"localisation"}}
 #: Modules of the simulation that only rovers have.
 ROVER = {"sim.dynamics.driving", "sim.dynamics.rover", "sim.render.rover", "sim.sensor.mast", "sim.sensor.odometry"}
 #: Import a scenario, check the parameters of a case of its first campaign, and print the imported modules.
@@ -44,7 +47,8 @@ def test_scenario_imports_no_other_system(name: str) -> None:
     folder = scenario_paths()[name].split(".")[2]
     algorithms = {entry.name for entry in systems()}.union(*FURTHER_ALGORITHMS.values())
     others = {f"algorithms.{other}" for other in algorithms - {system.name, *FURTHER_ALGORITHMS.get(name, ())}}
-    others |= {f"scenarios.{other}" for other in {*own_paths()} - {folder}} | (set() if folder == "rover" else ROVER)
+    own_folders = {folder, *FURTHER_SCENARIOS.get(name, ())}
+    others |= {f"scenarios.{other}" for other in {*own_paths()} - own_folders} | (set() if folder == "rover" else ROVER)
     imported = {module for module in modules if f"{module}.".startswith(tuple(f"{other}." for other in others))}
     # the registry reads the declaration of each system, which imports nothing
     assert imported <= {f"scenarios.{other}{module}" for other in own_paths() for module in ("", ".system")}
