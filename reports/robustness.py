@@ -16,19 +16,18 @@ The verdict under a change is that of its own rule: PASS while the upper bound o
 (`marsyard.reports.statistics.weighted`) is at most the permitted rate, FAIL if the lower bound is above it. The change
 to FAIL is where the estimated rate reaches the permitted rate. PASS is lost before, and FAIL shown after: these two
 changes are the interval, each with the confidence of the requirement. Weights say nothing where they are equivalent to
-fewer than `MIN_EFFECTIVE` cases.
+fewer than 30 cases.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Float64
 from scipy.special import ndtr, ndtri, rel_entr
 
@@ -40,7 +39,14 @@ from marsyard.campaigns.sampling.dispersions import Choice
 from marsyard.reports.case_evidence import CaseEvidence
 from marsyard.reports.decision import collect_evidence
 from marsyard.reports.sampling_design import SamplingDesign
-from marsyard.reports.statistics.weighted import Changes, WeightedRates, weighted_rates
+from marsyard.reports.statistics.weighted import (
+    MIN_EFFECTIVE,
+    Changes,
+    Crossing,
+    WeightedRates,
+    find_crossing,
+    weighted_rates,
+)
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import format_fraction, number, percent
@@ -49,16 +55,12 @@ from marsyard.scenarios.columns import split_unit, to_words
 if TYPE_CHECKING:
     from marsyard.scenarios.interface import Scenario
 
-#: Minimum number of effective cases (or terrains) of the weights.
-MIN_EFFECTIVE = 30.0
 #: Name of the parameter of a change of all dispersions at once.
 ALL_DISPERSIONS = "all dispersions"
 #: Number of evaluated sizes of a change; between them, rates are interpolated.
 _STEPS = 41
 #: Nodes of the quadrature of means and standard deviations of dispersions.
 _NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(31)
-#: Rounding error of a rate that is compared with the permitted rate.
-_ROUNDING = 1e-12
 
 
 class Kind(StrEnum):
@@ -77,10 +79,17 @@ class Outcome(StrEnum):
     """What the cases say about a change to FAIL."""
 
     FOUND = "found"
-    #: Fewer than `MIN_EFFECTIVE` cases before the estimated rate reaches the permitted one.
+    #: Fewer than 30 effective cases before the estimated rate reaches the permitted one.
     REFUSED = "refused"
     #: The estimated rate stays below the permitted one for all changes of this kind.
     NONE = "none"
+
+    @classmethod
+    def of(cls, crossing: Crossing, *, is_complete: bool) -> Outcome:
+        """Return the outcome of a change; `is_complete`: whether the cases tell about all changes of this kind."""
+        if not math.isnan(crossing.change):
+            return cls.FOUND
+        return cls.NONE if is_complete else cls.REFUSED
 
 
 @dataclass(frozen=True)
@@ -93,9 +102,9 @@ class Robustness:
     - spread: assumed spread, the unit of the changes, in this unit: the declared standard deviation, that of the
       indicator of a value of `choice`, or the magnitude of the value of a parameter that is not dispersed. A
       divergence r is expressed by the shift sqrt(2 r) of one normal dispersion, which has this divergence
+    - passes_at, fails_at: `assumed` after the changes `lower` and `change`
     - change: change to FAIL in assumed spreads
     - lower, upper: PASS holds below the change `lower`, FAIL is shown above `upper`, each at `confidence`
-    - passes_at, fails_at: `assumed` after the changes `lower` and `change`
     - reach: largest change about which the cases say something
     - effective_cases: effective number of cases (terrains if they are shared) at `change`, or at `reach` without it
     """
@@ -106,11 +115,11 @@ class Robustness:
     unit: str
     assumed: Number
     spread: Number
+    passes_at: Number
+    fails_at: Number
     change: Number
     lower: Number
     upper: Number
-    passes_at: Number
-    fails_at: Number
     reach: Number
     effective_cases: Number
     confidence: Number
@@ -180,22 +189,20 @@ def evaluate_robustness(
     if not met or not sampling.independent or "case" not in frame:
         return ()
     campaign = read_campaign(run)
-    evidence = {
-        verdict.requirement_id: _Evidence.collect(frame, requirement, verdict, sampling)
-        for verdict in met
-        for requirement in run.requirements
-        if requirement.get("id") == verdict.requirement_id
-    }
+    requirements = {str(item.get("id")): item for item in run.requirements}
+    # unfinished cases count as failures, also in populations of answers
+    evidence = [
+        (item, cases.with_unfinished)
+        for item in met
+        if (cases := collect_evidence(frame, requirements[item.requirement_id], sampling, has_own_terrains=True))
+    ]
     records = [_divergence(verdict) for verdict in met]
     if campaign is not None and campaign.drawn_paths:
         coordinates = draw_coordinates(campaign, frame["case"].to_numpy(dtype=np.int64))
         for index, path in enumerate(campaign.drawn_paths):
-            for change in _list_changes(campaign.marginals[path], coordinates[:, index]):
-                records += [
-                    _find_change(item, change, path, campaign.marginals[path])
-                    for item in evidence.values()
-                    if item is not None
-                ]
+            dispersion = campaign.marginals[path]
+            for change in _list_changes(dispersion, coordinates[:, index]):
+                records += [_find_change(path, dispersion, change, *item) for item in evidence]
     order = {verdict.requirement_id: index for index, verdict in enumerate(met)}
     return tuple(sorted(records, key=lambda item: (order[item.requirement], _sort_key(item))))
 
@@ -231,41 +238,23 @@ def draw_coordinates(
     return np.asarray(ndtri(np.clip(uniform, MIN_DRAW, MAX_DRAW)))
 
 
-@dataclass(frozen=True)
-class _Evidence:
-    """Cases of a requirement: its verdict, and the cases of its population, unfinished ones as failures."""
-
-    verdict: Verdict
-    cases: CaseEvidence
-
-    @classmethod
-    def collect(
-        cls, frame: pd.DataFrame, requirement: Mapping[str, Any], verdict: Verdict, sampling: SamplingDesign
-    ) -> _Evidence | None:
-        evidence = collect_evidence(frame, requirement, sampling, has_own_terrains=True)
-        return None if evidence is None else cls(verdict, evidence.with_unfinished)
-
-    def rates(self, change: _Change) -> WeightedRates:
-        """Compute the failure rates under changes."""
-        member, verdict = self.cases.member, self.verdict
-        groups = self.cases.groups[member] if self.cases.groups is not None and self.cases.clustered else None
-        largest = 1 if groups is None else int(np.bincount(groups).max())
-        return weighted_rates(
-            change.weights[:, member],
-            ~self.cases.success[member],
-            groups,
-            (_known(verdict.upper_confidence, verdict), _known(verdict.bounds_confidence, verdict)),
-            change.max_weights * largest,
-        )
-
-
-def _known(confidence: float, verdict: Verdict) -> float:
-    """Return the confidence of a bound of a verdict, which repeated evaluations increase."""
-    return verdict.confidence if math.isnan(confidence) else confidence
+def _rates(verdict: Verdict, cases: CaseEvidence, change: _Change) -> WeightedRates:
+    """Compute the failure rates of a requirement under changes, with the confidence of the bounds of its verdict."""
+    member = cases.member
+    groups = cases.groups[member] if cases.groups is not None and cases.clustered else None
+    largest = 1 if groups is None else int(np.bincount(groups).max())
+    return weighted_rates(
+        change.weights[:, member],
+        ~cases.success[member],
+        groups,
+        (verdict.upper_confidence, verdict.bounds_confidence),
+        change.max_weights * largest,
+        change.efficiency,
+    )
 
 
 def _list_changes(dispersion: Any, z: Float64[np.ndarray, " n"]) -> Iterator[_Change]:
-    """List the changes of a dispersion up to those whose expected number of effective cases is `MIN_EFFECTIVE`."""
+    """List the changes of a dispersion up to those whose expected number of effective cases is 30."""
     steps, fraction = np.linspace(0.0, 1.0, _STEPS), MIN_EFFECTIVE / z.size
     if fraction >= 1.0:
         return
@@ -292,74 +281,29 @@ def _list_changes(dispersion: Any, z: Float64[np.ndarray, " n"]) -> Iterator[_Ch
         yield _Change(kind, np.abs(scales - 1.0), weights, scales * np.sqrt(np.maximum(2.0 - scales**2, 0.0)))
 
 
-@dataclass(frozen=True)
-class Crossing:
-    """Sizes at which PASS is lost (`lower`), the estimated rate reaches the permitted one, and FAIL is shown (`upper`).
-
-    The sizes are NaN beyond `reach`; `lower` is then `reach`, and NaN without PASS at size 0.
-    """
-
-    change: float
-    lower: float
-    upper: float
-    reach: float
-    effective: float
-    outcome: Outcome
-
-
-def find_crossing(
-    sizes: Changes, rates: WeightedRates, effective: Changes, permitted: float, *, decides_by_rate: bool = False
-) -> Crossing:
-    """Find the sizes of a change at which the verdict changes; `effective` is the effective number of cases."""
-    is_usable = np.logical_and.accumulate(np.nan_to_num(effective) >= MIN_EFFECTIVE * (1.0 - 1e-9))
-    count = int(is_usable.sum())
-    if not count:
-        return Crossing(math.nan, math.nan, math.nan, 0.0, float(effective[0]), Outcome.REFUSED)
-    reach = float(sizes[count - 1])
-    lost, change, shown = (
-        _first_above(sizes[:count], values[:count], permitted)
-        for values in (rates.estimate if decides_by_rate else rates.upper, rates.estimate, rates.lower)
-    )
-    lower = math.nan if lost == 0.0 else reach if math.isnan(lost) else lost
-    is_known = not math.isnan(change)
-    at = float(np.interp(change if is_known else reach, sizes, effective))
-    outcome = Outcome.FOUND if is_known else Outcome.NONE if count == sizes.size and sizes[-1] else Outcome.REFUSED
-    return Crossing(change, lower, shown, reach, at, outcome)
-
-
-def _first_above(sizes: Changes, values: Changes, limit: float) -> float:
-    """Find the smallest size whose value exceeds a limit, by linear interpolation; NaN if there is none."""
-    above = np.flatnonzero(values > limit + _ROUNDING)
-    if not above.size:
-        return math.nan
-    last = int(above[0])
-    if last == 0:
-        return 0.0
-    return float(np.interp(limit, values[last - 1 : last + 1], sizes[last - 1 : last + 1]))
-
-
-def _find_change(evidence: _Evidence, change: _Change, path: str, dispersion: Any) -> Robustness:
+def _find_change(path: str, dispersion: Any, change: _Change, verdict: Verdict, cases: CaseEvidence) -> Robustness:
     """Find the smallest change of one kind of a dispersion that turns PASS into FAIL."""
-    verdict, permitted = evidence.verdict, 1.0 - evidence.verdict.probability
-    rates = evidence.rates(change)
-    effective = np.minimum(rates.effective_units, change.efficiency * rates.effective_units[0])
-    crossing = find_crossing(change.sizes, rates, effective, permitted, decides_by_rate=verdict.decide_by == ESTIMATE)
-    # beyond the evaluated sizes of these kinds, there are no effective cases
-    is_complete = change.kind is Kind.MORE_FREQUENT
-    outcome = Outcome.REFUSED if crossing.outcome is Outcome.NONE and not is_complete else crossing.outcome
-    unit = dispersion.unit if dispersion.unit is not None else split_unit(path)[1]
-    quantities = [_quantity(dispersion, change, size) for size in (0.0, crossing.lower, crossing.change)]
-    spread = _moments(dispersion, 0.0, 1.0)[1]
-    value = ""
-    if isinstance(dispersion, Choice):
-        probability = quantities[0]
-        unit, spread = "", math.sqrt(probability * (1.0 - probability))
-        value = str(dispersion.values[change.value])
+    rates, by_rate = _rates(verdict, cases, change), verdict.decide_by == ESTIMATE
+    crossing = find_crossing(change.sizes, rates, 1.0 - verdict.probability, decides_by_rate=by_rate)
+    assumed, passes_at, fails_at = (
+        _quantity(dispersion, change, size) for size in (0.0, crossing.lower, crossing.change)
+    )
+    is_choice = isinstance(dispersion, Choice)
+    is_complete = is_choice and crossing.reach == float(change.sizes[-1])
     return Robustness(
-        verdict.requirement_id, path, change.kind, unit, quantities[0], spread, crossing.change, crossing.lower,
-        crossing.upper, quantities[1], quantities[2], crossing.reach, crossing.effective, verdict.confidence, outcome,
-        value,
-    )  # fmt: skip
+        verdict.requirement_id,
+        path,
+        change.kind,
+        "" if is_choice else split_unit(path)[1] if dispersion.unit is None else dispersion.unit,
+        assumed=assumed,
+        spread=math.sqrt(assumed * (1.0 - assumed)) if is_choice else _moments(dispersion, 0.0, 1.0)[1],
+        passes_at=passes_at,
+        fails_at=fails_at,
+        confidence=verdict.confidence,
+        outcome=Outcome.of(crossing, is_complete=is_complete),
+        value=str(dispersion.values[change.value]) if is_choice else "",
+        **asdict(crossing),
+    )
 
 
 def _quantity(dispersion: Any, change: _Change, size: float) -> float:
@@ -368,18 +312,18 @@ def _quantity(dispersion: Any, change: _Change, size: float) -> float:
         weights = dispersion.weights or [1.0] * len(dispersion.values)
         probability = weights[change.value] / sum(weights)
         return probability + size * math.sqrt(probability * (1.0 - probability))
-    sign = -1.0 if change.kind in (Kind.MEAN_DOWN, Kind.NARROWER) else 1.0
+    signed = -size if change.kind in (Kind.MEAN_DOWN, Kind.NARROWER) else size
     if change.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN):
-        return _moments(dispersion, sign * size, 1.0)[0]
-    return _moments(dispersion, 0.0, 1.0 + sign * size)[1]
+        return _moments(dispersion, signed, 1.0)[0]
+    return _moments(dispersion, 0.0, 1.0 + signed)[1]
 
 
 def _moments(dispersion: Any, shift: float, scale: float) -> tuple[float, float]:
     """Compute mean and standard deviation of a dispersion whose standard normal variable is shifted and scaled.
 
-    NaN if its parameters are formulas, or its values are no numbers.
+    NaN if its parameters are formulas.
     """
-    if isinstance(dispersion, Choice) or dispersion.formulas or math.isnan(shift + scale):
+    if dispersion.formulas or math.isnan(shift + scale):
         return math.nan, math.nan
     draws = np.clip(ndtr(shift + scale * _NODES), MIN_DRAW, MAX_DRAW)
     values = np.array([float(dispersion.quantile(draw)) for draw in draws.tolist()])
@@ -400,12 +344,13 @@ def _divergence(verdict: Verdict) -> Robustness:
     permitted = 1.0 - verdict.probability
     radii = [binary_divergence(permitted, 1.0 - rate) for rate in (verdict.estimate, verdict.lower, verdict.upper)]
     change, lower, upper = (math.sqrt(2.0 * radius) if math.isfinite(radius) else math.nan for radius in radii)
-    if verdict.decide_by == ESTIMATE:
-        lower = change
+    lower = change if verdict.decide_by == ESTIMATE else lower
+    crossing = Crossing(change, lower, upper, math.nan, float(verdict.n))
+    outcome = Outcome.of(crossing, is_complete=False)
     return Robustness(
-        verdict.requirement_id, ALL_DISPERSIONS, Kind.DIVERGENCE, "nat", 0.0, 1.0, change, lower, upper,
-        0.5 * lower**2, 0.5 * change**2, math.nan, float(verdict.n), verdict.confidence,
-        Outcome.REFUSED if math.isnan(change) else Outcome.FOUND,
+        verdict.requirement_id, ALL_DISPERSIONS, Kind.DIVERGENCE, "nat", assumed=0.0, spread=1.0,
+        passes_at=0.5 * lower**2, fails_at=0.5 * change**2, confidence=verdict.confidence, outcome=outcome,
+        **asdict(crossing),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -22,9 +22,9 @@ from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVari
 from marsyard.reports import rates
 from marsyard.reports.decision import collect_evidence
 from marsyard.reports.requirement_cases import compute_margins
-from marsyard.reports.robustness import Kind, Robustness, find_crossing
+from marsyard.reports.robustness import Kind, Outcome, Robustness
 from marsyard.reports.sampling_design import INDEPENDENT
-from marsyard.reports.statistics.weighted import weighted_rates
+from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.columns import split_unit
@@ -170,13 +170,11 @@ def _find_step(
         (verdict.confidence, verdict.confidence),
     )  # fmt: skip
     spread = abs(assumed) or abs(farthest)
-    crossing = find_crossing(
-        grid / spread, result, result.effective_units, 1.0 - verdict.probability,
-        decides_by_rate=verdict.decide_by == ESTIMATE,
-    )  # fmt: skip
+    by_rate = verdict.decide_by == ESTIMATE
+    crossing = find_crossing(grid / spread, result, 1.0 - verdict.probability, decides_by_rate=by_rate)
     step = math.copysign(spread, farthest - assumed)
     return Robustness(
-        verdict.requirement_id, path, Kind.VALUE, split_unit(path)[1], assumed, spread, crossing.change, crossing.lower,
-        crossing.upper, assumed + step * crossing.lower, assumed + step * crossing.change, crossing.reach,
-        crossing.effective, verdict.confidence, crossing.outcome,
+        verdict.requirement_id, path, Kind.VALUE, split_unit(path)[1], assumed=assumed, spread=spread,
+        passes_at=assumed + step * crossing.lower, fails_at=assumed + step * crossing.change,
+        confidence=verdict.confidence, outcome=Outcome.of(crossing, is_complete=False), **asdict(crossing),
     )  # fmt: skip
