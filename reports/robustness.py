@@ -150,14 +150,20 @@ class Robustness:
 
     @property
     def fail_text(self) -> str:
-        """The change to FAIL in words; empty if it is unknown."""
-        return self._describe(self.fails_at, self.change) if self.outcome is Outcome.FOUND else ""
+        """The estimated change to FAIL in words, with that for which PASS holds.
 
-    def _describe(self, value: float, change: float) -> str:
+        Empty if no change shows FAIL: the estimate can then be due to chance.
+        """
+        if self.outcome is not Outcome.FOUND or math.isnan(self.upper):
+            return ""
+        passes = "not shown" if math.isnan(self.lower) else f"up to {self.format_value(self.passes_at, self.lower)}"
+        return self._describe(self.fails_at, self.change, f"; PASS {passes}")
+
+    def _describe(self, value: float, change: float, addition: str = "") -> str:
         if self.kind is Kind.DIVERGENCE:
             return f"any change of {self.name} up to a divergence of {number(value)} nat"
-        assumed = "" if math.isnan(self.assumed) else f" ({self.format_value(self.assumed, 0.0)} assumed)"
-        return f"{self.name} {self.format_value(value, change)}{assumed}"
+        unknown = "the declared one" if math.isnan(self.assumed) else self.format_value(self.assumed, 0.0)
+        return f"{self.name} {self.format_value(value, change)} ({unknown} assumed{addition})"
 
 
 @dataclass(frozen=True)
@@ -204,12 +210,14 @@ def evaluate_robustness(
             for change in _list_changes(dispersion, coordinates[:, index]):
                 records += [_find_change(path, dispersion, change, *item) for item in evidence]
     order = {verdict.requirement_id: index for index, verdict in enumerate(met)}
-    return tuple(sorted(records, key=lambda item: (order[item.requirement], _sort_key(item))))
+    return tuple(sorted(records, key=lambda item: (order[item.requirement], sort_key(item))))
 
 
-def _sort_key(item: Robustness) -> tuple[bool, float]:
-    """Sort by the change for which PASS holds; changes that are limited by the reach of the cases are last."""
-    return math.isnan(item.lower) or item.lower == item.reach, item.lower
+def sort_key(item: Robustness) -> tuple[int, float]:
+    """Sort values of parameters, then changes to FAIL by their size, then the others by that for which PASS holds."""
+    if item.outcome is Outcome.FOUND:
+        return 0 if item.kind is Kind.VALUE else 1 if item.fail_text else 2, item.change
+    return 3, math.inf if math.isnan(item.lower) else item.lower
 
 
 def read_campaign(run: StoredRun) -> Campaign | None:
@@ -354,28 +362,24 @@ def _divergence(verdict: Verdict) -> Robustness:
     )  # fmt: skip
 
 
-def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_parameters: int = 3) -> str:
-    """Describe how far the PASS of a requirement reaches, and where it turns into FAIL; empty without records.
-
-    The parameters with the smallest changes are named.
-    """
+def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes: int = 3) -> str:
+    """Describe how far the PASS of a requirement reaches, and the nearest changes to FAIL; empty without records."""
     own = [item for item in records if item.requirement == verdict.requirement_id]
-    # a change that is only limited by the reach of the cases is no limit of the PASS
-    limits = [item for item in own if item.lower > 0.0 and item.lower != item.reach]
-    passes = [item.pass_text for item in _select_nearest(limits, max_parameters)]
-    fails = [item.fail_text for item in _select_nearest([item for item in own if item.fail_text], max_parameters)]
     if not own:
         return ""
-    condition = f"{format_fraction(verdict.confidence)} confidence, one change at a time"
-    first = f"PASS up to ({condition}): {'; '.join(passes)}." if passes else "PASS is not shown for any change."
-    if verdict.decide_by == ESTIMATE:
-        first = f"Met by the rate up to: {'; '.join(passes)}."
-    return f"{first} Estimated change to FAIL: {'; '.join(fails) or 'unknown, too few cases fail'}."
-
-
-def _select_nearest(records: Sequence[Robustness], max_parameters: int) -> list[Robustness]:
-    """Select one record of each of the parameters with the smallest changes; parameters with values are first."""
-    ordered = sorted(records, key=lambda item: (item.kind is not Kind.VALUE, _sort_key(item)))
-    single = {item.parameter: item for item in reversed(ordered) if item.kind is not Kind.DIVERGENCE}
-    chosen = [item for item in ordered if single.get(item.parameter) is item][:max_parameters]
-    return [*chosen, *(item for item in ordered if item.kind is Kind.DIVERGENCE)]
+    shifts = [item.lower for item in own if item.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN) and item.lower > 0.0]
+    factors = [item.lower for item in own if item.kind is Kind.WIDER and item.lower > 0.0]
+    ball = next(item for item in own if item.kind is Kind.DIVERGENCE)
+    ranges = [f"for a shift of any mean by {number(min(shifts))} standard deviations"] if shifts else []
+    ranges += [f"for any standard deviation up to + {percent(min(factors))}"] if factors else []
+    ranges.append(f"for any change of all dispersions up to a divergence of {number(ball.passes_at)} nat")
+    nearest: dict[str, Robustness] = {}
+    for item in sorted(own, key=sort_key):
+        if item.fail_text and item is not ball:
+            nearest.setdefault(item.parameter, item)
+    changes = "; ".join(item.fail_text for item in [*nearest.values()][:max_changes])
+    word = "Met by the rate" if verdict.decide_by == ESTIMATE else "PASS holds"
+    return (
+        f"{word} ({format_fraction(verdict.confidence)} confidence, one change at a time) {', '.join(ranges)}. "
+        f"Nearest changes to FAIL: {changes or 'unknown, because too few cases fail'}."
+    )

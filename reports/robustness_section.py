@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from marsyard.campaigns.studies.results import ROBUST
-from marsyard.reports.robustness import ALL_DISPERSIONS, Kind, Outcome, Robustness
+from marsyard.reports.robustness import ALL_DISPERSIONS, Kind, Outcome, Robustness, sort_key
 from marsyard.reports.section import MARKERS, MUTED, SERIES, Block, Grid, Section, in_page_style, new_axes, svg_figure
 from marsyard.reports.variants import VariantVerdict
 from marsyard.reports.verdicts import Status
@@ -79,44 +79,38 @@ def _verdict_text(item: VariantVerdict | None) -> str:
 
 @in_page_style
 def _draw(records: Sequence[Robustness]) -> Figure:
-    """Draw for each parameter and requirement the smallest change of any kind, in assumed spreads."""
-    nearest: dict[tuple[str, str], Robustness] = {}
-    for item in records:
-        key = (item.parameter, item.requirement)
-        if not math.isnan(item.lower) and (key not in nearest or item.lower < nearest[key].lower):
-            nearest[key] = item
-    order = sorted(nearest, key=lambda key: (key[0] != ALL_DISPERSIONS, nearest[key].lower))
-    parameters = list(dict.fromkeys(parameter for parameter, _ in order))[:_MAX_PARAMETERS]
+    """Draw the changes of parameters for each requirement, in assumed spreads; those to FAIL are first."""
+    drawn = {(item.parameter, item.value, item.kind, item.requirement): item for item in records}
+    ordered = sorted(records, key=lambda item: (item.kind is not Kind.DIVERGENCE, *sort_key(item)))
+    keys = list(dict.fromkeys((item.parameter, item.value, item.kind) for item in ordered))[:_MAX_PARAMETERS]
     requirements = list(dict.fromkeys(item.requirement for item in records))
-    figure, axes = new_axes(8.6, 1.3 + 0.36 * max(len(parameters), 1))
-    offsets = 0.5 * (np.arange(len(requirements)) - 0.5 * (len(requirements) - 1)) / max(len(requirements), 1)
+    figure, axes = new_axes(8.6, 1.3 + 0.36 * len(keys))
     for index, requirement in enumerate(requirements):
         style: dict[str, Any] = {"color": SERIES[index % len(SERIES)]}
-        axes.plot([], [], marker=MARKERS[index % len(MARKERS)], label=requirement, linewidth=3.0, **style)
-        for row, parameter in enumerate(parameters):
-            if (parameter, requirement) not in nearest:
+        marker: dict[str, Any] = {"marker": MARKERS[index % len(MARKERS)], "markersize": 5.5, **style}
+        axes.plot([], [], label=requirement, linewidth=3.0, **marker)
+        offset = 0.5 * (index - 0.5 * (len(requirements) - 1)) / len(requirements)
+        for row, key in enumerate(keys):
+            item = drawn.get((*key, requirement))
+            if item is None:
                 continue
-            item = nearest[parameter, requirement]
-            y = row + offsets[index]
-            axes.plot([0.0, item.lower], [y, y], linewidth=3.0, solid_capstyle="butt", **style)
-            end = item.upper if math.isfinite(item.upper) else item.reach
-            if math.isfinite(end):
-                axes.plot([item.lower, end], [y, y], linewidth=0.9, **style)
-            if math.isfinite(item.change):
-                axes.plot([item.change], [y], marker=MARKERS[index % len(MARKERS)], markersize=5.5, **style)
-    axes.set_yticks(range(len(parameters)), parameters)
+            lower, y = np.nan_to_num(item.lower), [row + offset] * 2
+            axes.plot([0.0, lower], y, linewidth=3.0, solid_capstyle="butt", **style)
+            axes.plot([lower, item.upper if math.isfinite(item.upper) else item.reach], y, linewidth=0.9, **style)
+            axes.plot([item.change], y[:1], **marker)
+    names = [f"{parameter}{f' = {value}' if value else ''}, {kind}" for parameter, value, kind in keys]
+    axes.set_yticks(range(len(keys)), [ALL_DISPERSIONS if name.startswith(ALL_DISPERSIONS) else name for name in names])
     axes.invert_yaxis()
     axes.set(xlabel="change, assumed spreads", xlim=(0.0, None))
     axes.grid(visible=False, axis="y")
-    if requirements:
-        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(requirements), labelcolor=MUTED)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(requirements), labelcolor=MUTED)
     return figure
 
 
 def _figure(records: Sequence[Robustness]) -> Any:
     caption = (
-        "Smallest change of each parameter. Thick lines: PASS holds. Marks: the estimated rate reaches the permitted "
-        "rate (FAIL). Thin lines end where FAIL is shown, or where the cases say nothing further."
+        "Changes of parameters, those to FAIL first. Thick lines: PASS holds. Marks: the estimated rate reaches the "
+        "permitted rate (FAIL). Thin lines end where FAIL is shown, or where the cases say nothing further."
     )
     return svg_figure(_draw(records), "robustness", caption, wide=True)
 

@@ -251,14 +251,27 @@ def test_rows_with_other_draws_are_not_weighted(tmp_path: Path) -> None:
     assert [item.kind for item in records] == [Kind.DIVERGENCE]
 
 
-def test_sentence_names_the_nearest_changes(tmp_path: Path) -> None:
-    verdicts, _, records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
-    text = robustness_text(verdicts[0], records)
-    assert text.startswith("PASS up to (90 % confidence, one change at a time): standard deviation of loads 0 2.")
-    assert "(2.000 assumed)" in text
+def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
+    verdicts, records, all_records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
+    text = robustness_text(verdicts[0], all_records)
+    means = [item.lower for key, item in records.items() if key[1] in (Kind.MEAN_UP, Kind.MEAN_DOWN)]
+    assert f"(90 % confidence, one change at a time) for a shift of any mean by {min(means):.4f}"[:-1] in text
     assert "any change of all dispersions up to a divergence of 0.0" in text
-    assert "Estimated change to FAIL: standard deviation of loads 0 2." in text
-    assert "at least" not in text
+    wider, up = records["loads.0", Kind.WIDER], records["loads.0", Kind.MEAN_UP]
+    nearest = wider if wider.change < up.change else up
+    assert f"Nearest changes to FAIL: {nearest.fail_text}" in text
+    assert " assumed; PASS up to " in nearest.fail_text
+
+
+def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:
+    """Three failures give estimates of changes to FAIL, but do not show FAIL: the sentence does not name them."""
+    verdicts, records, all_records = evaluate(
+        tmp_path, 1000, 0.98, lambda first, second, kind: np.argsort(np.argsort(-first)) < 3
+    )
+    assert records["loads.0", Kind.MEAN_UP].outcome is Outcome.FOUND
+    assert records["loads.0", Kind.MEAN_UP].effective_cases >= 30.0
+    assert math.isnan(records["loads.0", Kind.WIDER].upper)
+    assert "standard deviation of loads 0" not in robustness_text(verdicts[0], all_records)
 
 
 @pytest.mark.slow
