@@ -141,7 +141,7 @@ class Result:
 
     @property
     def variants(self) -> pd.DataFrame:
-        """Verdicts under other models (`marsyard robust --variants`), one row per variant and requirement."""
+        """Verdicts under other models (`marsyard robust --variant`), one row per variant and requirement."""
         return pd.DataFrame([asdict(item) for item in self.evaluation.variants])
 
     def failures(self, requirement: str | None = None) -> pd.DataFrame:

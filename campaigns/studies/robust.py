@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int
 from pydantic import ValidationError
 from scipy.special import ndtri
+from scipy.stats import rankdata
 
 from marsyard.campaigns.definition.campaign import Campaign, value_at
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
@@ -42,7 +43,7 @@ from marsyard.sim.streams import Streams
 
 #: Number of steps from the assumed value of a parameter to the farthest one.
 STEPS = 3
-#: Minimum number of cases: the effective number of cases is at least half of them, and the minimum of that is 30.
+#: Minimum number of cases: their effective number is at least half of them, of which verdicts need 30.
 MIN_CASES = 60
 #: Number of cases that are evaluated together.
 _BATCH = 8
@@ -65,6 +66,8 @@ def start_robust(
     Raises CampaignError for an unsuitable run, parameter or folder. On KeyboardInterrupt all finished rows are stored,
     and `continue_robust` continues.
     """
+    if cases < MIN_CASES:
+        raise CampaignError(f"--cases {cases}: at least {MIN_CASES}, so that the effective number of cases is 30")
     definition = record.stored_definition(run)
     campaign = _load_run(run, definition)
     steps = [step for path, value in farthest.items() for step in _list_steps(campaign, path, value)]
@@ -99,7 +102,8 @@ def choose_cases(
     if count >= numbers.size:
         return numbers, np.ones(numbers.size)
     margins = np.array([[compute_margin(row, item) for row in rows] for item in requirements])
-    ranks = margins.argsort(axis=1, kind="stable").argsort(axis=1).min(axis=0)
+    # equal margins, such as those of a metric that is only true or false, have the rank of the last one
+    ranks = rankdata(margins, method="max", axis=1).min(axis=0)
     order = np.argsort(ranks, kind="stable")
     nearest, others = order[: count // 2], order[count // 2 :]
     sample = rng.choice(others, count - nearest.size, replace=False)

@@ -200,9 +200,12 @@ class RobustOptions:
             help="Run cases with other values of a parameter that the campaign does not disperse, up to VALUE.",
         ),
     ] = None
-    variants: Annotated[bool, Option("--variants", help="Run cases with each alternative model of the system.")] = False
+    variant: Annotated[
+        list[str] | None,
+        Option(metavar="NAME", help="Run cases with an alternative model of the system; `all`: with each of them."),
+    ] = None
     cases: Annotated[
-        int, Option("-n", "--cases", metavar="N", min=60, help="Cases of each value and model; of those of the run.")
+        int, Option("-n", "--cases", metavar="N", help="Cases of the run, at least 60, for each value and model.")
     ] = 100
     jobs: options.JobsOption = None
     cluster: options.ClusterOption = None
@@ -216,13 +219,18 @@ def robust(arguments: RobustOptions) -> None:
     Cases are run only for parameters that the campaign does not disperse, and for other models.
     """
     from marsyard.campaigns.definition.variants import system_variants
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
     from marsyard.campaigns.store.record import stored_definition
     from marsyard.campaigns.studies.results import ROBUST_FOLDER
     from marsyard.campaigns.studies.robust import start_robust
 
     run, farthest = arguments.directory, _read_farthest(arguments.parameter or [])
-    variants = system_variants(stored_definition(run).scenario) if arguments.variants else ()
-    if farthest or arguments.variants:
+    available = {item.name: item for item in system_variants(stored_definition(run).scenario)}
+    for name in arguments.variant or ():
+        if name not in available and name != "all":
+            raise CampaignError(f"--variant: {unknown_name_message('variant', name, ['all', *available])}")
+    variants = [item for name, item in available.items() if {name, "all"} & {*(arguments.variant or ())}]
+    if farthest or arguments.variant:
         directory = default_directory(ROBUST_FOLDER, run / ROBUST_FOLDER)
         executor = make_executor(arguments.jobs, arguments.cluster)
         with show_progress(directory, f"marsyard resume {directory}") as progress:

@@ -235,6 +235,22 @@ def test_pass_at_no_change_is_that_of_the_verdict(tmp_path: Path, failures: int)
         assert not records
 
 
+@pytest.mark.parametrize("failures", [0, 2, 6])
+def test_shared_terrains_are_the_units(tmp_path: Path, failures: int) -> None:
+    """600 cases on 200 terrains: the effective number is that of terrains, and PASS holds where the verdict has it."""
+    verdicts, records, _ = evaluate(
+        tmp_path, 600, 0.9, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures,
+        terrain=np.arange(600) // 3,
+    )  # fmt: skip
+    assert verdicts[0].status is Status.PASS
+    item = records["loads.0", Kind.MEAN_UP]
+    independent = evaluate(tmp_path, 600, 0.9, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures)[
+        1
+    ]["loads.0", Kind.MEAN_UP]
+    assert 0.0 < item.lower < independent.lower
+    assert item.effective_cases <= 200.0
+
+
 def test_unfinished_cases_are_failures(tmp_path: Path) -> None:
     """Crashed cases with large z0 count as failures at their weights, although their metric is unknown."""
     first = evaluate(tmp_path, 400, 0.9, lambda first, second, kind: first > 9.0)[1]["loads.0", Kind.MEAN_UP]

@@ -69,8 +69,8 @@ def test_change_of_a_fixed_parameter(run: Path) -> None:
     assert len(rows) == 600
     # the same dispersions and noise: only beta differs, in steps of 0.5
     for case in (0, 1, 199):
-        loads = [row["load"] for row in rows[3 * case : 3 * case + 3]]
-        assert loads == pytest.approx([base[case]["load"] + step for step in (0.5, 1.0, 1.5)], abs=1e-9)
+        repeated = [row["load"] for row in rows[3 * case : 3 * case + 3]]
+        assert repeated == pytest.approx([base[case]["load"] + step for step in (0.5, 1.0, 1.5)], abs=1e-9)
     assert StudyPoint.read(rows[0]["standard_point"]).values == (("beta", 2.0),)
     assert replay(directory, 4).differing == ()
 
@@ -97,6 +97,13 @@ def test_choice_of_cases_represents_all_cases() -> None:
     assert set(chosen[weights == 1.0].tolist()) == nearest
     assert weights.sum() == pytest.approx(500.0)
     assert (np.diff(chosen) > 0).all()
+    # cases that only violate or not: the violations are chosen
+    flag = Requirement.model_validate({"id": "F", "metric": "ok", "probability": 0.95, "confidence": 0.9})
+    for row in rows:
+        row["ok"] = row["case"] not in (400, 450)
+    chosen, weights = choose_cases(rows, [requirement, flag], 80, np.random.default_rng(1))
+    assert {400, 450} <= set(chosen[weights == 1.0].tolist())
+    assert len(nearest & set(chosen[weights == 1.0].tolist())) >= 38
     everything, ones = choose_cases(rows, [requirement], 500, np.random.default_rng(1))
     assert (everything == np.arange(500)).all()
     assert (ones == 1.0).all()
@@ -243,6 +250,18 @@ def test_study_is_no_run(run: Path) -> None:
     directory = study(run, {"beta": 1.0}, cases=60)
     with pytest.raises(CampaignError, match="its cases are not independent random draws"):
         study(directory, {"beta": 1.0})
+
+
+def test_unknown_variant_is_one_message(run: Path) -> None:
+    result = CliRunner().invoke(app, ["robust", str(run), "--variant", "lambert"])
+    assert result.exit_code == 2
+    assert "--variant: unknown variant 'lambert'" in result.output
+
+
+def test_too_few_cases_are_one_message(run: Path) -> None:
+    result = CliRunner().invoke(app, ["robust", str(run), "--parameter", "beta=1", "-n", "20"])
+    assert result.exit_code == 2
+    assert "--cases 20: at least 60" in result.output
 
 
 @pytest.mark.parametrize("text", ["beta", "beta=", "beta=two", "beta=nan"])
