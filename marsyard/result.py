@@ -131,6 +131,19 @@ class Result:
         index = pd.Index([item.requirement_id for item in self.evaluation.verdicts], name="requirement")
         return pd.DataFrame(rows, index=index, columns=list(_VERDICT_COLUMNS))
 
+    def robustness(self) -> pd.DataFrame:
+        """Return the smallest changes that turn PASS into FAIL, one row per requirement, parameter and kind of change.
+
+        The columns are those of `marsyard.reports.robustness.Robustness`; changes are in assumed spreads.
+        """
+        records = [asdict(item) | {"text": item.pass_text} for item in self.evaluation.robustness]
+        return pd.DataFrame(records).set_index("requirement") if records else pd.DataFrame()
+
+    @property
+    def variants(self) -> pd.DataFrame:
+        """Verdicts under other models (`marsyard robust --variant`), one row per variant and requirement."""
+        return pd.DataFrame([asdict(item) for item in self.evaluation.variants])
+
     def failures(self, requirement: str | None = None) -> pd.DataFrame:
         """Return the rows of the violations, the largest excess first; of any requirement if None.
 

@@ -31,6 +31,8 @@ from marsyard.reports.presentation import presentations
 from marsyard.reports.rare import rare_section, rare_sentences
 from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
 from marsyard.reports.requirement_cases import CaseFinder
+from marsyard.reports.robustness import robustness_text
+from marsyard.reports.robustness_section import robust_sentences, robustness_section
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.search import search_section, search_sentences
 from marsyard.reports.section import Grid, Section, SectionMaker, Subject
@@ -83,7 +85,9 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     bound = metric_verdicts[0].bound / metric_verdicts[0].scale if metric_verdicts else None
     subject = Subject(random_run, metric, bound)
     makers = STUDY_SECTIONS if is_study else section_makers()
-    extra_sections = [section for maker in makers if (section := maker(subject)) is not None]
+    robustness = robustness_section(evaluation.robustness, evaluation.variants)
+    made_sections = [robustness, *(maker(subject) for maker in makers)]
+    extra_sections = [section for section in made_sections if section is not None]
     report = build_report(evaluation, subject, extra_sections)
     algorithms = read_algorithms(run.record)
     write_atomic(
@@ -97,6 +101,8 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     context = page_context(run, subject, verdicts, overall_verdict, extra_sections)
     context["evidence"] = evaluation.evidence
     context["cautions"] += evaluation.validity.sentences
+    for row in context["verdicts"]:
+        row["robustness"] = robustness_text(row["verdict"], evaluation.robustness)
     write_atomic(page_file, hide_folders(page_environment().get_template("report.html.j2").render(context)))
     with suppress(StoreError, RuntimeError):  # without a key or a home folder, the dashboard writes the report again
         sign_report(directory, run.directory)
@@ -199,7 +205,8 @@ def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
 
 def study_sentences(record: Mapping[str, Any]) -> list[str]:
     """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
-    return [*rare_sentences(record), *search_sentences(record), *budget_sentences(record)]
+    sentences = (rare_sentences, search_sentences, budget_sentences, robust_sentences)
+    return [text for describe in sentences for text in describe(record)]
 
 
 def describe_study(record: Mapping[str, Any]) -> StudySummary | None:
@@ -210,7 +217,7 @@ def describe_study(record: Mapping[str, Any]) -> StudySummary | None:
     # the first sentence of a rare study is its verdict, the second the probability
     main_sentences = sentences[1:2] if study.get("kind") == "rare" else sentences[:1]
     sentence = "".join(main_sentences) or "The study is not finished."
-    return StudySummary(str(study.get("kind")), str(study.get("requirement")), sentence)
+    return StudySummary(str(study.get("kind")), str(study.get("requirement") or ""), sentence)
 
 
 def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> CampaignReport:
@@ -241,6 +248,7 @@ def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Seque
         validity=evaluation.validity,
         sections={section.key: section.data for section in extra_sections},
         showcases=run.stored_cases,
+        robustness=evaluation.robustness,
     )
 
 

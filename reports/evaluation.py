@@ -1,6 +1,6 @@
 """Evaluation of a stored campaign: overall verdict, exit status, and the next evaluation of a sequential campaign.
 
-A study is a run of `marsyard rare`, `search` or `budget`; its verdict does not follow from success rates.
+A study is a run of `marsyard rare`, `search`, `budget` or `robust`; its verdict does not follow from success rates.
 """
 
 from __future__ import annotations
@@ -17,15 +17,23 @@ import pandas as pd
 from marsyard.campaigns.definition.claims import requirement_key
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
 from marsyard.campaigns.store.confirmations import add_result
-from marsyard.campaigns.studies.results import BUDGET, RARE, SEARCH
+from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.overall import QUALIFIED_EXIT_CODE, OverallVerdict, combine_verdicts, compute_exit_code
 from marsyard.reports.rates import engine_failed
+from marsyard.reports.robustness import Robustness, evaluate_robustness
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
 from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
 from marsyard.reports.stored import StoredRun, read_columns, read_run, table
 from marsyard.reports.validity import Validity, assess_validity
+from marsyard.reports.variants import (
+    RobustStudy,
+    VariantVerdict,
+    evaluate_steps,
+    evaluate_variants,
+    read_robust_studies,
+)
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count
 
@@ -62,6 +70,21 @@ class Evaluation:
             return {Status.PASS: 0, Status.FAIL: 1}.get(self.overall_verdict.status, 3)
         exit_code = compute_exit_code(self.verdicts, bool(self.overall_verdict.crashed))
         return exit_code or (QUALIFIED_EXIT_CODE if self.is_qualified else 0)
+
+    @cached_property
+    def robustness(self) -> tuple[Robustness, ...]:
+        """Changes that turn PASS into FAIL, from the cases of the run and from those of its studies `robust`."""
+        steps = evaluate_steps(self.run, self._robust_studies, self.verdicts)
+        return (*steps, *evaluate_robustness(self.run, self.verdicts, self.sampling))
+
+    @cached_property
+    def variants(self) -> tuple[VariantVerdict, ...]:
+        """Verdicts in the named variants that studies `robust` have run."""
+        return evaluate_variants(self._robust_studies, self.verdicts)
+
+    @cached_property
+    def _robust_studies(self) -> list[RobustStudy]:
+        return read_robust_studies(self.run) if self.verdicts else []
 
 
 def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
@@ -127,6 +150,8 @@ def _evaluate_study(record: Mapping[str, Any], frame: pd.DataFrame) -> OverallVe
         parameters, found = search
         sentence = f"{count(found.violations, 'violation')} of {parameters.requirement} found. See the section."
         return OverallVerdict(Status.FAIL if found.violations else None, crashed, sentence, _NO_VERDICT)
+    if ROBUST.read(record):
+        return OverallVerdict(None, crashed, "The report of the run evaluates the study.", _NO_VERDICT)
     if BUDGET.read(record):
         return OverallVerdict(None, crashed, "The study computes an error budget. See the section.", _NO_VERDICT)
     if rare := RARE.read(record):

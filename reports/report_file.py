@@ -10,6 +10,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from marsyard.campaigns.definition.evidence import Evidence
+from marsyard.reports.robustness import Robustness
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.samples import ErrorSummary
 from marsyard.reports.traceability import Algorithm
@@ -24,12 +25,13 @@ Schema = Literal[8]
 SCHEMA: Schema = 8
 #: Properties that `report.json` contains next to the fields of verdicts, sampling design and evidence.
 _VERDICT_PROPERTIES = ("note", "plain_status", "confident_status", "margin")
+_ROBUSTNESS_PROPERTIES = ("name", "pass_text", "fail_text")
 _SAMPLING_PROPERTIES, _EVIDENCE_PROPERTIES = ("independent", "text"), ("title", "text")
 
 
 @dataclass(frozen=True)
 class StudySummary:
-    """Kind (`rare`, `search`, `budget`), requirement and main result of a study."""
+    """Kind (`rare`, `search`, `budget`, `robust`), requirement and main result of a study."""
 
     kind: str
     requirement: str
@@ -54,6 +56,8 @@ class CampaignReport:
     - validity: cases outside of the conditions in which the simulation was checked, and missed checks
     - sections: data of each further section of the page, by the section's anchor
     - showcases: cases with stored products
+    - robustness: for each requirement that is met, the smallest change of each kind that turns PASS into FAIL, with the
+      properties `name`, `pass_text` and `fail_text`
     """
 
     schema: Schema
@@ -82,11 +86,13 @@ class CampaignReport:
     validity: Validity
     sections: Mapping[str, Mapping[str, Any]]
     showcases: tuple[int, ...]
+    robustness: tuple[Robustness, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Convert to types of JSON; NaN and infinities become None, folders of the user are hidden."""
         values = asdict(self)
         values["verdicts"] = [asdict(verdict) | _properties(verdict, _VERDICT_PROPERTIES) for verdict in self.verdicts]
+        values["robustness"] = [asdict(item) | _properties(item, _ROBUSTNESS_PROPERTIES) for item in self.robustness]
         values["sampling"] |= _properties(self.sampling, _SAMPLING_PROPERTIES)
         values["evidence"] = self.evidence.to_table() | _properties(self.evidence, _EVIDENCE_PROPERTIES)
         return dict(_to_json_types(values))

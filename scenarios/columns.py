@@ -18,7 +18,8 @@ from marsyard.scenarios.systems import find_system, systems
 
 #: Units by the ends of column names.
 _UNITS = {
-    "_deg_h_k": "deg/h/K", "_m_s2": "m/s²", "_deg_s": "deg/s", "_rad_s": "rad/s", "_m_s": "m/s", "_m2": "m²",
+    "_deg_h_k": "deg/h/K", "_deg_h": "deg/h", "_m_s2": "m/s²", "_deg_s": "deg/s", "_rad_s": "rad/s", "_m_s": "m/s",
+    "_m2": "m²", "_mrad": "mrad", "_ppm": "ppm",
     "_deg": "deg", "_rad": "rad", "_km": "km", "_mm": "mm", "_cm": "cm", "_px": "px", "_dn": "DN", "_ms": "ms",
     "_kg": "kg", "_m": "m", "_s": "s", "_k": "K",
 }  # fmt: skip

@@ -51,7 +51,7 @@ class System:
     - tasks: each a `marsyard.scenarios.tasks.Task`: the published algorithm, the baselines, and the accepted forms
       of a user's algorithm. Entry points of the group `marsyard.algorithms` add algorithms.
     - folder: its files: campaigns in the folder `catalogue`, and the requirements that campaigns reference by id in
-      `requirements.toml` (docs/reports.md)
+      `requirements.toml` (docs/reports.md), and alternative models in `variants.toml` (docs/robustness.md)
     - columns: columns of the rows, each a `marsyard.scenarios.columns.Columns`, by scenario. Without them, requirements
       are checked against the first finished case.
     - compilation_campaigns: campaigns of the catalogue, each with overrides (``KEY=VALUE``) for a small one. One case

@@ -71,6 +71,13 @@ class Campaign:
         """Create the random streams of a case at a point of a study."""
         return replace(self.streams(point.stream), blend=point.blend)
 
+    def at(self, point: StudyPoint) -> Campaign:
+        """Return the campaign with the parameters that a point of a study replaces."""
+        if not point.values:
+            return self
+        parameters = replace_values(self.definition.parameters, dict(point.values))
+        return replace(self, definition=self.definition.model_copy(update={"parameters": parameters}))
+
     def draws(self, case: int) -> dict[str, Any]:
         """Compute the sampled values of a case by parameter path, in the order of the file.
 
@@ -115,10 +122,7 @@ class Campaign:
         if position is None:
             return None
         if definition.design.kind == "random":
-            streams = self.streams(case)
-            uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in paths}
-            independent = {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
-            numbers = correlate_groups(independent, definition.correlations)
+            numbers = correlate_groups(self.draw_uniform(case), definition.correlations)
         else:
             groups = tuple(
                 (tuple(map(paths.index, group.parameters)), tuple(map(tuple, group.factor.tolist())))
@@ -136,6 +140,12 @@ class Campaign:
             numbers = dict(zip(paths, design[position.design_index].tolist(), strict=True))
         grids = {path: len(grid.points) for path, grid in definition.grids.items()}
         return {**numbers, **compute_grid_quantiles(grids, position.grid_point)}
+
+    def draw_uniform(self, case: int) -> dict[str, float]:
+        """Draw the independent uniform numbers of a case of a random design, before the correlation of groups."""
+        streams = self.streams(case)
+        uniform = {path: streams.generator(f"dispersion:{stream_name(path)}").random() for path in self.drawn_paths}
+        return {path: max(float(value), MIN_DRAW) for path, value in uniform.items()}
 
     @cached_property
     def marginals(self) -> Mapping[str, Dispersion]:

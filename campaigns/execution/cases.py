@@ -82,6 +82,8 @@ def run_case(
     try:
         campaign = _load_campaign(definition)
         wall_start_s, cpu_start_s = time.perf_counter(), time.process_time()
+        if point is not None:
+            campaign = campaign.at(point)
         values = campaign.draws(case) if point is None else campaign.draws_at(point)
         draws = list_draws(values)
         with recording_timelines(selection.timelines):
@@ -159,7 +161,7 @@ def _build_terminated_row(definition: CampaignDefinition, result: TaskResult[Any
     case, error, draws = result.item, result.error, {}
     campaign = Campaign(definition, scenario(definition.scenario))
     with suppress(ValueError):  # an undefined formula also ends the case in its worker
-        draws = list_draws(campaign.draws(case) if point is None else campaign.draws_at(point))
+        draws = list_draws(campaign.draws(case) if point is None else campaign.at(point).draws_at(point))
     if not isinstance(error, WorkerExitError):
         return make_unfinished_row(case, CRASHED, describe_error(error), "", draws)
     trace = error.trace

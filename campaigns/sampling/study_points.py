@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from scipy.special import ndtr
@@ -31,6 +31,7 @@ class StudyPoint:
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have (`marsyard.scenarios.error_sources`)
     - blend: components of blended random streams, of which `stream` is the newest; empty for one component
+    - values: paths and values of parameters that replace those of the campaign
     """
 
     coordinates: tuple[float, ...]
@@ -38,23 +39,26 @@ class StudyPoint:
     nominal: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     blend: Blend = ()
+    values: tuple[tuple[str, Any], ...] = ()
 
     @classmethod
     def read(cls, text: str) -> Self:
         """Read a point from its text. Raises ValueError for any other text."""
         try:
-            coordinates, stream, nominal, removed, *blends = json.loads(text)
-            blend = tuple((int(number), float(weight)) for number, weight in (blends[0] if blends else ()))
+            coordinates, stream, nominal, removed, *rest = json.loads(text)
+            blends, values = [*rest, [], []][:2]
+            blend = tuple((int(number), float(weight)) for number, weight in blends)
             names = tuple(map(str, nominal)), tuple(map(str, removed))
-            return cls(tuple(map(float, coordinates)), int(stream), *names, blend)
+            replaced = tuple((str(path), value) for path, value in values)
+            return cls(tuple(map(float, coordinates)), int(stream), *names, blend, replaced)
         except (TypeError, ValueError) as error:
             raise ValueError(f"not a point of a study: {text!r:.100}") from error
 
     @property
     def text(self) -> str:
         """The point as text, without loss of precision."""
-        blend = [self.blend] if self.blend else []
-        return json.dumps([self.coordinates, self.stream, self.nominal, self.removed, *blend])
+        rest = [self.blend, self.values] if self.values else [self.blend] if self.blend else []
+        return json.dumps([self.coordinates, self.stream, self.nominal, self.removed, *rest])
 
 
 def transform_to_uniform(

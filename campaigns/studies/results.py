@@ -1,4 +1,4 @@
-"""Parameters and results of the three kinds of studies, which the record of a study contains (`study_record`)."""
+"""Parameters and results of the four kinds of studies, which the record of a study contains (`study_record`)."""
 
 from __future__ import annotations
 
@@ -236,6 +236,49 @@ class BudgetResult:
 
 
 BUDGET = StudyKind("budget", "an error budget (marsyard budget)", BudgetParameters, BudgetResult)
+
+
+@dataclass(frozen=True)
+class RobustVariant:
+    """A variant of the cases of a run: values of parameters that replace those of the campaign, by path.
+
+    parameter: path of the parameter that is changed in steps; empty for a named variant
+    """
+
+    name: str
+    title: str
+    values: dict[str, Any]
+    parameter: str = ""
+
+
+@dataclass(frozen=True)
+class RobustParameters:
+    """Parameters of the study.
+
+    - variants: named variants, and steps of parameters in increasing distance from the assumed value
+    - cases, weights: cases of the run that each variant repeats, and the number of its cases that each represents
+    """
+
+    variants: tuple[RobustVariant, ...]
+    cases: tuple[int, ...]
+    weights: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RobustResult:
+    """Result of the study: number of cases that were run."""
+
+    cases: int
+
+    @property
+    def exit_code(self) -> int:
+        """Exit status of the command."""
+        return 0
+
+
+#: Folder of the studies `robust` of a run, in the folder of the run.
+ROBUST_FOLDER = "robust"
+ROBUST = StudyKind("robust", "cases of other parameters (marsyard robust)", RobustParameters, RobustResult)
 
 
 def _check(conditions: Mapping[str, bool]) -> None:

@@ -1,4 +1,4 @@
-"""Run and continue studies (`rare`, `search`, `budget`), which choose the points of their cases.
+"""Run and continue studies (`rare`, `search`, `budget`, `robust`), which choose the points of their cases.
 
 A point consists of standard normal numbers and a number of random streams (`marsyard.campaigns.sampling.study_points`).
 
@@ -38,7 +38,7 @@ from marsyard.campaigns.store.origin import check_rows, describe_origin
 from marsyard.campaigns.store.products import ProductSelection
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
-from marsyard.campaigns.studies.results import BudgetResult, RareResult, SearchResult
+from marsyard.campaigns.studies.results import BudgetResult, RareResult, RobustResult, SearchResult
 from marsyard.campaigns.studies.study_record import STUDY_KEY, StudyKind
 from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.sim.streams import Blend
@@ -48,7 +48,7 @@ _MAX_FIRST_CRASHES = 20
 
 
 Parameters = TypeVar("Parameters")
-Result = TypeVar("Result", bound=RareResult | SearchResult | BudgetResult)
+Result = TypeVar("Result", bound=RareResult | SearchResult | BudgetResult | RobustResult)
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class Candidate:
     - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
     - removed: names of the sources of error that the case does not have
     - blend: components of the random streams, the last with the number `NEW_STREAM`; empty for one component
+    - values: paths and values of parameters that replace those of the campaign
     """
 
     coordinates: tuple[float, ...]
@@ -87,12 +88,13 @@ class Candidate:
     nominal: tuple[str, ...] = ()
     removed: tuple[str, ...] = ()
     blend: Blend = ()
+    values: tuple[tuple[str, Any], ...] = ()
 
     def point(self, case: int) -> StudyPoint:
         """Return the point of the candidate as a case; new streams have the number of the case."""
         stream = case if self.stream is None else self.stream
         blend = tuple((case if number == NEW_STREAM else number, weight) for number, weight in self.blend)
-        return StudyPoint(self.coordinates, stream, self.nominal, self.removed, blend)
+        return StudyPoint(self.coordinates, stream, self.nominal, self.removed, blend, self.values)
 
 
 class PointRunner:
@@ -159,10 +161,11 @@ class PointRunner:
         return [rows[case] for case in points]
 
 
-def prepare_campaign(campaign: Campaign, max_cases: int) -> Campaign:
+def prepare_campaign(campaign: Campaign, max_cases: int, streams: int | None = None) -> Campaign:
     """Return the campaign with the design `adaptive` and at most `max_cases` cases.
 
-    A number `in-turn` that does not repeat within the study belongs to the random streams: it follows their number.
+    A number `in-turn` that does not repeat within the `streams` of the study (one per case by default) belongs to the
+    random streams: it follows their number.
     Raises CampaignError if a dispersion is neither a standard normal variable nor such a number.
     """
     definition = campaign.definition
@@ -172,9 +175,9 @@ def prepare_campaign(campaign: Campaign, max_cases: int) -> Campaign:
             raise CampaignError(f"dispersions.{path}: is a distribution 'grid', which has no probabilities; {remedy}")
         if isinstance(dispersion, CyclicInteger):
             inputs = {name: value_at(definition.parameters, name) for name in dispersion.names}
-            size = dispersion.insert_values(inputs).size
-            if size < max_cases:
-                reason = f"the {size} values of the distribution 'in-turn' repeat within {max_cases} cases"
+            size, used = dispersion.insert_values(inputs).size, streams or max_cases
+            if size < used:
+                reason = f"the {size} values of the distribution 'in-turn' repeat within {used} cases"
                 raise CampaignError(f"dispersions.{path}: {reason}; extend its range, {remedy}")
     if not campaign.drawn_paths:
         raise CampaignError(f"campaign '{definition.name}' has no random dispersion")
@@ -216,9 +219,14 @@ def create_study(campaign: Campaign, directory: Path, session: StudySession[Any,
     record.update(directory, {STUDY_KEY: session.kind.encode(session.parameters)})
 
 
-def start_study(campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Any, Result]) -> Result:
-    """Create the folder of a study, and run it. Raises CampaignError for an unsuitable campaign or folder."""
-    study_campaign = prepare_campaign(campaign, max_cases)
+def start_study(
+    campaign: Campaign, max_cases: int, directory: Path, session: StudySession[Any, Result], streams: int | None = None
+) -> Result:
+    """Create the folder of a study, and run it; `streams` is the number of its random streams, by default of its cases.
+
+    Raises CampaignError for an unsuitable campaign or folder.
+    """
+    study_campaign = prepare_campaign(campaign, max_cases, streams)
     claim_folder(directory)
     with folder_lock(directory):
         # again, because another process may have started a campaign in the folder before the lock

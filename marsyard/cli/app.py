@@ -31,7 +31,7 @@ from marsyard.cli.options import CampaignArgument, JsonOption, SetOption
 from marsyard.cli.render import gallery, render
 from marsyard.cli.replay import replay
 from marsyard.cli.report import compare, confirmations, dashboard, nightly, report
-from marsyard.cli.studies import budget, rare, search
+from marsyard.cli.studies import budget, rare, robust, search
 from marsyard.cli.terrain import app as terrain
 
 
@@ -177,7 +177,7 @@ def _select_device(device: str) -> None:
 
 #: Commands by help panel; the first word of a function's name is the command's name.
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {
-    "Run campaigns": (list_campaigns, show, run, resume, append, merge, replay, rare, search, budget, nightly),
+    "Run campaigns": (list_campaigns, show, run, resume, append, merge, replay, rare, search, budget, robust, nightly),
     "Results": (report, confirmations, compare, dashboard),
     "Worlds and images": (render, gallery, dataset),
     "Custom campaigns and algorithms": (new, ingest, conformance, export, score),

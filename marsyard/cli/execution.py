@@ -85,10 +85,10 @@ def stop_on_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def default_directory(name: str) -> Path:
+def default_directory(name: str, parent: Path = Path("runs")) -> Path:
     """Return the path of a new folder ``runs/<campaign>-<UTC time>``, with a number if that folder exists."""
     from datetime import UTC, datetime
 
-    base = Path("runs") / f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    base = parent / f"{name}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     numbered_folders = (base.with_name(f"{base.name}-{number}") for number in itertools.count(2))
     return next(folder for folder in itertools.chain([base], numbered_folders) if not folder.exists())

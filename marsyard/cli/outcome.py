@@ -35,6 +35,7 @@ from marsyard.reports.comparison import compare_algorithms, comparison_grids
 from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
 from marsyard.reports.gallery import gallery_candidates
 from marsyard.reports.overall import multiplicity_text
+from marsyard.reports.robustness import robustness_text
 from marsyard.reports.stored import read_run
 from marsyard.reports.tables import verdict_table
 from marsyard.reports.verdicts import Verdict
@@ -69,6 +70,8 @@ def evaluate_and_report(directory: Path, console: Console, requirements: Require
         lines.append(f"to decide: marsyard append {directory} {evaluation.overall_verdict.additional_cases}")
     if multiplicity := multiplicity_text(verdicts):
         lines.append(multiplicity)
+    texts = {item.requirement_id: robustness_text(item, evaluation.robustness) for item in verdicts}
+    lines += [f"robustness of {name}: {text}" for name, text in texts.items() if text]
     if not any(verdict.withheld_status for verdict in verdicts):
         lines.append(f"evidence: {evaluation.evidence.text}")
     lines += [f"validity: {sentence}" for sentence in evaluation.validity.sentences]

@@ -1,7 +1,8 @@
-"""Commands `marsyard rare`, `marsyard search` and `marsyard budget`: studies that choose their cases."""
+"""Commands `marsyard rare`, `search`, `budget` and `robust`: studies that choose their cases."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -189,6 +190,98 @@ def budget(arguments: BudgetOptions) -> None:
     finish_budget(directory, result)
 
 
+@dataclass(frozen=True, kw_only=True)
+class RobustOptions:
+    """Arguments and options of `marsyard robust`."""
+
+    directory: options.DirectoryArgument
+    parameter: Annotated[
+        list[str] | None,
+        Option(
+            metavar="PATH=VALUE",
+            help="Run cases with other values of a parameter that the campaign does not disperse, up to VALUE.",
+        ),
+    ] = None
+    variant: Annotated[
+        list[str] | None,
+        Option(metavar="NAME", help="Run cases with an alternative model of the system; `all`: with each of them."),
+    ] = None
+    cases: Annotated[
+        int, Option("-n", "--cases", metavar="N", help="Cases of the run, at least 60, for each value and model.")
+    ] = 100
+    jobs: options.JobsOption = None
+    cluster: options.ClusterOption = None
+
+
+@handle_user_errors
+@options.with_options(RobustOptions)
+def robust(arguments: RobustOptions) -> None:
+    """Show which changes of the assumptions turn PASS into FAIL, from the stored cases of a campaign.
+
+    Cases are run only for parameters that the campaign does not disperse, and for other models.
+    """
+    from marsyard.campaigns.definition.variants import system_variants
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
+    from marsyard.campaigns.store.record import stored_definition
+    from marsyard.campaigns.studies.results import ROBUST_FOLDER
+    from marsyard.campaigns.studies.robust import start_robust
+
+    run, farthest = arguments.directory, _read_farthest(arguments.parameter or [])
+    available = {item.name: item for item in system_variants(stored_definition(run).scenario)}
+    for name in arguments.variant or ():
+        if name not in available and name != "all":
+            raise CampaignError(f"--variant: {unknown_name_message('variant', name, ['all', *available])}")
+    variants = [item for name, item in available.items() if {name, "all"} & {*(arguments.variant or ())}]
+    if farthest or arguments.variant:
+        directory = default_directory(ROBUST_FOLDER, run / ROBUST_FOLDER)
+        executor = make_executor(arguments.jobs, arguments.cluster)
+        with show_progress(directory, f"marsyard resume {directory}") as progress:
+            start_robust(run, farthest, variants, arguments.cases, directory, executor, progress)
+    finish_robust(run)
+
+
+def _read_farthest(texts: Sequence[str]) -> dict[str, float]:
+    """Read the values of the option `--parameter`. Raises CampaignError for another text."""
+    from marsyard.campaigns.errors import CampaignError
+
+    farthest = {}
+    for text in texts:
+        path, separator, value = text.partition("=")
+        try:
+            farthest[path.strip()] = float(value)
+        except ValueError:
+            farthest[path.strip()] = math.nan
+        if not separator or not math.isfinite(farthest[path.strip()]):
+            raise CampaignError(f"--parameter {text}: allowed: PATH=NUMBER, such as imu.gyro_scale_ppm=300")
+    return farthest
+
+
+def finish_robust(run: Path) -> NoReturn:
+    """Write the report of a run, print its robustness, and exit."""
+    from marsyard.cli.outcome import evaluate_and_store
+    from marsyard.cli.showing import grid_table
+    from marsyard.reports.robustness import robustness_text
+    from marsyard.reports.robustness_section import change_grid, variant_grid
+
+    evaluation, page = evaluate_and_store(run)
+    console = create_console()
+    lines = []
+    for verdict in evaluation.verdicts:
+        records = [item for item in evaluation.robustness if item.requirement == verdict.requirement_id]
+        if records:
+            console.print(grid_table(f"Change to FAIL: {verdict.requirement_id}", change_grid(records)))
+            lines.append(f"{verdict.requirement_id}: {robustness_text(verdict, records)}")
+        else:
+            lines.append(f"{verdict.requirement_id}: {verdict.status}, which no change is computed for")
+    if evaluation.variants:
+        grid, bands = variant_grid(evaluation.variants)
+        console.print(grid_table("Other models", grid))
+        lines.append(f"verdicts under other models: {bands}")
+    for line in (*lines, f"report: {page}"):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit
+
+
 def contains_study(directory: Path) -> bool:
     """Whether the folder contains a study, not an ordinary campaign."""
     from marsyard.campaigns.studies.study_record import read_study
@@ -206,8 +299,9 @@ def continue_study_and_exit(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.studies import budget as budget_study
     from marsyard.campaigns.studies import rare as rare_study
+    from marsyard.campaigns.studies import robust as robust_study
     from marsyard.campaigns.studies import search as search_study
-    from marsyard.campaigns.studies.results import BUDGET, SEARCH
+    from marsyard.campaigns.studies.results import BUDGET, ROBUST, SEARCH
     from marsyard.campaigns.studies.study_record import read_study
 
     study = read_study(directory) or {}
@@ -224,6 +318,12 @@ def continue_study_and_exit(
         with show_progress(directory, next_command) as progress:
             budget_result = budget_study.continue_budget(directory, executor, progress)
         finish_budget(directory, budget_result)
+    if study.get("kind") == ROBUST.name:
+        if additional:
+            raise CampaignError(f"{directory} contains a study of other parameters, which cannot be extended")
+        with show_progress(directory, next_command) as progress:
+            robust_study.continue_robust(directory, executor, progress)
+        finish_robust(directory.resolve().parent.parent)
     with show_progress(directory, next_command) as progress:
         replicates, random_cases = (0, additional) if is_random else (additional, 0)
         rare_result = rare_study.continue_rare(directory, executor, progress, replicates, random_cases)

@@ -46,7 +46,7 @@ from marsyard.sim.sensor import (
 )
 from marsyard.sim.sensor.detector import BURST_DN, BURST_PX
 from marsyard.sim.sensor.imu import IMUS, ImuClass
-from marsyard.sim.terrain import Site, TerrainParameters, site
+from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters, site
 from marsyard.sim.terrain.landforms import Dunes
 
 #: Regular dunes of the dune fault.
@@ -265,6 +265,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom objects on the ground")] = ()
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
+    photometry: PhotometryChanges = PhotometryChanges()
     descent: SwingParameters = SwingParameters()
     images: Annotated[int, bounded_field(2, 100, "number of images; only stream estimators use more than three")] = (
         TRIPLE_SIZE
@@ -348,4 +349,6 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     @property
     def preset(self) -> Site | None:
         """The site; None for a generic terrain."""
-        return None if self.site is None else site(self.site).with_dust(self.dust_opacity)
+        return (
+            None if self.site is None else site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)
+        )

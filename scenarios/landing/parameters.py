@@ -38,7 +38,7 @@ from marsyard.sim.sensor import (
     NamedOrCustomCamera,
     preset,
 )
-from marsyard.sim.terrain import Site, TerrainParameters, site, sites
+from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters, site, sites
 
 #: Sources of error of poses that are drawn without a flight.
 RATE = ErrorSource("motion", "motion: attitude rate")
@@ -140,6 +140,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     )
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
+    photometry: PhotometryChanges = PhotometryChanges()
     camera: NamedOrCustomCamera = Field(default="xc-55", description="nadir camera preset, or a table with file")
     calibration: CalibrationParameters = Field(default=CalibrationParameters(), description="camera calibration errors")
     detector: DetectorChoice = Field(default_factory=lambda: preset("xc-55").detector)
@@ -212,4 +213,4 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
     @property
     def preset(self) -> Site:
         """The site with the dust of the case."""
-        return site(self.site).with_dust(self.dust_opacity)
+        return site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)

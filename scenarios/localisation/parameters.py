@@ -23,7 +23,7 @@ from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.parameters import NonNegative, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarParameters
 from marsyard.sim.sensor.imu import IMUS, ImuClass
-from marsyard.sim.terrain import Site, TerrainParameters
+from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters
 
 
 class LocalisationFaults(SizedFaults):
@@ -62,6 +62,7 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     start_north_m: Annotated[float, bounded_field(-3000.0, 3000.0, "start, north of the map's centre")] = 0.0
     sun: Annotated[SunParameters, Field(description="sun at the landing")] = SunParameters()
     dust_opacity: DustOpacity = None
+    photometry: PhotometryChanges = PhotometryChanges()
     map: MapParameters = MapParameters()
     flight: ProfileParameters = ProfileParameters()
     images: ImageSchedule = ImageSchedule()
@@ -121,7 +122,7 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     @property
     def preset(self) -> Site:
         """The site, with the optical depth of the case."""
-        return localisation_site(self.site).with_dust(self.dust_opacity)
+        return localisation_site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)
 
     @property
     def imu(self) -> ImuParameters:

@@ -28,7 +28,7 @@ from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import AutoExposureParameters, CustomCameraChoice, DetectorChoice, DetectorParameters, preset
 from marsyard.sim.sensor.mast import MASTS, PointingParameters, StereoCalibrationParameters, mount_on_head, stereo_mast
 from marsyard.sim.sensor.odometry import OdometryParameters
-from marsyard.sim.terrain import MAX_TERRAINS, site
+from marsyard.sim.terrain import MAX_TERRAINS, PhotometryChanges, Site, site
 
 #: Angles in degrees: relative angles, and azimuths.
 RelativeAngle = Annotated[float, Field(ge=-180.0, le=180.0)]
@@ -58,6 +58,7 @@ class WorldParameters(Parameters):
     dust_opacity: Annotated[
         float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; default: the site's")
     ] = None
+    photometry: PhotometryChanges = PhotometryChanges()
     rock_abundance: Annotated[
         float | None, bounded_field(0.0, 0.4, "fraction of the ground covered by rocks; default: the site's")
     ] = None
@@ -68,6 +69,11 @@ class WorldParameters(Parameters):
     background_half_deg: Annotated[
         Positive, Field(le=180.0, description="half angle of the sector behind the target in which rocks are rendered")
     ] = 50.0
+
+    @property
+    def lit_site(self) -> Site:
+        """The site with the dust and the reflectance of the case."""
+        return site(self.site).with_dust(self.dust_opacity).with_photometry(self.photometry)
 
     @model_validator(mode="after")
     def _check_terrain(self) -> WorldParameters:

@@ -83,7 +83,7 @@ class RunWorld:
         """Create the world of a run."""
         world = p.world
         site_ground = load_ground(site(world.site), terrain_parameters(world), world.bank_seed, world.terrain)
-        site_ground = replace(site_ground, site=site(world.site).with_dust(world.dust_opacity))
+        site_ground = replace(site_ground, site=world.lit_site)
         ground, rocks = place_rocks(p, site_ground, streams.generator("placed rocks"))
         radius = p.start.distance_m + BACKGROUND_M
         azimuth, half_angle = p.bearing_rad + np.pi, np.radians(world.background_half_deg)

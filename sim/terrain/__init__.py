@@ -3,8 +3,8 @@
 from marsyard.sim.terrain.bank import MAX_TERRAINS, TerrainBank, synthesise
 from marsyard.sim.terrain.parameters import TerrainParameters
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockMesh, RockParameters
-from marsyard.sim.terrain.sites import Environment, Site, site, sites
+from marsyard.sim.terrain.sites import Environment, PhotometryChanges, Site, site, sites
 from marsyard.sim.terrain.surface import Surface
 
 __all__ = ["MAX_TERRAINS", "Environment", "PlacedRock", "RockField", "RockMesh", "RockParameters", "Site", "Surface"]
-__all__ += ["TerrainBank", "TerrainParameters", "site", "sites", "synthesise"]
+__all__ += ["PhotometryChanges", "TerrainBank", "TerrainParameters", "site", "sites", "synthesise"]

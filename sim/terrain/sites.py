@@ -95,6 +95,17 @@ class SitePhotometry(Parameters):
     source: Annotated[str, Field(description="source of these values")] = "assumed"
 
 
+class PhotometryChanges(Parameters):
+    """Changes of a site's photometry (`SitePhotometry`)."""
+
+    lunar_fraction: Annotated[
+        float | None, Field(ge=0.0, le=1.0, description="L: 0 Lambert, 1 Lommel-Seeliger; default: the site's")
+    ] = None
+    surge_amplitude: Annotated[
+        float | None, Field(ge=0.0, le=3.0, description="B0: amplitude of the surge; default: the site's")
+    ] = None
+
+
 class SiteTexture(Parameters):
     """Albedo variation finer than the terrain's samples: octaves of noise in the natural logarithm of albedo.
 
@@ -138,6 +149,11 @@ class Site(Parameters):
             return self
         environment = self.environment.model_copy(update={"optical_depth": optical_depth})
         return self.model_copy(update={"environment": environment})
+
+    def with_photometry(self, changes: PhotometryChanges) -> Site:
+        """Return the site with another reflectance law of ground and rocks."""
+        photometry = self.photometry.model_copy(update=changes.model_dump(exclude_none=True))
+        return self.model_copy(update={"photometry": photometry})
 
     def terrain(self, scale: str | None = None, changes: Mapping[str, Any] | None = None) -> TerrainParameters:
         """Return the terrain parameters at a scale, 'descent' or 'ground'; the default is the coarsest scale.

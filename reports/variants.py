@@ -1,0 +1,180 @@
+"""Verdicts under other parameters than those of a campaign, from the studies `robust` in the folder of its run.
+
+A study repeats cases of the run in variants (`marsyard.campaigns.studies.robust`). A case represents several cases of
+the run, so that its failures have this weight (`marsyard.reports.statistics.weighted`). Between the steps of a
+parameter, the margin of each case is interpolated.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float64, Int
+
+from marsyard.campaigns.definition.campaign import value_at
+from marsyard.campaigns.json_numbers import Number
+from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVariant
+from marsyard.reports import rates
+from marsyard.reports.decision import collect_evidence
+from marsyard.reports.requirement_cases import compute_margins
+from marsyard.reports.robustness import Kind, Outcome, Robustness
+from marsyard.reports.sampling_design import INDEPENDENT
+from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
+from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
+from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
+from marsyard.scenarios.columns import split_unit
+
+#: Number of evaluated values between the assumed and the farthest value of a parameter.
+_STEPS = 61
+#: Margin that replaces infinite ones, which cannot be interpolated.
+_LARGE = 1e9
+
+
+@dataclass(frozen=True)
+class VariantVerdict:
+    """Verdict on a requirement in a variant.
+
+    - estimate, lower, upper: failure rate, and its one-sided bounds at the requirement's confidence
+    - cases, effective_cases: number of cases that were run, and the equivalent number of random cases
+    """
+
+    variant: str
+    title: str
+    requirement: str
+    status: Status
+    estimate: Number
+    lower: Number
+    upper: Number
+    permitted: Number
+    cases: int
+    effective_cases: Number
+
+
+@dataclass(frozen=True)
+class RobustStudy:
+    """A finished study: its variants with their rows, the rows of the same cases in the run, and their weights."""
+
+    variants: Sequence[tuple[RobustVariant, pd.DataFrame]]
+    base: pd.DataFrame
+    weights: Float64[np.ndarray, " n"]
+
+
+def read_robust_studies(run: StoredRun) -> list[RobustStudy]:
+    """Read the finished studies of a run. Raises StoreError if their rows were changed."""
+    studies = []
+    folder = run.directory / ROBUST_FOLDER
+    for directory in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if not (directory / RECORD_FILE).is_file() or not (directory / TABLE_FILE).is_file():
+            continue
+        stored = read_run(directory)
+        if (study := ROBUST.read(stored.record)) is None or "case" not in run.frame:
+            continue
+        parameters = study[0]
+        rows = run.frame.set_index("case", drop=False)
+        if len(stored.frame) != len(parameters.variants) * len(parameters.cases):
+            continue
+        # the variants of a case follow each other
+        count = len(parameters.variants)
+        frames = [stored.frame.iloc[index::count].reset_index(drop=True) for index in range(count)]
+        base = rows.loc[list(parameters.cases)].reset_index(drop=True)
+        studies.append(
+            RobustStudy(list(zip(parameters.variants, frames, strict=True)), base, np.array(parameters.weights))
+        )
+    return studies
+
+
+def evaluate_variants(studies: Sequence[RobustStudy], verdicts: Sequence[Verdict]) -> tuple[VariantVerdict, ...]:
+    """Evaluate each requirement in each named variant, and in the campaign itself for the same cases."""
+    results: list[VariantVerdict] = []
+    for study in studies:
+        named = [(variant, frame) for variant, frame in study.variants if not variant.parameter]
+        assumed = RobustVariant("as assumed", "the campaign's own values", {})
+        for variant, frame in [(assumed, study.base), *named] if named else ():
+            results += filter(None, (_evaluate(study, variant, frame, verdict) for verdict in verdicts))
+    return tuple(results)
+
+
+def _evaluate(
+    study: RobustStudy, variant: RobustVariant, frame: pd.DataFrame, verdict: Verdict
+) -> VariantVerdict | None:
+    evidence = collect_evidence(frame, _to_requirement(verdict), INDEPENDENT, has_own_terrains=True)
+    if evidence is None or not evidence.with_unfinished.n:
+        return None
+    member, success = evidence.with_unfinished.member, evidence.with_unfinished.success
+    result = weighted_rates(
+        study.weights[None, member], ~success[member], _groups(frame, member), (verdict.confidence, verdict.confidence)
+    )
+    estimate, lower, upper = (float(values[0]) for values in (result.estimate, result.lower, result.upper))
+    permitted = 1.0 - verdict.probability
+    status = Status.PASS if upper <= permitted else Status.FAIL if lower > permitted else Status.INSUFFICIENT
+    if verdict.decide_by == ESTIMATE and status is not Status.PASS:
+        status = Status.MET_BY_RATE if estimate <= permitted else Status.FAIL
+    return VariantVerdict(
+        variant.name, variant.title, verdict.requirement_id, status, estimate, lower, upper, permitted,
+        int(member.sum()), float(result.effective_units[0]),
+    )  # fmt: skip
+
+
+def _to_requirement(verdict: Verdict) -> Mapping[str, Any]:
+    names = ("metric", "bound", "probability", "confidence", "population", "scale")
+    return {"id": verdict.requirement_id} | {name: getattr(verdict, name) for name in names}
+
+
+def _groups(frame: pd.DataFrame, member: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " m"] | None:
+    """Return the terrains of the members; None if no terrain is shared."""
+    groups = rates.terrain_groups(frame)
+    return None if groups is None or np.unique(groups).size == groups.size else groups[member]
+
+
+def evaluate_steps(
+    run: StoredRun, studies: Sequence[RobustStudy], verdicts: Sequence[Verdict]
+) -> tuple[Robustness, ...]:
+    """Find the change to FAIL of each requirement that is met, for each parameter that a study changes in steps."""
+    columns = {str(item.get("id")): item.get("margin") for item in run.requirements}
+    met = [item for item in verdicts if (item.withheld_status or item.status).is_met]
+    records = []
+    for study in studies:
+        for path in dict.fromkeys(variant.parameter for variant, _ in study.variants if variant.parameter):
+            assumed = float(value_at(run.definition["parameters"], path))
+            frames = {assumed: study.base} | {
+                float(variant.values[path]): frame for variant, frame in study.variants if variant.parameter == path
+            }
+            for verdict in met:
+                margins = [
+                    compute_margins(frame, verdict, columns.get(verdict.requirement_id)) for frame in frames.values()
+                ]
+                known = [item for item in margins if item is not None]
+                if len(known) == len(frames):
+                    records.append(_find_step(study, verdict, path, list(frames), np.array(known)))
+    return tuple(records)
+
+
+def _find_step(
+    study: RobustStudy, verdict: Verdict, path: str, values: Sequence[float], margins: Float64[np.ndarray, "steps n"]
+) -> Robustness:
+    """Find the value of a parameter at which PASS turns into FAIL; `values` begin with the assumed one."""
+    assumed, farthest = values[0], values[-1]
+    positions = np.abs(np.array(values) - assumed)
+    grid = np.linspace(0.0, positions[-1], _STEPS)
+    finite = np.clip(margins, -_LARGE, _LARGE)
+    failure = np.array([np.interp(grid, positions, column) < 0.0 for column in finite.T]).T
+    nearest = np.abs(grid[:, None] - positions).argmin(axis=1)
+    weights = study.weights * ((margins[nearest] < math.inf) | failure)
+    result = weighted_rates(
+        weights, failure, _groups(study.base, np.ones(len(study.base), dtype=np.bool_)),
+        (verdict.confidence, verdict.confidence),
+    )  # fmt: skip
+    spread = abs(assumed) or abs(farthest)
+    by_rate = verdict.decide_by == ESTIMATE
+    crossing = find_crossing(grid / spread, result, 1.0 - verdict.probability, decides_by_rate=by_rate)
+    step = math.copysign(spread, farthest - assumed)
+    return Robustness(
+        verdict.requirement_id, path, Kind.VALUE, split_unit(path)[1], assumed=assumed, spread=spread,
+        passes_at=assumed + step * crossing.lower, fails_at=assumed + step * crossing.change,
+        confidence=verdict.confidence, outcome=Outcome.of(crossing, is_complete=False), **asdict(crossing),
+    )  # fmt: skip

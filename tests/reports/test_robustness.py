@@ -1,0 +1,310 @@
+"""Tests of robust verdicts on limit states with known answers.
+
+A case fails if g(z) < 0 for a standard normal variable z of a dispersion. The rate after a change is known, and so is
+the change after which it equals the permitted rate.
+"""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import optimize
+from scipy.stats import norm
+
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports import robustness as module
+from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.robustness import (
+    ALL_DISPERSIONS,
+    Kind,
+    Outcome,
+    Robustness,
+    binary_divergence,
+    evaluate_robustness,
+    robustness_text,
+)
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.statistics.weighted import Crossing, find_crossing, weighted_rates
+from marsyard.reports.stored import StoredRun
+from marsyard.reports.verdicts import Status, Verdict
+
+CAMPAIGN = """
+name = "limit-state"
+scenario = "tests.campaigns.studies.limit_state:LimitStateScenario"
+cases = {cases}
+seed = 3
+
+[dispersions]
+"loads.0" = {{ distribution = "normal", mean = 10.0, sd = 2.0 }}
+"loads.1" = {{ distribution = "uniform", low = 20.0, high = 40.0 }}
+kind = {{ distribution = "choice", values = ["plain", "rough"], weights = [9.0, 1.0] }}
+
+[[requirements]]
+id = "LOAD"
+metric = "is_safe"
+probability = {probability}
+confidence = 0.9
+"""
+
+Fails = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def evaluate(
+    folder: Path, cases: int, probability: float, fails: Fails, **changes: Any
+) -> tuple[list[Verdict], dict[tuple[str, Kind], Robustness], tuple[Robustness, ...]]:
+    """Evaluate cases of a limit state; `fails` are functions of both loads as standard normal numbers, and of kind."""
+    path = folder / "campaign.toml"
+    path.write_text(CAMPAIGN.format(cases=cases, probability=probability))
+    campaign = load_campaign(str(path))
+    rows = [{"case": case, "outcome": "VALID", "answered": True, **campaign.draws(case)} for case in range(cases)]
+    frame = pd.DataFrame(rows)
+    loads = (frame["loads.0"] - 10.0) / 2.0, norm.ppf((frame["loads.1"] - 20.0) / 20.0)
+    frame["is_safe"] = ~fails(np.array(loads[0]), np.array(loads[1]), frame["kind"].to_numpy())
+    frame = frame.assign(**changes)
+    definition = campaign.definition.model_dump(mode="json")
+    run = StoredRun(folder, frame, frame, {"definition": definition, "requirements": definition["requirements"]}, ())
+    sampling = read_sampling_design(definition)
+    verdicts = evaluate_requirements(frame, run.requirements, sampling)
+    records = evaluate_robustness(run, verdicts, sampling)
+    return verdicts, {(item.parameter + item.value, item.kind): item for item in records}, records
+
+
+#: Limit states with 2 % of failures, which have 5 % after a known change: failures, and the change in assumed spreads.
+TAIL, HALF, CORE = norm.isf(0.02), norm.isf(0.01), norm.ppf(0.51)
+LIMIT_STATES: dict[Kind, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
+    # the rate is 1 - Phi(TAIL - d) for a mean of d
+    Kind.MEAN_UP: (lambda z: z > TAIL, TAIL - norm.isf(0.05)),
+    Kind.MEAN_DOWN: (lambda z: z < -TAIL, TAIL - norm.isf(0.05)),
+    # it is 2 - 2 Phi(HALF / s), or 2 Phi(CORE / s) - 1, for a standard deviation of s
+    Kind.WIDER: (lambda z: np.abs(z) > HALF, HALF / norm.isf(0.025) - 1.0),
+    Kind.NARROWER: (lambda z: np.abs(z) < CORE, 1.0 - CORE / norm.ppf(0.525)),
+}
+
+
+def find_crossings(z: np.ndarray) -> dict[Kind, Crossing]:
+    """Find the changes to FAIL, of more than 5 % of failures, of the limit states."""
+    crossings = {}
+    for change in module._list_changes(None, z):
+        fails = LIMIT_STATES[change.kind][0](z)
+        rates = weighted_rates(change.weights, fails, None, (0.9, 0.9), efficiency=change.efficiency)
+        crossings[change.kind] = find_crossing(change.sizes, rates, 0.05)
+    return crossings
+
+
+def test_change_to_fail_is_within_10_percent() -> None:
+    """The standard deviation of the estimates is 5 to 7 % for 20,000 cases, and 2 to 2.5 % for 150,000."""
+    crossings = find_crossings(np.random.default_rng(58).standard_normal(150_000))
+    for kind, (_, exact) in LIMIT_STATES.items():
+        assert crossings[kind].change == pytest.approx(exact, rel=0.1), kind
+
+
+@pytest.mark.parametrize("cases", [300, 1000])
+def test_interval_covers_the_change_to_fail(cases: int) -> None:
+    """The bounds of the interval hold with at least their confidence of 90 %, for each kind of change.
+
+    The standard deviation of the fraction of 200 samples is 2.1 %. The median of the estimates of 1,000 cases is within
+    10 %.
+    """
+    rng = np.random.default_rng(4)
+    covered = {kind: np.zeros(2) for kind in LIMIT_STATES}
+    errors: dict[Kind, list[float]] = {kind: [] for kind in LIMIT_STATES}
+    for _ in range(200):
+        for kind, crossing in find_crossings(rng.standard_normal(cases)).items():
+            exact = LIMIT_STATES[kind][1]
+            # a missing bound (NaN) claims nothing
+            covered[kind] += [not crossing.lower > exact, not crossing.upper < exact]
+            errors[kind].append(crossing.change / exact - 1.0)
+    for kind, counts in covered.items():
+        assert (counts / 200 >= 0.9 - 2.5 * 0.021).all(), (kind, counts / 200)
+        assert cases < 1000 or abs(np.nanmedian(errors[kind])) < 0.1, kind
+
+
+def test_changes_have_the_units_of_the_parameters(tmp_path: Path) -> None:
+    """The cases fail if z0 > 2 or z1 < -2.2 for a normal load 0 (10, 2) and a uniform load 1 (20 to 40)."""
+    fails = lambda first, second, kind: (first > 2.0) | (second < -2.2)  # noqa: E731
+    _, records, _ = evaluate(tmp_path, 3000, 0.9, fails)
+    up, wider = records["loads.0", Kind.MEAN_UP], records["loads.0", Kind.WIDER]
+    assert (up.assumed, up.spread, wider.assumed) == pytest.approx((10.0, 2.0, 2.0), abs=1e-6)
+    assert up.fails_at == pytest.approx(10.0 + 2.0 * up.change)
+    assert up.passes_at == pytest.approx(10.0 + 2.0 * up.lower)
+    assert wider.passes_at == pytest.approx(2.0 * (1.0 + wider.lower))
+    down = records["loads.1", Kind.MEAN_DOWN]
+    assert down.spread == pytest.approx(20.0 / math.sqrt(12.0), rel=1e-3)
+    # a bounded range stays the same: the mean of Phi(z - d) is Phi(-d / sqrt(2)) for a standard normal z
+    assert down.passes_at == pytest.approx(20.0 + 20.0 * norm.cdf(-down.lower / math.sqrt(2.0)), rel=1e-3)
+    assert up.outcome is down.outcome is Outcome.FOUND
+    # the other direction does not lead to FAIL within the reach of the cases
+    other = records["loads.0", Kind.MEAN_DOWN]
+    assert other.outcome is Outcome.REFUSED
+    assert math.isnan(other.change)
+
+
+def test_probability_of_a_value(tmp_path: Path) -> None:
+    """A fifth of the rough cases fail, and no other: the rate is 5 % if 25 % are rough (10 % assumed)."""
+    rng = np.random.default_rng(1)
+    fails = lambda first, second, kind: (kind == "rough") & (rng.random(kind.size) < 0.2)  # noqa: E731
+    _, records, _ = evaluate(tmp_path, 4000, 0.95, fails)
+    rough, plain = records["kindrough", Kind.MORE_FREQUENT], records["kindplain", Kind.MORE_FREQUENT]
+    assert rough.assumed == pytest.approx(0.1)
+    # 80 failures: the standard deviation of their fraction is 0.02
+    assert rough.fails_at == pytest.approx(0.25, rel=0.2)
+    assert 0.1 < rough.passes_at < 0.25
+    assert plain.outcome is Outcome.NONE
+
+
+def test_unobserved_value_is_no_evidence() -> None:
+    """No case of a value with a probability of 10 % is stored: PASS does not hold if the value is more frequent.
+
+    The upper bound without a failure is 2.3 / 400 times the largest weight, 1 + 9 a divided by the mean weight 1 - a
+    of the stored cases. It is 5 % for 1 + 9 a = 8.7 (1 - a), a = 0.435.
+    """
+    steps = np.linspace(0.0, 0.9, 41)
+    weights = np.outer(1.0 - steps, np.ones(400))
+    rates = weighted_rates(weights, np.zeros(400, dtype=np.bool_), None, (0.9, 0.9), 1.0 + 9.0 * steps)
+    assert find_crossing(steps, rates, 0.05).lower == pytest.approx(0.435, abs=0.02)
+
+
+def test_divergence_of_all_dispersions() -> None:
+    """The largest rate of all distributions with a divergence r is that of the binary divergence.
+
+    The least favourable distribution multiplies the density in the failure region by a factor, which is checked here
+    against a numeric maximum over distributions on 40 points.
+    """
+    rate, cells = 0.02, 40
+    p = np.full(cells, (1.0 - rate) / (cells - 4))
+    p[:4] = rate / 4
+    radius = 0.01
+
+    def excess(weight: float) -> float:
+        q = p * np.where(np.arange(cells) < 4, weight, 1.0)
+        q /= q.sum()
+        return float(np.sum(q * np.log(q / p))) - radius
+
+    weight = optimize.brentq(excess, 1.0, 50.0)
+    worst = weight * rate / (weight * rate + 1.0 - rate)
+    assert binary_divergence(worst, rate) == pytest.approx(radius, rel=1e-6)
+    rng = np.random.default_rng(2)
+    for _ in range(200):  # no other distribution within the ball has a larger rate
+        q = p * np.exp(rng.normal(0.0, 0.5, cells))
+        q /= q.sum()
+        if float(np.sum(q * np.log(q / p))) <= radius:
+            assert q[:4].sum() <= worst
+    assert binary_divergence(0.01, 0.02) == 0.0
+    assert binary_divergence(0.01, 0.0) == math.inf
+
+
+def test_divergence_follows_from_the_bounds_of_the_verdict(tmp_path: Path) -> None:
+    verdicts, records, _ = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
+    item = records[ALL_DISPERSIONS, Kind.DIVERGENCE]
+    assert verdicts[0].status is Status.PASS
+    assert item.passes_at == pytest.approx(binary_divergence(0.05, 1.0 - verdicts[0].lower))
+    # a shift of one normal dispersion by d has the divergence d^2 / 2: PASS then holds for any direction
+    assert item.lower <= records["loads.0", Kind.MEAN_UP].lower
+
+
+def test_few_cases_are_refused(tmp_path: Path) -> None:
+    """Of 29 cases, nothing is said about any change, except about those of bounded divergence."""
+    _, _, records = evaluate(tmp_path, 29, 0.9, lambda first, second, kind: first > 9.0)
+    assert [item.kind for item in records] == [Kind.DIVERGENCE]
+    assert records[0].outcome is Outcome.REFUSED
+
+
+def test_change_is_refused_below_30_effective_cases(tmp_path: Path) -> None:
+    """Of 200 cases, a shift d leaves 200 exp(-d^2) effective cases: at most d = 1.377."""
+    _, records, _ = evaluate(tmp_path, 200, 0.9, lambda first, second, kind: first > 9.0)
+    item = records["loads.0", Kind.MEAN_UP]
+    assert item.outcome is Outcome.REFUSED
+    assert 0.0 < item.lower < item.reach <= math.sqrt(math.log(200.0 / 30.0)) + 1e-9
+    assert item.effective_cases >= 30.0 * (1.0 - 1e-6)
+
+
+@pytest.mark.parametrize("failures", [0, 3, 8, 15, 25])
+def test_pass_at_no_change_is_that_of_the_verdict(tmp_path: Path, failures: int) -> None:
+    verdicts, records, _ = evaluate(
+        tmp_path, 300, 0.95, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures
+    )
+    if verdicts[0].status is Status.PASS:
+        assert all(item.lower > 0.0 for item in records.values())
+    else:
+        assert not records
+
+
+@pytest.mark.parametrize("failures", [0, 2, 6])
+def test_shared_terrains_are_the_units(tmp_path: Path, failures: int) -> None:
+    """600 cases on 200 terrains: the effective number is that of terrains, and PASS holds where the verdict has it."""
+    verdicts, records, _ = evaluate(
+        tmp_path, 600, 0.9, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures,
+        terrain=np.arange(600) // 3,
+    )  # fmt: skip
+    assert verdicts[0].status is Status.PASS
+    item = records["loads.0", Kind.MEAN_UP]
+    independent = evaluate(tmp_path, 600, 0.9, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures)[
+        1
+    ]["loads.0", Kind.MEAN_UP]
+    assert 0.0 < item.lower < independent.lower
+    assert item.effective_cases <= 200.0
+
+
+def test_unfinished_cases_are_failures(tmp_path: Path) -> None:
+    """Crashed cases with large z0 count as failures at their weights, although their metric is unknown."""
+    first = evaluate(tmp_path, 400, 0.9, lambda first, second, kind: first > 9.0)[1]["loads.0", Kind.MEAN_UP]
+    frame_outcomes = ["CRASHED" if case % 40 == 0 else "VALID" for case in range(400)]
+    crashed = evaluate(tmp_path, 400, 0.9, lambda first, second, kind: first > 9.0, outcome=frame_outcomes)[1]
+    assert crashed["loads.0", Kind.MEAN_UP].lower < first.lower
+
+
+def test_rows_with_other_draws_are_not_weighted(tmp_path: Path) -> None:
+    """If the rows do not contain the values that the definition draws, only the divergence remains."""
+    _, _, records = evaluate(
+        tmp_path, 300, 0.9, lambda first, second, kind: first > 9.0, **{"loads.0": np.linspace(0.0, 20.0, 300)}
+    )
+    assert [item.kind for item in records] == [Kind.DIVERGENCE]
+
+
+def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
+    verdicts, records, all_records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
+    text = robustness_text(verdicts[0], all_records)
+    means = [item.lower for key, item in records.items() if key[1] in (Kind.MEAN_UP, Kind.MEAN_DOWN)]
+    assert f"(90 % confidence, one change at a time) for a shift of any mean by {min(means):.4f}"[:-1] in text
+    assert "any change of all dispersions up to a divergence of 0.0" in text
+    wider, up = records["loads.0", Kind.WIDER], records["loads.0", Kind.MEAN_UP]
+    nearest = wider if wider.change < up.change else up
+    assert f"Nearest changes to FAIL: {nearest.fail_text}" in text
+    assert " assumed; PASS up to " in nearest.fail_text
+
+
+def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:
+    """Three failures give estimates of changes to FAIL, but do not show FAIL: the sentence does not name them."""
+    verdicts, records, all_records = evaluate(
+        tmp_path, 1000, 0.98, lambda first, second, kind: np.argsort(np.argsort(-first)) < 3
+    )
+    assert records["loads.0", Kind.MEAN_UP].outcome is Outcome.FOUND
+    assert records["loads.0", Kind.MEAN_UP].effective_cases >= 30.0
+    assert math.isnan(records["loads.0", Kind.WIDER].upper)
+    assert "standard deviation of loads 0" not in robustness_text(verdicts[0], all_records)
+
+
+@pytest.mark.slow
+def test_time_of_a_thousand_cases() -> None:
+    """The robustness of 1,000 cases of a campaign with 27 dispersions takes at most 60 core-s."""
+    campaign = load_campaign("dimes-gusev")
+    rng, rows = np.random.default_rng(1), []
+    for case in range(1000):
+        draws = campaign.draws(case)
+        rows.append({"case": case, "outcome": "VALID", "answered": True, "feasible_overlap": True, **draws})
+    frame = pd.DataFrame(rows).assign(velocity_error_m_s=np.abs(rng.normal(0.0, 1.6, 1000)))
+    definition = campaign.definition.model_dump(mode="json")
+    run = StoredRun(Path(), frame, frame, {"definition": definition, "requirements": definition["requirements"]}, ())
+    sampling = read_sampling_design(definition)
+    verdicts = evaluate_requirements(frame, run.requirements, sampling)
+    start = time.process_time()
+    records = evaluate_robustness(run, verdicts, sampling)
+    assert time.process_time() - start < 60.0
+    assert len({item.parameter for item in records}) == 28
+    assert json.dumps([item.pass_text for item in records])
