@@ -1,4 +1,4 @@
-"""Tests of the domain of validity: cases outside of the checked conditions, and missed checks beside the verdict."""
+"""Tests of the domain of validity: cases outside of the checked conditions, and missed checks next to the verdict."""
 
 import json
 from dataclasses import replace
