@@ -24,8 +24,7 @@ def sign_file(path: Path, key: Path) -> None:
     if not key.is_file():
         raise CampaignError(f"--sign {key}: no such file; `ssh-keygen -t ed25519 -f {key}` creates a key")
     signature_path(path).unlink(missing_ok=True)
-    # without a terminal, ssh-keygen asks for no passphrase and fails
-    process = _run(["sign", "-f", str(key), "-n", NAMESPACE, str(path)], None)
+    process = _run(["sign", "-f", str(key), "-n", NAMESPACE, str(path)])
     if process.returncode or not signature_path(path).is_file():
         raise CampaignError(f"--sign {key}: {_last_line(process)}")
 
@@ -41,7 +40,7 @@ def check_signature(path: Path, signers: Path | None) -> tuple[bool, str]:
         return not process.returncode, _last_line(process)
     if not signers.is_file():
         raise CampaignError(f"--signers {signers}: no such file")
-    principals = _run(["find-principals", "-s", signature, "-f", str(signers)], None)
+    principals = _run(["find-principals", "-s", signature, "-f", str(signers)])
     if principals.returncode:
         return False, f"the key of the signature is not in {signers}"
     name = principals.stdout.decode(errors="replace").split("\n")[0].split(",")[0].strip()
@@ -50,15 +49,15 @@ def check_signature(path: Path, signers: Path | None) -> tuple[bool, str]:
     return not process.returncode, _last_line(process)
 
 
-def _run(arguments: Sequence[str], content: bytes | None) -> subprocess.CompletedProcess[bytes]:
-    """Run ``ssh-keygen -Y``. Raises CampaignError if it is not installed or does not end."""
+def _run(arguments: Sequence[str], content: bytes = b"") -> subprocess.CompletedProcess[bytes]:
+    """Run ``ssh-keygen -Y`` with an input. Raises CampaignError if it is not installed or does not end."""
     program = shutil.which("ssh-keygen")
     if program is None:
         raise CampaignError("signatures need ssh-keygen; install OpenSSH (Debian: apt install openssh-client)")
-    source = {"stdin": subprocess.DEVNULL} if content is None else {"input": content}
     try:
+        # ssh-keygen asks for a passphrase on the terminal itself
         return subprocess.run(  # noqa: S603
-            [program, "-Y", *arguments], capture_output=True, timeout=_TIMEOUT_S, check=False, **source
+            [program, "-Y", *arguments], input=content, capture_output=True, timeout=_TIMEOUT_S, check=False
         )
     except subprocess.SubprocessError as error:
         raise CampaignError(f"ssh-keygen did not end: {error}") from error

@@ -16,10 +16,10 @@ def write_stored_run(directory: Path, cases: int = 240, **changes: Any) -> Path:
     frame = make_rows(cases, answer_rate=1.0)
     frame["terrain"], frame["site"] = np.arange(cases), "gusev"
     directory.mkdir(parents=True)
-    record = synthetic_record(frame, [VELOCITY | {"source": "the paper; the rate is assumed"}])
+    record = synthetic_record(frame, [{**VELOCITY, "source": "the paper; the rate is assumed"}])
     (directory / "campaign.json").write_text(json.dumps(record | changes))
     create_store(directory / ROWS_FILE, {"campaign": "synthetic"})
     with RowStore(directory / ROWS_FILE) as store:
-        store.add([dict(row) for row in frame.to_dict("records")])
+        store.add([{str(name): value for name, value in row.items()} for row in frame.to_dict("records")])
         write_table(directory / TABLE_FILE, store)
     return directory
