@@ -87,14 +87,19 @@ class Evaluation:
         return read_robust_studies(self.run) if self.verdicts else []
 
 
-def evaluate_run(directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None) -> Evaluation:
-    """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows."""
+def evaluate_run(
+    directory: Path, requirements: Sequence[Mapping[str, Any]] | None = None, record: Path | None = None
+) -> Evaluation:
+    """Evaluate the campaign in a folder, or other requirements on its rows. Raises StoreError without rows.
+
+    record: record of confirmations instead of that of the run, such as a copy of it
+    """
     run = read_run(directory, requirements)
     sampling = read_sampling_design(run.definition)
     if table(run.record.get("study")):
         return Evaluation(run, sampling, read_evidence(run.record), (), _evaluate_study(run.record, run.all_cases))
     evidence = read_evidence(run.record, uses_campaign_requirements=requirements is None)
-    joint = read_joint_evidence(evidence)
+    joint = read_joint_evidence(evidence if record is None else replace(evidence, record=str(record)))
     evidence = replace(evidence, notes=joint.notes)
     columns = read_columns(str(run.definition.get("scenario") or ""))
     # columns that are computed from the truth, and columns that the definition of a case determines

@@ -81,8 +81,13 @@ def _descend(value: Any, names: list[str]) -> Any:
 
 @cache
 def read_register() -> tuple[Constant, ...]:
-    """Read the register."""
-    return tuple(_read_constants(tomllib.loads(REGISTER.read_text(encoding="utf-8"))))
+    """Read the packaged register."""
+    return read_constants(REGISTER)
+
+
+def read_constants(path: Path) -> tuple[Constant, ...]:
+    """Read a register. Raises OSError or ValueError if it cannot be read."""
+    return tuple(_read_constants(tomllib.loads(path.read_text(encoding="utf-8"))))
 
 
 def _read_constants(content: Mapping[str, Any]) -> Iterator[Constant]:

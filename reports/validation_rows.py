@@ -89,6 +89,7 @@ class ValidationRow:
     sense: Literal["at most", "at least"]
     how: str
     conditions: Conditions
+    kind: RowKind = RowKind.VERIFICATION
 
     @property
     def is_met(self) -> bool | None:
@@ -97,13 +98,6 @@ class ValidationRow:
             return None
         # NaN meets no limit
         return self.measured <= self.limit if self.sense == "at most" else self.measured >= self.limit
-
-    @property
-    def kind(self) -> RowKind:
-        """What the row compares the simulation with."""
-        if not self.conditions.data:
-            return RowKind.VERIFICATION
-        return RowKind.FIT if self.conditions.data in fitted_data() else RowKind.VALIDATION
 
     def concerns(self, system: str) -> bool:
         """Whether the row concerns the verdicts of a system."""
@@ -129,15 +123,22 @@ class ValidationCheck:
 _ADAPTER = TypeAdapter(dict[str, ValidationCheck])
 
 
+def read_checks(path: Path = VALIDATION_FILE) -> Mapping[str, ValidationCheck]:
+    """Read the rows by check. Raises ValueError if the file is invalid, OSError if it cannot be read."""
+    return _ADAPTER.validate_json(path.read_bytes())
+
+
 @cache
-def read_checks() -> Mapping[str, ValidationCheck]:
-    """Read the packaged rows by check."""
-    return _ADAPTER.validate_json(VALIDATION_FILE.read_bytes())
-
-
 def rows_of_system(system: str) -> list[ValidationRow]:
-    """List the rows that concern the verdicts of a system."""
+    """List the packaged rows that concern the verdicts of a system."""
     return [row for check in read_checks().values() for row in check.rows if row.concerns(system)]
+
+
+def kind_of(data: str) -> RowKind:
+    """Return the kind of a comparison with these data; empty for an independent calculation."""
+    if not data:
+        return RowKind.VERIFICATION
+    return RowKind.FIT if data in fitted_data() else RowKind.VALIDATION
 
 
 def find_conditions(conditions: Collection[Conditions], claim: str) -> Conditions:

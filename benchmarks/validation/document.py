@@ -12,15 +12,18 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import renderer
 from marsyard.reports.validation_rows import (
     VALIDATION_FILE,
+    Conditions,
     RowKind,
     ValidationCheck,
     ValidationRow,
     find_conditions,
+    kind_of,
     to_json,
 )
 from marsyard.sim.kernel_cache import processor_features
@@ -84,17 +87,19 @@ def create_rows(checks: Sequence[Check], stored: dict[str, dict]) -> dict[str, V
             check.section,
             stored[check.name]["environment"],
             tuple(
-                ValidationRow(
-                    **row
-                    | {name: None if row[name] is None else float(row[name]) for name in ("measured", "limit")}
-                    | {"conditions": find_conditions(check.conditions, row["claim"])}
-                )
+                _create_row(row, find_conditions(check.conditions, row["claim"]))
                 for row in stored[check.name]["measures"]
             ),
         )
         for check in checks
         if check.name in stored
     }
+
+
+def _create_row(row: dict[str, Any], conditions: Conditions) -> ValidationRow:
+    """Combine a stored measurement with its conditions."""
+    numbers = {name: None if row[name] is None else float(row[name]) for name in ("measured", "limit")}
+    return ValidationRow(**row | numbers, conditions=conditions, kind=kind_of(conditions.data))
 
 
 def write_pages(checks: Sequence[Check], stored: dict[str, dict]) -> None:

@@ -201,6 +201,20 @@ class RowStore(AbstractContextManager["RowStore"]):
             raise StoreError(f"{self._path}: {problem}; its rows are not those that the campaign stored")
 
     @property
+    def head(self) -> str:
+        """Last head of the chain of hashes, which depends on all rows."""
+        return self._last_entry()[1].hex()
+
+    def copy(self, path: Path) -> None:
+        """Copy the rows into a new file, complete without a log file. Raises StoreError if it cannot be written."""
+        try:
+            with closing(sqlite3.connect(path)) as target:
+                self._connection.backup(target)
+                target.execute("PRAGMA journal_mode = DELETE")
+        except sqlite3.Error as error:
+            raise StoreError(f"{path} cannot be written: {error}") from error
+
+    @property
     def is_signed(self) -> bool:
         """Whether this user's installation stored the last rows."""
         return self._seals().get(chain.ROWS, ("", False))[1]

@@ -20,6 +20,7 @@ import typer
 from typer import Option
 from typer.core import TyperCommand, TyperGroup
 
+from marsyard.cli.assure import assure
 from marsyard.cli.campaign import append, merge, resume, run
 from marsyard.cli.conformance import conformance
 from marsyard.cli.console import create_console
@@ -178,7 +179,7 @@ def _select_device(device: str) -> None:
 #: Commands by help panel; the first word of a function's name is the command's name.
 PANELS: dict[str, tuple[Callable[..., None], ...]] = {
     "Run campaigns": (list_campaigns, show, run, resume, append, merge, replay, rare, search, budget, robust, nightly),
-    "Results": (report, confirmations, compare, dashboard),
+    "Results": (report, confirmations, compare, dashboard, assure),
     "Worlds and images": (render, gallery, dataset),
     "Custom campaigns and algorithms": (new, ingest, conformance, export, score),
     "Housekeeping": (doctor, compile_kernels, clean),

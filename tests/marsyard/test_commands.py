@@ -13,7 +13,7 @@ PRINTING = {
 }  # fmt: skip
 WRITING = {
     "run", "resume", "append", "merge", "replay", "report", "dashboard", "nightly", "gallery", "render", "dataset",
-    "new", "ingest", "export", "score", "compile", "rare", "search", "budget", "robust",
+    "new", "ingest", "export", "score", "compile", "rare", "search", "budget", "robust", "assure",
 }  # fmt: skip
 
 

@@ -42,7 +42,10 @@ def test_wheel_contains_one_package(wheel: Path) -> None:
         names = archive.namelist()
     top_level_names = {name.partition("/")[0] for name in names}
     assert {name for name in top_level_names if not name.endswith(".dist-info")} == {"marsyard"}
-    for name in ("sim/render/renderer.py", "scenarios/descent/requirements.toml", "reports/templates/report.css"):
+    for name in (
+        "sim/render/renderer.py", "scenarios/descent/requirements.toml", "reports/templates/report.css",
+        "reports/validation.json", "reports/fitted.toml", "reports/credibility.toml",
+    ):  # fmt: skip
         assert f"marsyard/{name}" in names
     sources = {
         path.relative_to(ROOT).as_posix()

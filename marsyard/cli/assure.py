@@ -1,0 +1,81 @@
+"""Command `marsyard assure`: write an assurance package of stored campaigns, or verify one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from typer import Argument, Option
+
+from marsyard.cli.errors import Exit, handle_user_errors
+
+
+@handle_user_errors
+def assure(
+    runs: Annotated[
+        list[Path] | None, Argument(metavar="[RUN...]", help="Folders of finished campaigns, one or more.")
+    ] = None,
+    out: Annotated[Path, Option(metavar="DIR", help="New folder of the package.")] = Path("assurance"),
+    sign: Annotated[
+        Path | None, Option(metavar="KEY", help="Sign the package with this OpenSSH key (ssh-keygen -Y sign).")
+    ] = None,
+    verify: Annotated[
+        Path | None, Option(metavar="DIR", help="Verify a package: every file, row, record, verdict and claim.")
+    ] = None,
+    signers: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="With --verify: require a signature by a key of this file of allowed signers."),
+    ] = None,
+) -> None:
+    """Write an assurance package: claims, arguments, evidence and open defeaters of campaigns in one offline folder.
+
+    The exit status does not depend on the verdicts. With --verify it is 1 if the package does not verify.
+    """
+    from marsyard.campaigns.errors import CampaignError
+
+    if verify is not None:
+        if runs or sign is not None:
+            raise CampaignError("--verify verifies an existing package: give no RUN and no --sign")
+        _verify(verify, signers)
+        return
+    if not runs:
+        raise CampaignError("give the folders of one or more finished campaigns, or --verify DIR")
+    if signers is not None:
+        raise CampaignError("--signers needs --verify")
+    _write(runs, out, sign)
+
+
+def _write(runs: list[Path], out: Path, key: Path | None) -> None:
+    from marsyard.campaigns.errors import StoreError, report_write_errors
+    from marsyard.campaigns.store.temporary_files import create_folder
+    from marsyard.reports.assurance.package import MANIFEST, PAGE, write_package
+    from marsyard.reports.assurance.signature import sign_file
+    from marsyard.reports.wording import count
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"{out} is not an empty folder; choose another folder with --out")
+    with report_write_errors(out), create_folder(out) as folder:
+        case = write_package(runs, folder)
+        if key is not None:
+            sign_file(folder / MANIFEST, key)
+    for run in case.runs:
+        typer.echo(f"{run.report.campaign}: {run.report.verdict}, {count(run.report.cases, 'case')}")
+    typer.echo(f"claim: {case.root.state}; {count(len(case.defeaters), 'open defeater')}")
+    typer.echo(f"package: {out / PAGE}{'' if key else ' (not signed)'}")
+    typer.echo(f"to verify: marsyard assure --verify {out}")
+
+
+def _verify(folder: Path, signers: Path | None) -> None:
+    from marsyard.reports.assurance.verification import verify_package
+    from marsyard.reports.wording import count
+
+    result = verify_package(folder, signers)
+    for note in result.notes:
+        typer.echo(f"verified: {note}" if not note.startswith("no signature") else note)
+    for problem in result.problems:
+        typer.echo(f"problem: {problem}")
+    if result.problems:
+        typer.echo(f"NOT VERIFIED: {count(len(result.problems), 'problem')} in {folder}")
+        raise typer.Exit(Exit.FAILED)
+    typer.echo(f"OK: {folder}")

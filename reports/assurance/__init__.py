@@ -1,0 +1,1 @@
+"""Assurance package: the argument for the verdicts of campaigns, with all its evidence, in one folder."""

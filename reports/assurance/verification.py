@@ -1,0 +1,210 @@
+"""Verification of an assurance package: hashes of all files, chains of rows and confirmations, verdicts, and the case.
+
+Without a signature, the hashes show accidental changes only: a person who changes a file can also write its new hash.
+The other steps then still find rows, records and claims that contradict each other.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from marsyard.campaigns.errors import CampaignError
+from marsyard.campaigns.store.confirmations import find_own_entry, read_record
+from marsyard.reports.assurance.case import VALIDATION, AssuredRun, build_case
+from marsyard.reports.assurance.package import (
+    CONFIRMATIONS,
+    MANIFEST,
+    SCHEMA,
+    hash_files,
+    read_run_evidence,
+    render_case,
+)
+from marsyard.reports.assurance.signature import check_signature, signature_path
+from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.report_file import REPORT_JSON
+from marsyard.reports.stored import table
+from marsyard.reports.validation_rows import VALIDATION_FILE
+from marsyard.reports.verdicts import Status, Verdict
+
+#: Numbers of a verdict that follow from the requirement, the rows and the record of confirmations.
+_NUMBERS = ("bound", "probability", "confidence", "scale", "n", "failures", "estimate", "lower", "upper")
+_TEXTS = ("statement", "metric", "population", "decide_by", "source", "kind")
+_TOLERANCE = 1e-9
+#: Further content of `report.json` that follows from the rows, and from the rows and the packaged validation rows.
+_FROM_ROWS = ("cases", "crashed", "outcomes", "metric", "statistics", "worst_cases", "sampling", "algorithm_details")
+_COMPARED = (*_FROM_ROWS, "validity")
+
+
+@dataclass(frozen=True)
+class Verification:
+    """Result of a verification: problems, each with the file or claim that it names, and what was verified."""
+
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def verify_package(folder: Path, signers: Path | None = None) -> Verification:
+    """Verify a package. Raises CampaignError if the folder contains none, or its layout is of another version.
+
+    signers: file of allowed signers; a signature by another key is then a problem
+    """
+    manifest = _read_manifest(folder)
+    problems = list(_compare_hashes(folder, table(manifest.get("files"))))
+    notes = [f"{len(table(manifest.get('files')))} files with their hashes"]
+    signature_problems, note = _check_signature(folder, signers)
+    problems += signature_problems
+    notes.append(note)
+    runs = []
+    # a copy, because SQLite writes into the folder of its file even for reading
+    with tempfile.TemporaryDirectory(prefix="marsyard-") as name:
+        copy = Path(name, "package")
+        shutil.copytree(folder, copy, symlinks=True)
+        names = [str(run) for run in manifest.get("runs") or ()]
+        if not names:
+            problems.append(f"{MANIFEST}: the package contains no campaign")
+        for run_name in names:
+            try:
+                run = read_run_evidence(copy, f"runs/{run_name}")
+                problems += _verify_run(copy / run.folder, run)
+                runs.append(run)
+            except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
+                problems.append(f"runs/{run_name}: {_relative(error, copy)}")
+        if manifest.get("marsyard") != version("marsyard"):
+            written = f"the package was written by marsyard {manifest.get('marsyard')}, this is {version('marsyard')}"
+            notes.append(f"case and page are checked by their hashes only: {written}")
+        elif len(runs) == len(names):
+            problems += _compare_case(copy, runs)
+            notes.append("case and page, computed again from the evidence")
+    notes.append(f"rows, verdicts and confirmations of {len(runs)} campaigns")
+    return Verification(tuple(dict.fromkeys(problems)), tuple(notes))
+
+
+def _read_manifest(folder: Path) -> Mapping[str, Any]:
+    try:
+        manifest = table(json.loads((folder / MANIFEST).read_text(encoding="utf-8")))
+    except OSError as error:
+        raise CampaignError(f"{folder} is no assurance package: {MANIFEST} cannot be read") from error
+    except ValueError as error:
+        raise CampaignError(f"{folder / MANIFEST} is damaged: {error}") from error
+    if manifest.get("schema") != SCHEMA:
+        raise CampaignError(f"{folder / MANIFEST} has schema {manifest.get('schema')}; allowed: {SCHEMA}")
+    return manifest
+
+
+def _compare_hashes(folder: Path, stored: Mapping[str, Any]) -> Iterator[str]:
+    """Compare the files with their hashes."""
+    present = hash_files(folder)
+    for name in sorted({*stored, *present}):
+        if name not in present:
+            yield f"{name}: the file is missing"
+        elif name not in stored:
+            yield f"{name}: the file is not in {MANIFEST}"
+        elif stored[name] != present[name]:
+            yield f"{name}: the file was changed after the package was written"
+
+
+def _check_signature(folder: Path, signers: Path | None) -> tuple[list[str], str]:
+    """Check the signature of the manifest; a missing one is a problem only if a signer is required."""
+    path = folder / MANIFEST
+    if not signature_path(path).is_file():
+        problems = [] if signers is None else [f"{signature_path(path).name}: the package is not signed"]
+        return problems, "no signature: who wrote the package is unknown"
+    is_valid, text = check_signature(path, signers)
+    identity = "" if signers is not None else " (to check who signed: --signers FILE)"
+    return ([] if is_valid else [f"{signature_path(path).name}: {text}"]), f"signature: {text}{identity}"
+
+
+def _verify_run(directory: Path, run: AssuredRun) -> Iterator[str]:
+    """Verify rows, record of confirmations, and verdicts of a campaign."""
+    record = directory / CONFIRMATIONS
+    evidence = run.report.evidence
+    if evidence.is_confirmation and evidence.record:
+        entry = find_own_entry(read_record(record), evidence)
+        if entry is None:
+            yield f"{run.folder}/{CONFIRMATIONS}: the record does not contain confirmation {evidence.number}"
+    evaluation = evaluate_run(directory, record=record if record.is_file() else None)
+    if len(evaluation.run.all_cases) != run.report.cases:
+        yield f"{run.folder}/report.json: {run.report.cases} cases, but {len(evaluation.run.all_cases)} rows"
+    stored = {verdict.requirement_id: verdict for verdict in run.report.verdicts}
+    computed = {verdict.requirement_id: verdict for verdict in evaluation.verdicts}
+    for name in dict.fromkeys((*stored, *computed)):
+        if name not in stored or name not in computed:
+            yield f"{run.folder}/report.json: the requirement {name} is missing, or not in campaign.json"
+        elif difference := _find_difference(stored[name], computed[name]):
+            yield f"{run.folder}/report.json: {name} does not follow from the rows: {difference}"
+    with tempfile.TemporaryDirectory(prefix="marsyard-") as name:
+        write_evaluation(evaluation, Path(name))
+        rewritten = json.loads((Path(name) / REPORT_JSON).read_text(encoding="utf-8"))
+    compared = (
+        _COMPARED if (directory / "../.." / VALIDATION).read_bytes() == VALIDATION_FILE.read_bytes() else _FROM_ROWS
+    )
+    for key in compared:
+        if not _is_equal(run.data.get(key), rewritten.get(key)):
+            yield f"{run.folder}/report.json: {key} does not follow from the rows"
+
+
+def _find_difference(stored: Verdict, computed: Verdict) -> str:
+    """Describe the first number or status that differs; the registration of a record cannot be verified here."""
+    for name in _NUMBERS:
+        first, second = float(getattr(stored, name)), float(getattr(computed, name))
+        if not (math.isclose(first, second, rel_tol=_TOLERANCE) or (math.isnan(first) and math.isnan(second))):
+            return f"{name} {first:g}, from the rows {second:g}"
+    for name in _TEXTS:
+        if getattr(stored, name) != getattr(computed, name):
+            return f"{name} '{getattr(stored, name)}', in campaign.json '{getattr(computed, name)}'"
+    statuses = [Status.PASS if item.status.is_qualified else item.status for item in (stored, computed)]
+    return "" if statuses[0] is statuses[1] else f"{stored.status}, from the rows {computed.status}"
+
+
+def _is_equal(first: Any, second: Any) -> bool:
+    """Compare JSON values; numbers with a tolerance for the rounding errors of another processor."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return first.keys() == second.keys() and all(_is_equal(first[key], second[key]) for key in first)
+    if isinstance(first, list) and isinstance(second, list):
+        return len(first) == len(second) and all(map(_is_equal, first, second))
+    if isinstance(first, float) and isinstance(second, float):
+        return math.isclose(first, second, rel_tol=_TOLERANCE)
+    return bool(first == second)
+
+
+def _compare_case(folder: Path, runs: Sequence[AssuredRun]) -> Iterator[str]:
+    """Compare the files that are computed from the evidence, and name the first element that differs."""
+    try:
+        case = build_case(runs, folder)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        yield f"evidence: {_relative(error, folder)}"
+        return
+    for name, content in render_case(case).items():
+        path = folder / name
+        if path.is_file() and path.read_text(encoding="utf-8") == content:
+            continue
+        yield f"{name}: {_locate_difference(path, content) or 'the content does not follow from the evidence'}"
+
+
+def _locate_difference(path: Path, content: str) -> str:
+    """Describe the first element of a case in JSON that differs; empty for other files."""
+    if path.suffix != ".json" or not path.is_file():
+        return ""
+    try:
+        stored = table(json.loads(path.read_text(encoding="utf-8"))).get("elements") or []
+    except ValueError:
+        return "the file is damaged"
+    for found, expected in zip(stored, json.loads(content)["elements"], strict=False):
+        if found != expected:
+            return f"element {expected['id']} does not follow from the evidence: {expected['statement']}"
+    return ""
+
+
+def _relative(error: Exception, folder: Path) -> str:
+    """Return the message of an error without the path of the temporary folder."""
+    text = str(error) or type(error).__name__
+    return text.replace(f"{folder}/", "")

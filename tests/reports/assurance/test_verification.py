@@ -1,0 +1,278 @@
+"""Tests of assurance packages: what they contain, and that any change of them is found and named."""
+
+import json
+import shutil
+import sqlite3
+import subprocess
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from marsyard.campaigns.errors import CampaignError
+from marsyard.reports.assurance.case import Kind, State, number_elements
+from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, write_package
+from marsyard.reports.assurance.signature import sign_file
+from marsyard.reports.assurance.verification import verify_package
+from tests.command import marsyard
+from tests.reports.assurance.stored_run import write_stored_run
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a package of one campaign of 240 cases."""
+    folder = tmp_path_factory.mktemp("assured")
+    run = write_stored_run(folder / "run")
+    (folder / "package").mkdir()
+    write_package([run], folder / "package")
+    return folder / "package"
+
+
+@pytest.fixture
+def package(stored: Path, tmp_path: Path) -> Path:
+    """Copy the package, to change it."""
+    return Path(shutil.copytree(stored, tmp_path / "package"))
+
+
+RUN = "runs/dimes-synthetic"
+
+
+def rehash(folder: Path) -> None:
+    """Write the hashes of the present files: the change of a person who knows the layout of a package."""
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps(manifest | {"files": hash_files(folder)}))
+
+
+def replace_text(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def change_row(folder: Path) -> None:
+    with closing(sqlite3.connect(folder / RUN / "cases.sqlite")) as connection, connection:
+        (row,) = connection.execute("SELECT row FROM cases WHERE case_number = 7").fetchone()
+        values = json.loads(row)
+        values[3] = 0.001  # the velocity error
+        connection.execute("UPDATE cases SET row = ? WHERE case_number = 7", (json.dumps(values),))
+
+
+def change_table(folder: Path) -> None:
+    path = folder / RUN / "cases.parquet"
+    frame = pd.read_parquet(path)
+    frame.loc[7, "velocity_error_m_s"] = 0.001
+    frame.to_parquet(path)
+
+
+def change_verdict(folder: Path) -> None:
+    path = folder / RUN / "report.json"
+    report = json.loads(path.read_text())
+    report["verdicts"][0]["failures"] += 1
+    path.write_text(json.dumps(report))
+
+
+def change_validity(folder: Path) -> None:
+    path = folder / RUN / "report.json"
+    report = json.loads(path.read_text())
+    report["validity"]["missed"] = []
+    path.write_text(json.dumps(report))
+
+
+def change_statement(folder: Path) -> None:
+    replace_text(folder / CASE, "supported, with open defeaters", "supported")
+
+
+def change_drawing(folder: Path) -> None:
+    replace_text(folder / "case.svg", "not shown", "supported")
+
+
+def change_page(folder: Path) -> None:
+    replace_text(folder / "index.html", "Not shown", "Supported")
+
+
+def change_validation_row(folder: Path) -> None:
+    replace_text(folder / "evidence/validation.json", '"measured": 0.6230026031237486', '"measured": 0.5')
+
+
+def change_requirement(folder: Path) -> None:
+    path = folder / RUN / "campaign.json"
+    path.write_text(path.read_text().replace('"probability": 0.99', '"probability": 0.9'))
+
+
+def test_package_verifies(package: Path) -> None:
+    result = verify_package(package)
+    assert result.problems == ()
+    assert any("case and page, computed again" in note for note in result.notes)
+    # the verification does not write into the package
+    assert hash_files(package) == json.loads((package / MANIFEST).read_text())["files"]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (change_row, "the row of case 7 was changed"),
+        (change_table, f"{RUN}: {RUN}/cases.parquet was changed"),
+        (change_verdict, f"{RUN}/report.json: DIMES-VEL does not follow from the rows: failures"),
+        (change_validity, f"{RUN}/report.json: validity does not follow from the rows"),
+        (change_statement, "case.json: element G"),
+        (change_drawing, "case.svg: the content does not follow"),
+        (change_page, "index.html: the content does not follow"),
+        (change_validation_row, "index.html: the content does not follow"),
+        (
+            change_requirement,
+            f"{RUN}/report.json: DIMES-VEL does not follow from the rows: probability 0.99, from the rows",
+        ),
+    ],
+)
+def test_changes_with_a_new_hash_are_found_and_named(package: Path, change: Callable[[Path], None], named: str) -> None:
+    change(package)
+    rehash(package)
+    problems = verify_package(package).problems
+    assert any(named in problem for problem in problems), problems
+
+
+@pytest.mark.parametrize(
+    "name", [f"{RUN}/report.html", f"{RUN}/cases.sqlite", f"{RUN}/campaign.json", "evidence/fitted.toml", "case.svg"]
+)
+def test_every_changed_file_is_named(package: Path, name: str) -> None:
+    with (package / name).open("ab") as file:
+        file.write(b" ")
+    status, out, _ = marsyard("assure", "--verify", package)
+    assert status == 1
+    assert f"problem: {name}: the file was changed" in out
+    assert "NOT VERIFIED" in out
+
+
+def test_missing_additional_and_linked_files_are_named(package: Path) -> None:
+    (package / RUN / "junit.xml").unlink()
+    (package / "manifest.json.note").write_text("")
+    (package / "evidence/link").symlink_to(package / "case.svg")
+    problems = verify_package(package).problems
+    assert f"{RUN}/junit.xml: the file is missing" in problems
+    assert f"manifest.json.note: the file is not in {MANIFEST}" in problems
+    assert f"evidence/link: the file is not in {MANIFEST}" in problems
+
+
+def test_signature_shows_who_wrote_the_hashes(package: Path, tmp_path: Path) -> None:
+    keys = [tmp_path / "key", tmp_path / "other"]
+    for key in keys:
+        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", key], check=True)
+    signers, others = tmp_path / "signers", tmp_path / "others"
+    for file, key in zip((signers, others), keys, strict=True):
+        file.write_text(f"board@example.org {key.with_suffix('.pub').read_text()}")
+    assert verify_package(package, signers).problems == ("manifest.json.sig: the package is not signed",)
+    sign_file(package / MANIFEST, keys[0])
+    result = verify_package(package, signers)
+    assert result.problems == ()
+    assert any("board@example.org" in note for note in result.notes)
+    assert verify_package(package).problems == ()
+    unknown = f"manifest.json.sig: the key of the signature is not in {others}"
+    assert verify_package(package, others).problems == (unknown,)
+    # new hashes of a changed page have no signature
+    change_page(package)
+    rehash(package)
+    assert any(problem.startswith("manifest.json.sig: ") for problem in verify_package(package, signers).problems)
+    assert any(problem.startswith("manifest.json.sig: ") for problem in verify_package(package).problems)
+
+
+def test_case_has_all_kinds_of_defeaters(tmp_path: Path) -> None:
+    (tmp_path / "package").mkdir()
+    case = write_package([write_stored_run(tmp_path / "run")], tmp_path / "package")
+    texts = [item.text for _, item, _ in case.defeaters]
+    beginnings = (
+        "The required rate or bound is assumed", "Exploration: the seed was chosen freely", "Missed check (validation)",
+        "240 of 240 cases", "Fitted to statistics of Spirit", "Nobody outside of the project", "validation, level 1",
+    )  # fmt: skip
+    for beginning in beginnings:
+        assert any(text.startswith(beginning) for text in texts), beginning
+    # an exploration does not show that its cases are new
+    assert case.root.state in (State.OPEN, State.REFUTED)
+    content = case.to_json()
+    names = [name for name, _, _ in number_elements(case.root)]
+    assert [item["id"] for item in content["elements"]] == names
+    assert {link["target"] for link in content["links"] if link["type"] == "supportedBy"} <= set(names)
+    assert len([link for link in content["links"] if link["type"] == "challenges"]) == len(case.defeaters)
+    for _, item, _ in number_elements(case.root):
+        assert not item.evidence or (tmp_path / "package" / item.evidence).is_file()
+
+
+def test_failed_requirement_refutes_the_claim(tmp_path: Path) -> None:
+    run = write_stored_run(tmp_path / "run")
+    record = (run / "campaign.json").read_text()
+    (run / "campaign.json").write_text(record.replace('"bound": 5.0', '"bound": 0.001'))
+    (tmp_path / "package").mkdir()
+    case = write_package([run], tmp_path / "package")
+    assert case.root.state is State.REFUTED
+    solution = next(item for _, item, _ in number_elements(case.root) if item.kind is Kind.SOLUTION)
+    assert solution.text.startswith("FAIL: ")
+
+
+def test_page_opens_offline(stored: Path) -> None:
+    page = (stored / "index.html").read_text()
+    assert "default-src 'none'" in page
+    assert "http://" not in page.replace("http://www.w3.org/", "")
+    assert "https://" not in page
+    assert "<svg" in page
+
+
+def test_packages_of_two_runs_of_a_campaign_have_two_folders(tmp_path: Path) -> None:
+    runs = [write_stored_run(tmp_path / name, cases=20) for name in ("a", "b")]
+    status, out, _ = marsyard("assure", *runs, "--out", tmp_path / "package")
+    assert status == 0
+    assert sorted(path.name for path in (tmp_path / "package/runs").iterdir()) == [
+        "dimes-synthetic",
+        "dimes-synthetic-2",
+    ]
+    assert f"to verify: marsyard assure --verify {tmp_path / 'package'}" in out
+    assert verify_package(tmp_path / "package").problems == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"state": "interrupted"}, "is not finished"), ({"study": {"kind": "search"}}, "contains a study")],
+)
+def test_studies_and_unfinished_campaigns_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    run = write_stored_run(tmp_path / "run", cases=20, **changes)
+    status, _, error = marsyard("assure", run, "--out", tmp_path / "package")
+    assert status == 2
+    assert message in error
+    assert not (tmp_path / "package").exists()
+
+
+def test_invalid_commands_have_one_message(tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/file").write_text("")
+    run = tmp_path / "missing"
+    for arguments, message in (
+        ((), "give the folders"),
+        ((run,), f"{run}"),
+        ((run, "--out", tmp_path / "full"), "is not an empty folder"),
+        (("--verify", tmp_path / "full"), "is no assurance package"),
+        ((run, "--verify", tmp_path), "give no RUN"),
+        ((run, "--signers", tmp_path / "full/file"), "--signers needs --verify"),
+    ):
+        status, _, error = marsyard("assure", *arguments)
+        assert status == 2
+        assert message in error.replace("\n", " ")
+
+
+def test_key_that_does_not_exist_leaves_no_package(tmp_path: Path) -> None:
+    run = write_stored_run(tmp_path / "run", cases=20)
+    status, _, error = marsyard("assure", run, "--out", tmp_path / "package", "--sign", tmp_path / "key")
+    assert (status, "no such file" in error, (tmp_path / "package").exists()) == (2, True, False)
+
+
+def test_package_of_another_layout_is_refused(package: Path) -> None:
+    (package / MANIFEST).write_text(json.dumps({"schema": 99}))
+    with pytest.raises(CampaignError, match="schema 99"):
+        verify_package(package)
+
+
+def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:
+    manifest = json.loads((package / MANIFEST).read_text())
+    (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9"}))
+    result = verify_package(package)
+    assert result.problems == ()
+    assert any("checked by their hashes only" in note for note in result.notes)
