@@ -67,6 +67,11 @@ def add_map(source: Path, table: MapTable, cases: store.CasesFile) -> store.Stor
     IngestError for an invalid map, for an image with a pose outside of the map, and if no image has a pose.
     """
     path, stored = source / table.file, cases.stored
+    if stored.detector.rows_summed != 1:
+        raise IngestError(
+            f"{source}: the images have {stored.detector.rows_summed} summed rows; allowed for map: square "
+            "pixels: resize the images, and scale the camera"
+        )
     product = _read_map(source, table)
     features = extract_features(product)
     posed_cases, problems = [], []

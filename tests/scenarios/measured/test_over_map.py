@@ -130,6 +130,10 @@ POSE_TABLE = '[poses]\naxes = "enu"\nattitude_of = "body"\n'
         (lambda folder: np.save(folder / "elevation.npy", np.full((9, 9), np.nan)), ["elevation.npy", "not finite"]),
         (lambda folder: (folder / "elevation.npy").write_text("1 2"), ["elevation.npy", "is not a valid array"]),
         (change_text("ingest.toml", 'task = "map"', 'task = "matching"'), ["map: the task map, and no other"]),
+        (
+            change_text("ingest.toml", "bits = 12", "bits = 12\nrows_summed = 4"),
+            ["4 summed rows; allowed for map: square"],
+        ),
         (change_text("ingest.toml", "pixel_m = 6.0", "pixel_m = -6"), ["map.pixel_m", "greater than 0"]),
         (
             change_text("ingest.toml", "[map]", "[map]\norigin_mars_fixed_m = [701.4, 3145.7, 1075.9]"),
