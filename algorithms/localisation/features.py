@@ -29,6 +29,8 @@ _MIN_SIDE_PX = 96
 #: Largest ratio of the pixels of map and binned image on the ground, and its inverse, in a registration (assumed): SIFT
 #: compares scales in steps of 2, and a wrong pose often places the camera very far from the ground.
 _MAX_SCALE_RATIO = 4.0
+#: Smallest component along the optical axis of the direction of a match: 84 deg, beyond which it is at the horizon.
+_MIN_FORWARD = 0.1
 #: Largest distance of an inlier from its position by the homography, pixels of the binned image; standard deviation of
 #: the blur of `flatten`, pixels (assumed).
 _MAX_RESIDUAL_PX, _FLATTEN_PX = 2.5, 16.0
@@ -133,7 +135,10 @@ def match_with_map(image: PosedImage, features: MapFeatures, options: LvsOptions
     pixels = np.array([keypoints[index].pt for index in indices], dtype=np.float64)
     pixels[:, 1] = image.camera.size[1] - 1 - pixels[:, 1]
     directions = camera_pose(image.camera).rotation.inv().apply(image.camera.rays(pixels)[1])
-    return features.points_m[map_indices], directions[:, :2] / directions[:, 2:]
+    forward = directions[:, 2] >= _MIN_FORWARD
+    if np.count_nonzero(forward) < options.min_matches:
+        return None
+    return features.points_m[map_indices[forward]], directions[forward, :2] / directions[forward, 2:]
 
 
 def _solve_by_homography(

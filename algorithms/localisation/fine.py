@@ -176,6 +176,8 @@ def render_templates(
     - corners: pixels (column, row) of the squares' upper left pixels
     - elevations_m: elevation of the ground in each square, where the intersection with the rays starts
     """
+    if not len(corners):
+        return np.zeros((0, side, side), dtype=np.float32), np.zeros(0, dtype=np.bool_)
     steps = np.arange(side, dtype=np.float64)
     pixels = corners[:, np.newaxis, np.newaxis, :] + np.stack(np.meshgrid(steps, steps), axis=-1)
     origins, directions = camera.rays(pixels.reshape(len(corners), side * side, 2))
@@ -183,11 +185,10 @@ def render_templates(
     inside = np.asarray(np.all(map_sampling.inside_map(map_product, ground), axis=1))
     positions = map_sampling.map_pixels(map_product, ground).reshape(len(corners), side, side, 2)
     appearance = map_product.appearance
-    if len(corners):
-        cells = np.abs(np.diff(positions, axis=2)).max(axis=-1)
-        # large cells: the map is averaged over a box, of odd side; the four samples average over the rest of the cell
-        size = 2 * int(float(np.median(cells)) / 4.0) + 1
-        appearance = cv2.blur(appearance, (size, size)) if size > 1 else appearance
+    cells = np.abs(np.diff(positions, axis=2)).max(axis=-1)
+    # large cells: the map is averaged over a box, of odd side; the four samples average over the rest of the cell
+    size = 2 * int(float(np.median(cells)) / 4.0) + 1
+    appearance = cv2.blur(appearance, (size, size)) if size > 1 else appearance
     return map_sampling.sample_averages(appearance, positions), inside
 
 

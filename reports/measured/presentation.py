@@ -146,7 +146,7 @@ def view(products: Products, complete: bool = False) -> CaseView:
 
 
 MEASURED = Presentation(
-    cases=(OVER_MAP, CaseKind(lambda products: bool(read_matched_pairs(products)), view, _LEGEND)),
+    cases=(CaseKind(lambda products: bool(read_matched_pairs(products)), view, _LEGEND), OVER_MAP),
     first=(agreement_section, map_section),
     outcomes=(MapOutcome,),
 )

@@ -106,8 +106,9 @@ def compare_with_map(
         errors_px = _errors_px(templates.pixels, templates.map_pixels, alignment)
         results["template"] = (int(np.count_nonzero(errors_px <= TOLERANCE_PX)), len(errors_px))
         correlations = templates.correlations
-        is_strong = templates.interest >= np.quantile(templates.interest, 1.0 - _STRONG_FRACTION, method="lower")
-        strong = correlations[is_strong]
+        # from the largest contrast to the smallest
+        order = np.argsort(-templates.interest, kind="stable")
+        strong = correlations[order[: int(np.ceil(_STRONG_FRACTION * len(order)))]]
         for name, match in (("sift", _match_sift), ("orb", _match_orb)):
             pixels, on_map, count = match(footprint)
             errors_px = _errors_px(pixels, on_map, alignment)

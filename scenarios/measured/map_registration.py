@@ -23,9 +23,10 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 
 #: Area for each feature of a map, pixels: 20,000 features in 2048 x 2048 pixels, as for the baseline `sift`.
-_FEATURE_AREA_PX = 200
+#: OpenCV interpolates the elevations of at most 32,767 features in one call.
+_FEATURE_AREA_PX, _MAX_FEATURES = 200, 32_000
 #: Smallest and largest side of a map, pixels: templates and features need some area, and time and memory are limited.
-_MIN_SIDE_PX, _MAX_SIDE_PX = 128, 8192
+_MIN_SIDE_PX, _MAX_SIDE_PX = 128, 4096
 
 
 def register_on_map(image: DetectorImage, map_product: MapProduct, features: MapFeatures) -> FeaturePose | None:
@@ -37,7 +38,7 @@ def register_on_map(image: DetectorImage, map_product: MapProduct, features: Map
 def extract_features(map_product: MapProduct) -> MapFeatures:
     """Extract the features of a map, without large-scale contrast, in proportion to its area."""
     flat = replace(map_product, appearance=flatten(map_product.appearance))
-    return MapFeatures.extract(flat, map_product.appearance.size // _FEATURE_AREA_PX)
+    return MapFeatures.extract(flat, min(map_product.appearance.size // _FEATURE_AREA_PX, _MAX_FEATURES))
 
 
 def load_map(cases: store.CasesFile) -> MapProduct:
@@ -67,6 +68,11 @@ def add_map(source: Path, table: MapTable, cases: store.CasesFile) -> store.Stor
     IngestError for an invalid map, for an image with a pose outside of the map, and if no image has a pose.
     """
     path, stored = source / table.file, cases.stored
+    if stored.detector.rows_summed != 1:
+        raise IngestError(
+            f"{source}: the images have {stored.detector.rows_summed} summed rows; allowed for map: square "
+            "pixels: resize the images, and scale the camera"
+        )
     product = _read_map(source, table)
     features = extract_features(product)
     posed_cases, problems = [], []

@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
+from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.scenarios.measured import store
@@ -86,6 +87,20 @@ def test_matchers_find_little_on_the_map_of_other_ground(flight: store.CasesFile
     assert max(float(row["sift_yield"]), float(row["orb_yield"])) < 0.01
 
 
+@pytest.mark.parametrize("height_m", [-50.0, 30.0, 150.0])
+def test_image_below_or_just_above_the_ground_has_no_templates(flight: store.CasesFile, height_m: float) -> None:
+    (image,) = store.load_images(flight, flight.stored.cases[0])
+    product = load_map(flight)
+    position = np.array([0.0, 0.0, height_m + elevation_at(product, np.zeros(2))])
+    row = compare_with_map(
+        PosedImage.from_detector(image, position, Rotation.identity()), product, POSITION_SD_M, LvsOptions()
+    ).row
+    # the footprint of 150 m is 35 map pixels wide; a template of 31 pixels with its search range needs 55
+    assert row["template_searched"] == row["lvs_inliers"] == 0
+    for name in ("template_yield", "template_correlation", "template_rank"):
+        assert np.isnan(float(row[name])), name
+
+
 def test_image_without_matches_is_an_outcome_of_its_case(tmp_path: Path) -> None:
     folder = write_map_folder(tmp_path / "in", map_scene(), {"middle": POSES["middle"]})
     noise = np.random.default_rng(3).integers(0, 4096, CAMERA.size[::-1]).astype(np.uint16)
@@ -125,11 +140,15 @@ POSE_TABLE = '[poses]\naxes = "enu"\nattitude_of = "body"\n'
         (write_truncated_jpeg, ["middle.jpg", "cannot be decoded", "truncated"]),
         (lambda folder: (folder / "middle.png").write_text("text"), ["middle.png", "is not a supported image"]),
         (lambda folder: (folder / "map.png").unlink(), ["map.png: No such file"]),
-        (lambda folder: cv2.imwrite(str(folder / "map.png"), np.zeros((64, 64), np.uint8)), ["64 x 64", "128 to 8192"]),
+        (lambda folder: cv2.imwrite(str(folder / "map.png"), np.zeros((64, 64), np.uint8)), ["64 x 64", "128 to 4096"]),
         (lambda folder: cv2.imwrite(str(folder / "map.png"), np.ones((256, 256), np.uint8)), ["all pixels of the map"]),
         (lambda folder: np.save(folder / "elevation.npy", np.full((9, 9), np.nan)), ["elevation.npy", "not finite"]),
         (lambda folder: (folder / "elevation.npy").write_text("1 2"), ["elevation.npy", "is not a valid array"]),
         (change_text("ingest.toml", 'task = "map"', 'task = "matching"'), ["map: the task map, and no other"]),
+        (
+            change_text("ingest.toml", "bits = 12", "bits = 12\nrows_summed = 4"),
+            ["4 summed rows; allowed for map: square"],
+        ),
         (change_text("ingest.toml", "pixel_m = 6.0", "pixel_m = -6"), ["map.pixel_m", "greater than 0"]),
         (
             change_text("ingest.toml", "[map]", "[map]\norigin_mars_fixed_m = [701.4, 3145.7, 1075.9]"),
