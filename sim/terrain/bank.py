@@ -14,8 +14,8 @@ import numpy as np
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
 from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream
-from marsyard.sim.terrain.landforms.kernels import interleave_samples, stamp_craters
-from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_craters
+from marsyard.sim.terrain.landforms.kernels import interleave_samples
+from marsyard.sim.terrain.landforms.relief import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
@@ -75,7 +75,7 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         if landform is not None:
             landform.apply(ground, substream(rng, name))
     if len(craters):
-        stamp_craters(ground.height, ground.log_albedo, ground.spacing_m, craters, EJECTA_EXTENT_RADII)
+        add_craters(ground, craters)
     if p.drifts is not None:
         p.drifts.apply(ground, substream(rng, "drifts"))
     if dtm is not None:

@@ -19,6 +19,7 @@ from marsyard.sim.terrain.landforms.kernels import (
     add_dunes,
     cut_channels,
     raise_cones,
+    stamp_craters,
     stamp_lobes,
 )
 
@@ -30,6 +31,7 @@ CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a two-dimensional cubic B-spline divided by that of its control values, if these are independent. The mean
 #: square has the factor 151/315 along each axis: the integral of the squared basis function.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
+RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
 EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
 #: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
 #: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
@@ -263,6 +265,18 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
     albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
     return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, phase])
+
+
+def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 21"]) -> None:
+    """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
+    octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
+    layer = None
+    for step in range(int(octave.max(initial=0.0)), -1, -1):
+        grid = ground.coarser(ground.spacing_m * 2.0**step) if step else ground
+        if layer is not None:
+            grid.add(layer)
+        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, craters[octave == step], EJECTA_EXTENT_RADII)
+        layer = grid
 
 
 def draw_channels(
