@@ -1,4 +1,4 @@
-"""Statistics of terrain images, and of pairs of them, to compare rendered with real ones; no calibration is needed."""
+"""Statistics of terrain images, of pairs, and of images on maps, to compare rendered with real ones; uncalibrated."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from scipy.ndimage import gaussian_filter
 
 #: Side of the resized images, pixels, as in DIMES; and side of the blocks for the local contrast.
@@ -16,6 +16,12 @@ SIDE, BLOCK = 256, 16
 FEATURE_SIDE, TEMPLATE = 512, 31
 #: Minimum numbers of matches, and of matches that agree with the homography of a pair.
 _MIN_MATCHES, _MIN_INLIERS = 8, 12
+#: Maximum distance of a match from its expected position on a map, and half width of the search for a template, pixels.
+_MAP_TOLERANCE_PX, _MAP_SEARCH_PX = 3.0, 6
+#: Number of features of ORB: about that of SIFT with its default contrast.
+_ORB_FEATURES = 1000
+#: Fraction of the templates that are the strongest ones, and minimum number of templates.
+_STRONGEST, _MIN_TEMPLATES = 0.1, 20
 #: Grey level of the mean, and distance of the overlap's border from the image's, pixels.
 _GREY, _MARGIN_PX = 110.0, 8
 #: Frequency range of the fit to the power spectrum, cycles per image.
@@ -70,6 +76,23 @@ class PairStatistics(NamedTuple):
     decorrelation: float
 
 
+class MapStatistics(NamedTuple):
+    """Statistics of an image against a map with pixels of about the same size; a homography relates them.
+
+    - sift, orb: features of the image in the overlap whose best match on the map is at the expected position, divided
+      by all features of the image in the overlap
+    - correlation: median over all templates of the largest correlation with the map near the expected position
+    - strongest: the same over the tenth of the templates with the largest Harris values on the map
+    - valid: fraction of the templates whose largest correlation is at the expected position
+    """
+
+    sift: float
+    orb: float
+    correlation: float
+    strongest: float
+    valid: float
+
+
 def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageStatistics:
     """Compute the statistics of an image in any unit proportional to radiance."""
     small = _reduce(image, SIDE)
@@ -84,7 +107,7 @@ def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageS
     band_4, band_8 = (_standardise((fine - coarse)[16:-16, 16:-16]) for fine, coarse in pairwise(smooth))
     tails = (float((band_4**4).mean()) - 3.0, float((band_8**4).mean()) - 3.0, float((band_8**3).mean()))
     features = cv2.SIFT.create().detect(_to_bytes(_flatten(_reduce(image, FEATURE_SIDE), 64.0)))
-    template = float(_template_strength(small).max())
+    template = float(_template_strength(small)[40:-40:8, 40:-40:8].max())
     return ImageStatistics(
         rms, spectral_slope(small), p10, p50, p90, p90 / p10, corner, *tails, template, float(len(features))
     )
@@ -98,25 +121,16 @@ def compute_pair_statistics(
     The contrast between 1 and 8 pixels is scaled to 8 grey levels in both images.
     """
     image, other = images = tuple(_equalise(_reduce(item, FEATURE_SIDE)) for item in (first, second))
-    sift = cv2.SIFT.create(6000, contrastThreshold=0.008)
-    (keys, descriptors), (other_keys, other_descriptors) = (sift.detectAndCompute(item, None) for item in images)
-    if descriptors is None or other_descriptors is None:
+    matched = _match(cv2.SIFT.create(6000, contrastThreshold=0.008), cv2.NORM_L2, *images)
+    homography, inliers = _fit_homography(matched, 2.5)
+    if homography is None:
         return None
-    neighbours = cv2.BFMatcher().knnMatch(descriptors, other_descriptors, k=2)
-    matches = [best[0] for best in neighbours if len(best) == 2 and best[0].distance < 0.8 * best[1].distance]
-    if len(matches) < _MIN_MATCHES:
-        return None
-    points = np.array([keys[match.queryIdx].pt for match in matches], dtype=np.float32)
-    other_points = np.array([other_keys[match.trainIdx].pt for match in matches], dtype=np.float32)
-    homography, inliers = cv2.findHomography(points, other_points, cv2.RANSAC, 2.5, maxIters=20000, confidence=0.9999)
-    if homography is None or inliers.sum() < _MIN_INLIERS:
-        return None
-    in_overlap = _is_inside(_warp(np.array([key.pt for key in keys], dtype=np.float32), homography)).sum()
+    in_overlap = _is_inside(_warp(matched.features, homography), other).sum()
     corners, other_corners = (
         cv2.goodFeaturesToTrack(item, count, 0.01, 7)[:, 0] for item, count in zip(images, (500, 700), strict=True)
     )
     expected = _warp(corners, homography)
-    visible = _is_inside(expected)
+    visible = _is_inside(expected, other)
     corners, expected = corners[visible], expected[visible]
     nearest = np.linalg.norm(expected[:, None] - other_corners[None], axis=2).min(axis=1)
     warped = cv2.warpPerspective(other, np.linalg.inv(homography), (FEATURE_SIDE, FEATURE_SIDE))
@@ -129,6 +143,67 @@ def compute_pair_statistics(
         float(np.median(errors)) if errors.size else float("nan"),
         _decorrelation(image, other, homography),
     )
+
+
+def compute_map_statistics(
+    image: Float[np.ndarray, "rows columns"], mapped: Float[np.ndarray, "map_rows map_columns"]
+) -> MapStatistics | None:
+    """Compute the statistics of an image on a map with pixels of about the same size.
+
+    The contrast of both is equalised as for pairs. None where no homography or too few templates are found.
+    """
+    picture, chart = (_equalise(np.asarray(item, dtype=np.float64)) for item in (image, mapped))
+    many = _match(cv2.SIFT.create(contrastThreshold=0.008), cv2.NORM_L2, picture, chart)
+    homography, _ = _fit_homography(many, _MAP_TOLERANCE_PX)
+    if homography is None:
+        return None
+    yields = []
+    for detector, norm in ((cv2.SIFT.create(), cv2.NORM_L2), (cv2.ORB.create(_ORB_FEATURES), cv2.NORM_HAMMING)):
+        matched = _match(detector, norm, picture, chart)
+        errors = np.linalg.norm(_warp(matched.points, homography) - matched.other_points, axis=1)
+        in_overlap = _is_inside(_warp(matched.features, homography), chart).sum()
+        yields.append(float((errors < _MAP_TOLERANCE_PX).sum() / max(in_overlap, 1)))
+    largest, distance, strength = _search_templates(picture, chart, homography)
+    if largest.size < _MIN_TEMPLATES:
+        return None
+    strongest = strength >= np.quantile(strength, 1.0 - _STRONGEST)
+    valid = float((distance < _MAP_TOLERANCE_PX).mean())
+    return MapStatistics(*yields, float(np.median(largest)), float(np.median(largest[strongest])), valid)
+
+
+def _search_templates(
+    picture: UInt8[np.ndarray, "side side"],
+    chart: UInt8[np.ndarray, "rows columns"],
+    homography: Float[np.ndarray, "3 3"],
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Correlate templates of an image, warped to the map, with the map near their expected positions.
+
+    Returns the largest correlation of each template, its distance from the expected position, pixels of the map, and
+    the template's Harris value on the map.
+    """
+    # twice the map's resolution, then averaged
+    double = np.array([[2.0, 0.0, 0.5], [0.0, 2.0, 0.5], [0.0, 0.0, 1.0]]) @ homography
+    rows, columns = chart.shape
+    size = (2 * columns, 2 * rows)
+    warped, covered = (
+        cv2.resize(cv2.warpPerspective(item, double, size), (columns, rows), interpolation=cv2.INTER_AREA)
+        for item in (picture, np.full_like(picture, 255))
+    )
+    strength, half, search = _template_strength(chart.astype(np.float64)), TEMPLATE // 2, _MAP_SEARCH_PX
+    found = []
+    for row in range(half + search, rows - half - search, 8):
+        for column in range(half + search, columns - half - search, 8):
+            window = np.s_[row - half : row + half + 1, column - half : column + half + 1]
+            if covered[window].min() < 255:
+                continue
+            first, last = -half - search, half + search + 1
+            area = chart[row + first : row + last, column + first : column + last]
+            correlation = cv2.matchTemplate(area, warped[window], cv2.TM_CCOEFF_NORMED)
+            peak = np.unravel_index(np.argmax(correlation), correlation.shape)
+            distance = np.hypot(*(np.array(peak) - search))
+            found.append((correlation[peak], distance, strength[row, column]))
+    columns_of = np.array(found, dtype=np.float64).reshape(-1, 3).T
+    return columns_of[0], columns_of[1], columns_of[2]
 
 
 def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
@@ -188,21 +263,60 @@ def _equalise(image: Float[np.ndarray, "side side"]) -> UInt8[np.ndarray, "side 
 
 
 def _template_strength(image: Float[np.ndarray, "side side"]) -> Float[np.ndarray, "rows columns"]:
-    """Compute the Harris value of templates on a grid of 8 pixels: the smaller RMS gradient divided by the mean."""
+    """Compute the Harris value of the template around each pixel: the smaller RMS gradient divided by the mean."""
     along_x, along_y = np.gradient(image, axis=1), np.gradient(image, axis=0)
     size = (TEMPLATE, TEMPLATE)
     xx, yy, xy = (cv2.blur(product, size) for product in (along_x**2, along_y**2, along_x * along_y))
     smaller = 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy)
-    strength = np.sqrt(np.maximum(smaller, 0.0)) / cv2.blur(image, size)
-    return np.asarray(strength[40:-40:8, 40:-40:8])
+    return np.asarray(np.sqrt(np.maximum(smaller, 0.0)) / cv2.blur(image, size))
 
 
 def _warp(points: Float[np.ndarray, "n 2"], homography: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 2"]:
     return np.asarray(cv2.perspectiveTransform(points[None], homography)[0])
 
 
-def _is_inside(points: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-    return np.asarray(np.all((points > _MARGIN_PX) & (points < FEATURE_SIDE - _MARGIN_PX), axis=1))
+def _is_inside(points: Float[np.ndarray, "n 2"], image: UInt8[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "n"]:
+    limits = np.array(image.shape[::-1]) - _MARGIN_PX
+    return np.asarray(np.all((points > _MARGIN_PX) & (points < limits), axis=1))
+
+
+class _Matches(NamedTuple):
+    """All features of an image, and its matches in another one: pixels (column, row)."""
+
+    features: Float32[np.ndarray, "features 2"]
+    points: Float32[np.ndarray, "matches 2"]
+    other_points: Float32[np.ndarray, "matches 2"]
+
+
+def _match(
+    detector: cv2.Feature2D, norm: int, image: UInt8[np.ndarray, "_ _"], other: UInt8[np.ndarray, "_ _"]
+) -> _Matches:
+    """Match the features of two images, with a ratio test of 0.8."""
+    (keys, descriptors), (other_keys, other_descriptors) = (
+        detector.detectAndCompute(item, None) for item in (image, other)
+    )
+    matches = []
+    if descriptors is not None and other_descriptors is not None:
+        neighbours = cv2.BFMatcher(norm).knnMatch(descriptors, other_descriptors, k=2)
+        matches = [best[0] for best in neighbours if len(best) == 2 and best[0].distance < 0.8 * best[1].distance]
+    points = (
+        [key.pt for key in keys],
+        [keys[match.queryIdx].pt for match in matches],
+        [other_keys[match.trainIdx].pt for match in matches],
+    )
+    return _Matches(*(np.array(items, dtype=np.float32).reshape(-1, 2) for items in points))
+
+
+def _fit_homography(
+    matched: _Matches, tolerance_px: float
+) -> tuple[Float64[np.ndarray, "3 3"], UInt8[np.ndarray, "matches 1"]] | tuple[None, None]:
+    """Fit the homography from an image to the other by RANSAC; None where too few matches agree."""
+    if len(matched.points) < _MIN_MATCHES:
+        return None, None
+    homography, inliers = cv2.findHomography(
+        matched.points, matched.other_points, cv2.RANSAC, tolerance_px, maxIters=20000, confidence=0.9999
+    )
+    return (None, None) if homography is None or inliers.sum() < _MIN_INLIERS else (homography, inliers)
 
 
 def _decorrelation(

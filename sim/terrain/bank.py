@@ -13,9 +13,9 @@ import numpy as np
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
-from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround, refine, substream
-from marsyard.sim.terrain.landforms.kernels import interleave_samples, stamp_craters
-from marsyard.sim.terrain.landforms.relief import EJECTA_EXTENT_RADII, draw_craters
+from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream
+from marsyard.sim.terrain.landforms.kernels import interleave_samples
+from marsyard.sim.terrain.landforms.relief import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
@@ -47,10 +47,10 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     single-threaded, so that the samples do not depend on the number of threads.
     """
     p = parameters
-    relief = Spectrum.power_law(p.samples, p.spacing_m, p.hurst, p.outer_scale_m)
+    relief = FractalField.power_law(p.samples, p.spacing_m, p.hurst, p.outer_scale_m)
     rms_slope = np.tan(np.radians(p.rms_slope_deg))
     relief_m = rms_slope / relief.line_slope_rms(p.slope_baseline_m)
-    albedo = Spectrum.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
+    albedo = FractalField.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
     contrast = p.albedo_contrast * float(np.exp(p.contrast_spread * substream(rng, "contrast").standard_normal()))
     craters = draw_craters(p, substream(rng, "craters"))
     factors = UNIFORM
@@ -75,7 +75,9 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         if landform is not None:
             landform.apply(ground, substream(rng, name))
     if len(craters):
-        stamp_craters(ground.height, ground.log_albedo, ground.spacing_m, craters, EJECTA_EXTENT_RADII)
+        add_craters(ground, craters)
+    if p.drifts is not None:
+        p.drifts.apply(ground, substream(rng, "drifts"))
     if dtm is not None:
         blend_into_ground(ground, dtm, detail)
     relative_albedo = np.exp(ground.log_albedo, out=ground.log_albedo)

@@ -1,10 +1,17 @@
 """Tests of image statistics on synthetic images with known spectrum, contrast and fall-off."""
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from marsyard.sim.image_statistics import SIDE, compute_image_statistics, compute_pair_statistics, spectral_slope
+from marsyard.sim.image_statistics import (
+    SIDE,
+    compute_image_statistics,
+    compute_map_statistics,
+    compute_pair_statistics,
+    spectral_slope,
+)
 
 
 @pytest.mark.parametrize("exponent", [-1.5, -2.5])
@@ -77,3 +84,37 @@ def test_pair_of_shifted_images_agrees_except_for_its_noise() -> None:
     assert noisy.tracking_error_px > 2.0 * exact.tracking_error_px
     assert noisy.repeatability < exact.repeatability
     assert compute_pair_statistics(first, 1000.0 + rng.standard_normal((512, 512))) is None
+
+
+def test_image_on_its_map_is_found_and_correlates() -> None:
+    """A part of the map, rotated by 10 deg, is found; noise of the same spectrum lowers the correlation."""
+    mapped = _draw_texture(9)[:500, :500]
+    rotation = cv2.getRotationMatrix2D((250.0, 250.0), 10.0, 1.0)
+    image = cv2.warpAffine(mapped, rotation, (500, 500), flags=cv2.INTER_CUBIC)[100:400, 100:400]
+    exact = compute_map_statistics(image, mapped)
+    assert exact is not None
+    assert exact.sift > 0.5
+    assert exact.orb > 0.1
+    assert exact.correlation > 0.97
+    assert exact.valid == pytest.approx(1.0)
+    noisy = compute_map_statistics(image + 0.5 * (_draw_texture(8)[:300, :300] - 1000.0), mapped)
+    assert noisy is not None
+    # noise of half the contrast of the signal: correlation 1 / sqrt(1 + 1 / 4)
+    assert noisy.correlation == pytest.approx(1.0 / np.sqrt(1.25), abs=0.05)
+    assert noisy.sift < exact.sift
+    assert compute_map_statistics(_draw_texture(7)[:300, :300], mapped) is None
+
+
+def test_landmarks_that_the_sun_moves_correlate_less_than_others() -> None:
+    """Strong blobs on the map that are missing in the image lower the correlation of the strongest templates."""
+    mapped = _draw_texture(9)[:500, :500]
+    y, x = np.mgrid[:500, :500]
+    changed = mapped.copy()
+    for row, column in np.random.default_rng(1).uniform(80.0, 420.0, (12, 2)):
+        changed += 400.0 * np.exp(-0.5 * ((y - row) ** 2 + (x - column) ** 2) / 4.0**2)
+    statistics = compute_map_statistics(mapped[50:450, 50:450], changed)
+    assert statistics is not None
+    assert statistics.strongest < statistics.correlation - 0.1
+    equal = compute_map_statistics(changed[50:450, 50:450], changed)
+    assert equal is not None
+    assert equal.strongest > 0.98

@@ -229,6 +229,74 @@ class Spectrum:
         return float(np.sqrt(square) / baseline_m)
 
 
+@dataclass(frozen=True)
+class FractalField:
+    """Isotropic power-law field whose finest octave, wavelengths of two to four samples, is white noise.
+
+    The other octaves are drawn on every second sample, and refined, which is faster than a Fourier transform at all
+    samples.
+
+    - octaves: spectrum of the field without its finest octave, on every second sample
+    - finest_fraction: fraction of the variance in the finest octave
+    """
+
+    octaves: Spectrum
+    finest_fraction: float
+
+    @classmethod
+    def power_law(cls, samples: int, spacing_m: float, hurst: float, outer_scale_m: float) -> FractalField:
+        """Create a field with the power spectral density of `Spectrum.power_law`."""
+        octaves = Spectrum.power_law(samples // 2, 2.0 * spacing_m, hurst, outer_scale_m)
+        # power beyond the wavenumbers of `octaves`, from a grid of 64 x 64 cells of wavenumbers
+        k = np.pi / spacing_m * (np.arange(-32, 32) + 0.5) / 32.0
+        density = (k[:, None] ** 2 + k**2 + (2.0 * np.pi / outer_scale_m) ** 2) ** -(hurst + 1.0)
+        is_finest = np.maximum(np.abs(k[:, None]), np.abs(k)) > 0.5 * np.pi / spacing_m
+        finest = density[is_finest].sum() * (samples / 64.0) ** 2
+        # A B-spline attenuates each wave by sinc(frequency * spacing)**4, on every second sample more than on all.
+        gain_y, gain_x = (
+            ((np.sinc(f * spacing_m) / np.sinc(2.0 * f * spacing_m)) ** 4).astype(np.float32)
+            for f in (
+                scipy.fft.fftfreq(samples // 2, 2.0 * spacing_m),
+                scipy.fft.rfftfreq(samples // 2, 2.0 * spacing_m),
+            )
+        )
+        sharpened = octaves.amplitude * gain_x * gain_y[:, None]
+        fraction = finest / (finest + octaves.column_power.sum())
+        return cls(Spectrum(sharpened, octaves.spacing_m, octaves.column_power), float(fraction))
+
+    def draw_field(self, rng: Generator, scale: float) -> Grid:
+        """Draw a random field with the expected variance ``scale**2``."""
+        field = self._draw_finest(rng, scale)
+        add_refined(field, self.octaves.draw_field(rng, self._octave_scale(scale)))
+        return field
+
+    def draw_split_field(self, rng: Generator, scale: float, wavelength_m: float) -> tuple[Grid, Grid]:
+        """Draw the field of `draw_field` as the sum of a coarse and a fine field, separated at a wavelength."""
+        fine = self._draw_finest(rng, scale)
+        coarse, rest = self.octaves.draw_split_field(rng, self._octave_scale(scale), wavelength_m)
+        add_refined(fine, rest)
+        return refine(coarse, len(fine)), fine
+
+    def line_slope_rms(self, baseline_m: float) -> float:
+        """Compute the expected RMS slope of a field with unit variance along a line, over a baseline."""
+        # values of the finest octave at the two ends are independent
+        octaves = (1.0 - self.finest_fraction) * self.octaves.line_slope_rms(baseline_m) ** 2
+        return float(np.sqrt(octaves + 2.0 * self.finest_fraction / baseline_m**2))
+
+    def _octave_scale(self, scale: float) -> float:
+        return scale * float(np.sqrt(1.0 - self.finest_fraction))
+
+    def _draw_finest(self, rng: Generator, scale: float) -> Grid:
+        """Draw the finest octave: white noise, uniformly distributed."""
+        side = 2 * len(self.octaves.amplitude)
+        noise = np.frombuffer(rng.bytes(side * side), dtype=np.int8).reshape(side, side)
+        # 256 equally probable integers have the variance (256**2 - 1) / 12 and the mean -1 / 2
+        deviation = scale * np.sqrt(self.finest_fraction * 12.0 / (256.0**2 - 1.0))
+        field = np.multiply(noise, np.float32(deviation), dtype=np.float32)
+        field += np.float32(0.5 * deviation)
+        return field
+
+
 def _compute_column_power(amplitude: Float32[np.ndarray, "samples half"]) -> Float64[np.ndarray, "half"]:
     power = np.einsum("ij,ij->j", amplitude, amplitude, dtype=np.float64)
     # each mode of the half spectrum represents two conjugate modes, except in the first and last column

@@ -408,6 +408,50 @@ def raise_cones(
 
 
 @njit(cache=True)
+def expose_strata(height: Grid, log_albedo: Grid, lowest: float, step: float, strata: Array) -> None:
+    """Replace heights, and add to the logarithm of albedo, by linear interpolation in a table.
+
+    Row k of `strata` contains the new height and the change of the logarithm of albedo of ground at the height
+    ``lowest + k step``; the table covers all heights.
+    """
+    last = strata.shape[0] - 2
+    for i in range(height.shape[0]):
+        for j in range(height.shape[1]):
+            position = (height[i, j] - lowest) / step
+            k = min(int(position), last)
+            fraction = position - k
+            height[i, j] = strata[k, 0] + fraction * (strata[k + 1, 0] - strata[k, 0])
+            log_albedo[i, j] += strata[k, 1] + fraction * (strata[k + 1, 1] - strata[k, 1])
+
+
+@njit(cache=True)
+def cast_lee(height: Grid, shift: float, drop: float) -> Grid:
+    """Compute the surface below which the wind leaves sand, for a wind towards larger rows: the ground or its lee.
+
+    The lee of the row before continues `shift` columns to the right, at most one, and `drop` lower. It spreads to its
+    sides with the weights of a quadratic B-spline. A second pass makes it periodic.
+    """
+    side = height.shape[0]
+    mask = side - 1
+    lee = height.copy()
+    whole = round(shift)
+    part = np.float32(shift - whole)
+    half, fall = np.float32(0.5), np.float32(drop)
+    left = half * (half + part) * (half + part)
+    right = half * (half - part) * (half - part)
+    middle = np.float32(1.0) - left - right
+    padded = np.empty(side + 4, dtype=np.float32)
+    for i in range(1, 2 * side):
+        row = lee[i & mask]
+        padded[2:-2] = lee[(i - 1) & mask]
+        padded[:2], padded[-2:] = padded[-4:-2], padded[2:4]
+        first = padded[1 - whole :]
+        for j in range(side):
+            row[j] = max(row[j], left * first[j] + middle * first[j + 1] + right * first[j + 2] - fall)
+    return lee
+
+
+@njit(cache=True)
 def interleave_samples(height: Grid, albedo: Grid, scale: float, samples: Level) -> None:
     """Interleave height and albedo; the albedo is scaled and limited to 1."""
     for i in range(height.shape[0]):

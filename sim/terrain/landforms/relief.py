@@ -19,6 +19,7 @@ from marsyard.sim.terrain.landforms.kernels import (
     add_dunes,
     cut_channels,
     raise_cones,
+    stamp_craters,
     stamp_lobes,
 )
 
@@ -30,13 +31,13 @@ CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a two-dimensional cubic B-spline divided by that of its control values, if these are independent. The mean
 #: square has the factor 151/315 along each axis: the integral of the squared basis function.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
+RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
 EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
 #: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
 #: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
 FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
-#: Height of the rim crest above the surroundings, divided by the diameter: 0.04 if fresh (Pike 1977). Diffusion lowers
-#: the rim faster than it fills the bowl.
-FRESH_RIM, DEGRADED_RIM = 0.04, 0.004
+#: Height of the rim crest above the surroundings of a fresh crater, divided by the diameter (Pike 1977).
+FRESH_RIM = 0.04
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
 DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
@@ -69,7 +70,11 @@ class Dunes(Parameters):
     albedo_contrast: Annotated[float, bounded_field(-1.0, 1.0, "ln(albedo of crests / of troughs)")] = 0.05
 
     def apply(self, ground: TerrainGround, rng: Generator) -> None:
-        """Add the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
+        """Add the dunes."""
+        ground.add(self.create_layer(ground, rng))
+
+    def create_layer(self, ground: TerrainGround, rng: Generator) -> TerrainGround:
+        """Create the dunes, with the wave vector that is periodic on the terrain and nearest to the parameters."""
         # the wave vector points downwind; azimuth is clockwise from north, x is east
         downwind = np.radians(90.0 - (self.wind_from_deg + 180.0))
         waves_per_side = ground.period_m / self.wavelength_m * np.array([np.cos(downwind), np.sin(downwind)])
@@ -91,7 +96,7 @@ class Dunes(Parameters):
         kx, ky = (float(wavenumber) for wavenumber in wave_vector)
         bedforms = Bedforms(kx, ky, self.height_m, max_slope, self.albedo_contrast)
         add_dunes(layer.height, layer.log_albedo, layer.spacing_m, modulation, bedforms)
-        ground.add(layer)
+        return layer
 
 
 class Lava(Parameters):
@@ -214,9 +219,13 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
 
     Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
     `crater_knee_m` (saturation, Hartmann 1984: -1.83) and ``D**-crater_steep_exponent`` above it (production function,
-    Hartmann 2005). Freshness is ``u**2`` with a uniform u: most craters are degraded. Outlines deviate from circles by
-    `OUTLINE_RMS`. Sand, dark on Mars, fills the inner part of some craters, and dust that the impact has brought up or
-    that the rim retains brightens the ejecta of most.
+    Hartmann 2005). Outlines deviate from circles by `OUTLINE_RMS`. Sand, dark on Mars, fills the inner part of some
+    craters, and dust that the impact has brought up or that the rim retains brightens the ejecta of most.
+
+    Diffusion wears craters: the depth of a Gaussian bowl is ``1 / (1 + t)`` of the initial one after the time t, in
+    units that are proportional to the square of the diameter. A crater vanishes at `DEGRADED_DEPTH`. Saturation is the
+    balance of new and vanished craters: below the knee the ages are uniform up to that of the vanishing crater, above
+    it up to that of the ground, so that large craters are fresher.
     """
     p = parameters
     min_m, max_m = p.crater_diameter_min_m, p.crater_diameter_max_m
@@ -231,10 +240,12 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     below_knee = min_m * fraction ** (-1.0 / p.crater_exponent)
     above_knee = knee * (fraction / knee_fraction) ** (-1.0 / p.crater_steep_exponent)
     diameter = np.sort(np.where(fraction > knee_fraction, below_knee, above_knee))[::-1]
-    freshness = rng.uniform(0.0, 1.0, count) ** 2
+    age = (FRESH_DEPTH / DEGRADED_DEPTH - 1.0) * rng.uniform(0.0, 1.0, count) * np.minimum(knee / diameter, 1.0) ** 2
+    freshness = 1.0 / (1.0 + age)
     position = rng.uniform(0.0, period, (count, 2))
-    rim = diameter * (DEGRADED_RIM + (FRESH_RIM - DEGRADED_RIM) * freshness)
-    depth = diameter * (DEGRADED_DEPTH + (FRESH_DEPTH - DEGRADED_DEPTH) * freshness) - rim
+    # the sharper rim wears faster than the bowl: as the square (assumed)
+    rim = diameter * FRESH_RIM * freshness**2
+    depth = diameter * FRESH_DEPTH * freshness - rim
     rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * freshness)
     fill = DEEPEST_FILL * (1.0 - freshness)
     # small craters shelter less sand, and throw out less material of other brightness
@@ -254,6 +265,18 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
     albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
     return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, phase])
+
+
+def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 21"]) -> None:
+    """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
+    octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
+    layer = None
+    for step in range(int(octave.max(initial=0.0)), -1, -1):
+        grid = ground.coarser(ground.spacing_m * 2.0**step) if step else ground
+        if layer is not None:
+            grid.add(layer)
+        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, craters[octave == step], EJECTA_EXTENT_RADII)
+        layer = grid
 
 
 def draw_channels(

@@ -37,11 +37,16 @@ class SurfaceUnit(Parameters):
     roughness: Annotated[NonNegative, Field(description="factor of fine relief")] = 1.0
     texture: Annotated[NonNegative, Field(description="factor of fine albedo contrast")] = 1.0
     rocks: Annotated[NonNegative, Field(description="factor of rock density")] = 1.0
+    elevation: Annotated[
+        float, bounded_field(-5.0, 5.0, "preference for high ground, if positive, or low ground; 0: none")
+    ] = 0.0
 
 
 class SurfaceUnits(Parameters):
     """A map of surface units. The ground belongs to the unit with the largest random field.
 
+    The field of a unit increases with the height of the coarse relief times the unit's `elevation`, so that its borders
+    follow this relief: both have the standard deviation 1.
     The areas vary from terrain to terrain by a Dirichlet distribution around the expected fractions.
     """
 
@@ -85,6 +90,10 @@ class SurfaceUnits(Parameters):
         spectrum = Spectrum.power_law(side, spacing, OUTLINE_HURST, self.largest_m, self.elongation, downwind)
         spectrum = spectrum.apply_low_pass(self.smallest_m)
         fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in units], axis=-1)
+        elevation = np.array([unit.elevation for unit in units], dtype=np.float32)
+        if elevation.any():
+            height = ground.height[::FACTOR_STEP, ::FACTOR_STEP]
+            fields += ((height - height.mean()) / max(float(height.std()), 1e-6))[..., None] * elevation
         membership = self._compute_membership(fields, areas)
         unit_factors = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
         factors = np.exp(membership @ np.log(np.maximum(unit_factors, 1e-3)).astype(np.float32))
