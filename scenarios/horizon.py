@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from marsyard.scenarios.meshes import FIRST_MESH_NUMBER
 from marsyard.sim.render import Frame, Objects, Scene
+from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.terrain import RockField
 from marsyard.sim.terrain.sites import Hill
 

@@ -24,6 +24,7 @@ from marsyard.scenarios.mesh_orientation import orient_triangles
 from marsyard.scenarios.user_files import UserFile
 from marsyard.sim.files import check_regular, expanded_bytes, report_damage
 from marsyard.sim.render import Objects, Scene
+from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.terrain import Surface
 
 #: Maximum size of a file, and maximum number of triangles.
@@ -34,8 +35,6 @@ _ZIPPED = frozenset({"3mf", "3dxml", "zae"})
 _NO_MESH = "cannot be read as a mesh"
 #: Numbers in an element of a glTF accessor.
 _COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-#: First body number of meshes; the body numbers of rocks start at 0.
-FIRST_MESH_NUMBER = 1 << 30
 #: Default albedo by kind: rock, painted structure, bright target.
 _ALBEDO = {"rock": 0.15, "lander": 0.5, "landmark": 0.6}
 #: Rotations from the file's axes, by the axis that points up, to axes whose z axis points up.

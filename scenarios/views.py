@@ -158,7 +158,8 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
     """Build the scene for a viewpoint: ground, resolved rocks, texture and light."""
     finest_m, half_width_m, lines = mesh_size(ground.surface.spacing_m, viewpoint.height_m, viewpoint.max_distance_m)
     objects = select_rocks(ground, viewpoint, half_width_m)
-    if ground.site.hills and np.isinf(viewpoint.max_distance_m) and viewpoint.height_m < _MAX_AMONG_ROCKS_M:
+    is_near = viewpoint.height_m < _MAX_AMONG_ROCKS_M
+    if ground.site.hills and np.isinf(viewpoint.max_distance_m) and is_near:
         mean_m = float(ground.surface.levels[-1][..., 0].mean())
         objects = Objects.join([objects, hill_objects(ground.site.hills, mean_m, ground.terrain.albedo)])
     return Scene(
@@ -170,10 +171,13 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
         relief=micro_relief(ground),
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
+        pebbles=ground.site.pebbles if is_near else None,
+        dust_albedo=ground.site.photometry.dust_albedo,
+        dust_cover=ground.site.photometry.dust_cover,
         mesh_finest_m=finest_m,
         mesh_half_width_m=half_width_m,
         mesh_lines=lines,
-        among_objects=viewpoint.height_m < _MAX_AMONG_ROCKS_M,
+        among_objects=is_near,
     )
 
 

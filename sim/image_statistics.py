@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, median_filter
 
 #: Side of the resized images, pixels, as in DIMES; and side of the blocks for the local contrast.
 SIDE, BLOCK = 256, 16
@@ -24,6 +24,8 @@ _ORB_FEATURES = 1000
 _STRONGEST, _MIN_TEMPLATES = 0.1, 20
 #: Grey level of the mean, and distance of the overlap's border from the image's, pixels.
 _GREY, _MARGIN_PX = 110.0, 8
+#: Minimum distance between corners, pixels, and their minimum quality relative to the best corner, in crops of ground.
+_CORNER_DISTANCE_PX, _CORNER_QUALITY = 5.0, 0.01
 #: Frequency range of the fit to the power spectrum, cycles per image.
 MIN_FREQUENCY, MAX_FREQUENCY = 4, 63
 
@@ -91,6 +93,45 @@ class MapStatistics(NamedTuple):
     correlation: float
     strongest: float
     valid: float
+
+
+class GroundStatistics(NamedTuple):
+    """Statistics of a crop of ground in an image from a mast or a low-flying helicopter, at full resolution.
+
+    - local_p10, local_p50, local_p90: percentiles over blocks of `BLOCK` pixels of (standard deviation / mean)
+    - kurtosis: excess kurtosis of the finest band, the image minus its blur by 1 pixel, divided by the image's blur by
+      32 pixels: large where a few strong features stand out of quiet ground
+    - corners: thousands of corners (Shi and Tomasi) per megapixel
+    - darkest: first percentile of the image divided by its median over 64 pixels
+    """
+
+    local_p10: float
+    local_p50: float
+    local_p90: float
+    kurtosis: float
+    corners: float
+    darkest: float
+
+
+def compute_ground_statistics(crop: Float[np.ndarray, "rows columns"]) -> GroundStatistics:
+    """Compute the statistics of a crop of ground; its sides are multiples of `BLOCK`."""
+    rows, columns = crop.shape
+    blocks = np.asarray(crop, dtype=np.float64).reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK)
+    contrast = np.percentile(blocks.std(axis=(1, 3)) / blocks.mean(axis=(1, 3)), [10.0, 50.0, 90.0])
+    flat = _flatten(np.asarray(crop, dtype=np.float64), 32.0)
+    finest = _standardise((flat - gaussian_filter(flat, 1.0, mode="reflect"))[16:-16, 16:-16])
+    corners = cv2.goodFeaturesToTrack(_to_bytes(flat), 0, _CORNER_QUALITY, _CORNER_DISTANCE_PX)
+    small = cv2.resize(np.asarray(crop, dtype=np.float32), (columns // 4, rows // 4), interpolation=cv2.INTER_AREA)
+    median = cv2.resize(median_filter(small, 17, mode="reflect"), (columns, rows), interpolation=cv2.INTER_LINEAR)
+    p10, p50, p90 = (float(value) for value in contrast)
+    return GroundStatistics(
+        p10,
+        p50,
+        p90,
+        float((finest**4).mean()) - 3.0,
+        1e3 * len(corners) / crop.size,
+        float(np.percentile(crop / median, 1.0)),
+    )
 
 
 def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageStatistics:
@@ -242,7 +283,7 @@ def _reduce(image: Float[np.ndarray, "rows columns"], side: int) -> Float[np.nda
     return np.asarray(cv2.resize(square, (side, side), interpolation=cv2.INTER_AREA))
 
 
-def _flatten(image: Float[np.ndarray, "side side"], sigma_px: float) -> Float[np.ndarray, "side side"]:
+def _flatten(image: Float[np.ndarray, "rows columns"], sigma_px: float) -> Float[np.ndarray, "rows columns"]:
     """Compute the relative deviation from the blurred image."""
     return np.asarray(image / cv2.GaussianBlur(image, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT) - 1.0)
 
@@ -251,7 +292,7 @@ def _standardise(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray,
     return np.asarray((values - values.mean()) / values.std())
 
 
-def _to_bytes(relative: Float[np.ndarray, "side side"]) -> UInt8[np.ndarray, "side side"]:
+def _to_bytes(relative: Float[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
     return np.clip(_GREY * (1.0 + relative), 0.0, 255.0).astype(np.uint8)
 
 

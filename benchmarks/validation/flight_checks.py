@@ -89,7 +89,7 @@ def _render_descent(site: str, **values: float | int) -> Float64[np.ndarray, "ro
     return np.asarray(cv2.resize(summed, (columns, rows), interpolation=cv2.INTER_LINEAR))
 
 
-def _within(claim: str, value: float, limits: tuple[float, float], how: str) -> Iterator[Measure]:
+def measure_within(claim: str, value: float, limits: tuple[float, float], how: str) -> Iterator[Measure]:
     """Compare a value with a lower and an upper limit."""
     low, high = limits
     yield Measure(claim, value, "1", low, how, "at least")
@@ -110,10 +110,10 @@ def compare_descent_images(quick: bool) -> Iterator[Measure]:
     how = f"median of {len(rows)} images of {len(seeds)} terrains"
     for name, limits in LIMITS.items():
         value = getattr(medians["gusev"], name)
-        yield from _within(f"{name}, descent over gusev", value, limits, f"{how}; Spirit: {FLOWN[name]}")
+        yield from measure_within(f"{name}, descent over gusev", value, limits, f"{how}; Spirit: {FLOWN[name]}")
     for name in TAILS:
         ratio = getattr(medians["meridiani"], name) / getattr(medians["gusev"], name)
-        yield from _within(f"{name}, descent over meridiani divided by gusev", ratio, (0.5, 2.0), how)
+        yield from measure_within(f"{name}, descent over meridiani divided by gusev", ratio, (0.5, 2.0), how)
     for site, median in medians.items():
         claim = f"brightness of corners divided by centre, descent over {site}"
         yield Measure(claim, median.corner, "1", None, f"{how}; cos^4 of the lens")
@@ -147,7 +147,7 @@ def compare_descent_pairs(quick: bool) -> Iterator[Measure]:
     how = f"means of three pairs, median of {len(rows)} terrains; {PAIR_EAST_M:g} m and {PAIR_AZIMUTH_DEG:g} deg apart"
     for name, limits in PAIR_LIMITS.items():
         claim = f"{name}, pairs of descent images over gusev"
-        yield from _within(claim, getattr(median, name), limits, f"{how}; Spirit: {FLOWN_PAIRS[name]}")
+        yield from measure_within(claim, getattr(median, name), limits, f"{how}; Spirit: {FLOWN_PAIRS[name]}")
 
 
 def compare_mast_images(quick: bool) -> Iterator[Measure]:

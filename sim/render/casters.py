@@ -142,7 +142,7 @@ def _choose_sides(items: np.ndarray) -> Int64[np.ndarray, "grids"]:
     return np.asarray(np.clip(np.ceil(np.sqrt(items)), 1, MAX_CELLS).astype(np.int64))
 
 
-def _list_in_grids(
+def list_in_grids(
     low: Values,
     high: Values,
     grid: Values,
@@ -215,12 +215,12 @@ def list_casters(
     body_bounds = _enclose(np.concatenate([to_host(low), to_host(high)], axis=1), first_triangle[:-1])
     body = to_device(UInt32, np.repeat(np.arange(len(counts)), counts))
     triangle_sides = _choose_sides(counts / TRIANGLES_PER_CELL)
-    bodies = _list_in_grids(low.xy, high.xy, body, body_bounds, triangle_sides, dr.arange(UInt32, len(body)))
+    bodies = list_in_grids(low.xy, high.xy, body, body_bounds, triangle_sides, dr.arange(UInt32, len(body)))
     origins = vectors_to_device(Array3f64, body_bounds[:, [0, 1, 5]])
     functions = _linear_functions(projected, dr.gather(Array3f64, origins, body))
     all_bodies, coarse_side = _enclose(body_bounds, np.zeros(1, dtype=np.int64)), _choose_sides(np.array([len(counts)]))
     body_low, body_high = (vectors_to_device(Array2f64, body_bounds[:, k : k + 2]) for k in (0, 3))
-    coarse = _list_in_grids(body_low, body_high, UInt32(0), all_bodies, coarse_side, dr.arange(UInt32, len(counts)))
+    coarse = list_in_grids(body_low, body_high, UInt32(0), all_bodies, coarse_side, dr.arange(UInt32, len(counts)))
     fine = _list_in_fine_grids(body_bounds, all_bodies[0], int(coarse_side[0]), coarse)
     return Casters(matrix, functions, coarse, fine, bodies, to_device(Float64, body_bounds[:, 5]))
 
@@ -243,7 +243,7 @@ def _list_in_fine_grids(body_bounds: Bounds, all_bodies: np.ndarray, coarse_side
     area = np.prod(enclosing[:, 3:5] - enclosing[:, :2], axis=1)
     sides = _choose_sides(np.minimum(counts / BODIES_PER_CELL, area * counts / np.maximum(areas, 1e-300)))
     item_low, item_high = (vectors_to_device(Array2f64, clipped[:, k : k + 2]) for k in (0, 3))
-    return _list_in_grids(item_low, item_high, to_device(UInt32, cell), enclosing, sides, to_device(UInt32, bodies))
+    return list_in_grids(item_low, item_high, to_device(UInt32, cell), enclosing, sides, to_device(UInt32, bodies))
 
 
 def are_occluded(casters: Casters, position: Values, active: Values) -> Values:

@@ -30,7 +30,15 @@ def _locate(position: list[Values], cell: Values, seed: Values) -> tuple[Values,
     return lattice, offsets
 
 
-def _mix(h: Values) -> Values:
+def hash_cell(cell: list[Values], seed: Values) -> Values:
+    """Hash the integer coordinates of a lattice cell."""
+    lattice = seed * UInt32(_HASH_SEED)
+    for coordinate, factor in zip(cell, _HASH_FACTORS, strict=False):
+        lattice = lattice + UInt32(coordinate) * UInt32(factor)
+    return mix_bits(lattice)
+
+
+def mix_bits(h: Values) -> Values:
     """Mix the bits of a hash (the finaliser of MurmurHash3)."""
     h = (h ^ (h >> 16)) * UInt32(0x85EBCA6B)
     h = (h ^ (h >> 13)) * UInt32(0xC2B2AE35)
@@ -57,7 +65,7 @@ def noise_in_space(position: list[Values], cell: Values, seed: Values) -> Values
     corners = []
     for k, j, i in product((0, 1), repeat=3):
         h = lattice + UInt32((i * _HASH_FACTORS[0] + j * _HASH_FACTORS[1] + k * _HASH_FACTORS[2]) & 0xFFFFFFFF)
-        corners.append(_product_with_gradient(_mix(h), offsets[0] - i, offsets[1] - j, offsets[2] - k))
+        corners.append(_product_with_gradient(mix_bits(h), offsets[0] - i, offsets[1] - j, offsets[2] - k))
     for weight in (u, v, w):
         corners = [dr.fma(weight, b - a, a) for a, b in zip(corners[::2], corners[1::2], strict=True)]
     return corners[0]
@@ -76,10 +84,10 @@ def noise_in_plane(position: list[Values], cell: Values, seed: Values) -> tuple[
     x1, y1 = x - 1.0, y - 1.0
     u, v, du, dv = _fade(x), _fade(y), 30.0 * (x * x1) * (x * x1), 30.0 * (y * y1) * (y * y1)
     factor_x, factor_y = _HASH_FACTORS[:2]
-    ax, ay = _gradient(_mix(lattice))
-    bx, by = _gradient(_mix(lattice + UInt32(factor_x)))
-    cx, cy = _gradient(_mix(lattice + UInt32(factor_y)))
-    dx, dy = _gradient(_mix(lattice + UInt32((factor_x + factor_y) & 0xFFFFFFFF)))
+    ax, ay = _gradient(mix_bits(lattice))
+    bx, by = _gradient(mix_bits(lattice + UInt32(factor_x)))
+    cx, cy = _gradient(mix_bits(lattice + UInt32(factor_y)))
+    dx, dy = _gradient(mix_bits(lattice + UInt32((factor_x + factor_y) & 0xFFFFFFFF)))
     a = dr.fma(ax, x, ay * y)
     difference_x = dr.fma(bx, x1, by * y) - a
     difference_y = dr.fma(cx, x, cy * y1) - a

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,8 @@ from marsyard.sim.render.arrays import Values, vectors_to_device
 from marsyard.sim.render.device import Array3f64
 from marsyard.sim.render.triangles import Hierarchy, body_spheres, morton_codes
 
+#: Identifiers of users' meshes start here; identifiers of rocks are smaller.
+FIRST_MESH_NUMBER = 2**30
 #: Triangle numbers are rendered as 24-bit colours; 0 is the ground.
 MAX_TRIANGLES = 2**24 - 2
 
@@ -26,6 +28,7 @@ class Objects:
     - first_triangle: first triangle of each body, and the number of triangles at the end
     - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field; a
       user's mesh has a number from 2^30; rover and hills have negative numbers
+    - shelter: corners of a convex body that hides the sky from the ground below it (`skylight.Shelter`), or None
     """
 
     triangles: Float64[np.ndarray, "triangles 3 3"]
@@ -34,6 +37,7 @@ class Objects:
     first_triangle: Int64[np.ndarray, "bodies+1"]
     albedo: Float64[np.ndarray, "bodies"]
     names: Int64[np.ndarray, "bodies"]
+    shelter: Float64[np.ndarray, "8 3"] | None = None
 
     @classmethod
     def of_mesh(
@@ -64,10 +68,14 @@ class Objects:
 
     @classmethod
     def join(cls, parts: Sequence[Objects]) -> Objects:
-        """Join the bodies of several sets."""
+        """Join the bodies of several sets; at most one of them has a shelter."""
+        shelters = [part.shelter for part in parts if part.shelter is not None]
+        if len(shelters) > 1:
+            raise ValueError(f"{len(shelters)} sets of objects have a shelter; at most one is possible")
         names = ("triangles", "normals", "albedo", "names", "spheres")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        return cls._of_bodies(counts=np.concatenate([np.diff(part.first_triangle) for part in parts]), **arrays)
+        joined = cls._of_bodies(counts=np.concatenate([np.diff(part.first_triangle) for part in parts]), **arrays)
+        return joined.with_shelter(shelters[0]) if shelters else joined
 
     @classmethod
     def _of_bodies(
@@ -103,6 +111,26 @@ class Objects:
         """Bounding sphere of each body, centred at the centre of its bounding box: centre and radius."""
         return body_spheres(self.triangles, self.first_triangle)
 
+    def with_shelter(self, corners: Float64[np.ndarray, "8 3"]) -> Objects:
+        """Return the objects with a shelter; bounding spheres are kept."""
+        objects = replace(self, shelter=corners)
+        objects.__dict__["spheres"] = self.spheres
+        return objects
+
+    @property
+    def is_rock(self) -> Bool[np.ndarray, "bodies"]:
+        """Whether each body is a rock of a rock field."""
+        return np.asarray((self.names >= 0) & (self.names < FIRST_MESH_NUMBER))
+
+    def bounds_on_ground(self) -> tuple[Float64[np.ndarray, "selected 3"], Float64[np.ndarray, "selected 3"]]:
+        """Return the minimum and maximum x, y, z of the bodies that stand on the ground: rocks and meshes of users."""
+        if len(self) == 0:
+            return np.empty((0, 3)), np.empty((0, 3))
+        corners, first = self.triangles.reshape(-1, 3), 3 * self.first_triangle[:-1]
+        is_on_ground = self.names >= 0
+        low, high = (extreme.reduceat(corners, first)[is_on_ground] for extreme in (np.minimum, np.maximum))
+        return low, high
+
     def in_cone(
         self,
         apex: Float64[np.ndarray, "3"],
@@ -129,7 +157,7 @@ class Objects:
     def select(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
         """Return the selected bodies, renumbered."""
         triangles = self._triangles_of(is_selected)
-        return self._of_bodies(
+        selected = self._of_bodies(
             np.take(self.triangles, triangles, axis=0),
             np.take(self.normals, triangles, axis=0),
             np.diff(self.first_triangle)[is_selected],
@@ -137,6 +165,7 @@ class Objects:
             self.names[is_selected],
             self.spheres[is_selected],
         )
+        return selected if self.shelter is None else selected.with_shelter(self.shelter)
 
     def _triangles_of(self, is_selected: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "selected"]:
         return np.flatnonzero(np.repeat(is_selected, np.diff(self.first_triangle)))

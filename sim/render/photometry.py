@@ -11,11 +11,12 @@ from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
 from pydantic import Field
 from scipy.ndimage import map_coordinates
-from scipy.special import ndtri
+from scipy.special import expn, ndtri
 
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.render.device import Float, Float64
-from marsyard.sim.render.reflectance import Law, Sky, scattered_irradiance
+from marsyard.sim.render.reflectance import Law, Sky, scattered_moments
+from marsyard.sim.render.skylight import SkyLight
 from marsyard.sim.render.sunlight import Clouds, Grid
 from marsyard.sim.render.texture import Octaves
 
@@ -49,8 +50,9 @@ class DustySky:
     with the Henyey-Greenstein phase function P, optical depth tau, single-scattering albedo w, mean cosine g of the
     scattering angle, and the sines of elevation mu of the view and mu0 of the sun. The extinction depth is
     ``t = (1 - w g**2) tau``: the forward peak, a fraction g**2 of the scattered light, is part of the direct sunlight
-    (Joseph et al. 1976). Multiple scattering adds a uniform radiance, so that the irradiance of level ground without
-    the peak is `Photometry.sky_fraction`. If single scattering exceeds this irradiance, it is scaled down.
+    (Joseph et al. 1976). Light scattered several times is isotropic: it adds ``J (1 - exp(-t / mu))``, so that the
+    irradiance of level ground without the peak is `Photometry.sky_fraction`. If single scattering exceeds this
+    irradiance, it is scaled down.
     """
 
     optical_depth: float
@@ -67,19 +69,42 @@ class DustySky:
                 "allowed: above 0, above 0 and at most 1, at least 0 and below 1"
             )
 
+    @property
+    def depth(self) -> float:
+        """Extinction depth t."""
+        return (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
+
     def model(self, sun_z: float, sky_fraction: float) -> Sky:
         """Return the sky whose irradiance without the forward peak is `sky_fraction`."""
-        depth = (1.0 - self.single_scattering_albedo * self.asymmetry**2) * self.optical_depth
-        scale = self.single_scattering_albedo * self.optical_depth / (4.0 * depth)
-        without_peak = 1.0 - self.asymmetry**2
-        scattered = without_peak * scale * _scattered_irradiance(sun_z, depth, self.asymmetry)
-        uniform, scattering = max(sky_fraction - scattered, 0.0), scale * min(sky_fraction / scattered, 1.0)
-        return Sky(*map(Float64, (uniform, scattering, depth, self.asymmetry)))
+        scale = self.single_scattering_albedo * self.optical_depth / (4.0 * self.depth)
+        scattered = self._scattered_irradiance(sun_z)
+        multiple = max(sky_fraction - scattered, 0.0) / (1.0 - 2.0 * float(expn(3, self.depth)))
+        return Sky(*map(Float64, (multiple, scale * min(sky_fraction / scattered, 1.0), self.depth, self.asymmetry)))
+
+    def light(self, sun: Sun, sky_fraction: float) -> SkyLight:
+        """Return the light of the sky without the forward peak, which is part of the direct sunlight.
+
+        Without the peak, the phase function has the asymmetry ``g / (1 + g)``.
+        """
+        sun_z, t = float(sun.direction[2]), self.depth
+        if sky_fraction == 0.0:
+            return SkyLight.of(0.0, 1.0, 0.0, sun.direction)
+        irradiance, mean, towards_sun = _scattered_moments(sun_z, t, self.asymmetry / (1.0 + self.asymmetry))
+        single = min(self._scattered_irradiance(sun_z) / sky_fraction, 1.0)
+        # irradiance and mean radiance of the isotropic layer are J (1 - 2 E_3) and J (1 - E_2)
+        layer_mean = float((1.0 - expn(2, t)) / (1.0 - 2.0 * expn(3, t)))
+        mean_radiance = single * mean / irradiance + (1.0 - single) * layer_mean
+        return SkyLight.of(sky_fraction, mean_radiance, single * towards_sun / irradiance, sun.direction)
+
+    def _scattered_irradiance(self, sun_z: float) -> float:
+        """Irradiance of level ground by single scattering without the forward peak."""
+        scale = self.single_scattering_albedo * self.optical_depth / (4.0 * self.depth)
+        return (1.0 - self.asymmetry**2) * scale * _scattered_moments(sun_z, self.depth, self.asymmetry)[0]
 
 
 @dataclass(frozen=True)
 class Photometry:
-    """A Lunar-Lambert surface with an opposition surge, under direct sunlight, a uniform sky and light from the ground.
+    """A Lunar-Lambert surface with an opposition surge, under direct sunlight, light from the sky and from the ground.
 
     Radiance factor (I/F) of ground with albedo A, incidence angle i, emission angle e and phase angle g::
 
@@ -88,13 +113,13 @@ class Photometry:
 
     The Lunar-Lambert law is from McEwen (1991); the surge has the form of Hapke's shadow-hiding term (1986). K
     normalises the law so that A is its spherical albedo, the reflected fraction of isotropic light. The law is
-    reciprocal.
+    reciprocal. The term of D is that of a uniform sky without obstructions; see `skylight` for others.
 
     - lunar_fraction: L, between 0 (Lambert) and 1 (Lommel-Seeliger). About 0.55 for Mars at small phase (McEwen 1991)
     - surge_amplitude, surge_width: B0 and h
     - sky_fraction: D, diffuse irradiance from the sky divided by that of direct sunlight on a plane facing the sun
     - sky_radiance: radiance factor of a uniform sky in pixels without ground
-    - sky: model that replaces the uniform sky in these pixels
+    - sky: model that replaces the uniform sky in these pixels, and its light on surfaces
     - surrounding_albedo: albedo of the ground that scatters light onto slopes and into shadows; B is this albedo times
       the irradiance of level ground
     """
@@ -114,8 +139,13 @@ class Photometry:
     def law(self, sun: Sun) -> Law:
         """Return the reflectance law under a sun."""
         ground_light = self.surrounding_albedo * (max(float(sun.direction[2]), 0.0) + self.sky_fraction)
-        law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation())
-        return Law(*map(Float, (*law, self.sky_fraction, ground_light)))
+        if self.sky is None:
+            sky_light = SkyLight.of(self.sky_fraction, 1.0, 0.0, sun.direction)
+        else:
+            sky_light = self.sky.light(sun, self.sky_fraction)
+        law = (self.lunar_fraction, self.surge_amplitude, self.surge_width, self.normalisation(), ground_light)
+        lunar_fraction, amplitude, width, normalisation, from_ground = map(Float, law)
+        return Law(lunar_fraction, amplitude, width, normalisation, from_ground, sky_light)
 
     def sky_model(self, sun: Sun) -> Sky:
         """Return the sky in pixels without ground."""
@@ -141,7 +171,7 @@ class Texture:
         return Octaves.of(self.coarsest_m, self.amplitudes)
 
 
-_scattered_irradiance = cache(scattered_irradiance)
+_scattered_moments = cache(scattered_moments)
 
 
 @cache

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
 
-from marsyard.sim.render.arrays import Values, clip, compiled, larger, to_device, to_host
+from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, to_device, to_host
 from marsyard.sim.render.device import Array3f, Float, Float64
+from marsyard.sim.render.skylight import SkyLight
 
 #: Sine of the elevation below which the sky's brightness is constant.
 MIN_ELEVATION_SINE = 1e-3
@@ -37,22 +38,28 @@ class Angles:
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """Coefficients of the reflectance law of `Photometry`: L, B0, h and K; irradiance of the sky and of the ground."""
+    """Coefficients of the reflectance law of `Photometry`: L, B0, h and K; light of the ground and of the sky."""
 
     lunar_fraction: Values
     surge_amplitude: Values
     surge_width: Values
     normalisation: Values
-    sky_fraction: Values
     ground_light: Values
+    sky_light: SkyLight
 
-    def radiance(self, angles: Angles, normal_z: Values, sun_fraction: Values) -> Values:
-        """Compute the radiance factor of a surface with albedo 1, of which the sun illuminates a fraction."""
+    def radiance(self, angles: Angles, normal: Values, sun_fraction: Values, blocked: Values) -> Values:
+        """Compute the radiance factor of a surface with albedo 1, of which the sun illuminates a fraction.
+
+        `blocked` are the vectors of the hidden sky (`skylight`). Ground below a body that hides the sky is dark; it
+        reflects less light by the same fraction.
+        """
         cos_i, lunar = angles.cos_i, self.lunar_fraction
         surge = 1.0 + self.surge_amplitude / (1.0 + angles.tan_half_g / self.surge_width)
         disc = 2.0 * lunar * cos_i / (cos_i + angles.cos_e) + (1.0 - lunar) * cos_i
         direct = dr.select(cos_i > 0.0, sun_fraction * self.normalisation * surge * disc, 0.0)
-        return direct + 0.5 * self.sky_fraction * (1.0 + normal_z) + 0.5 * self.ground_light * (1.0 - normal_z)
+        diffuse = self.sky_light.irradiance(normal, blocked)
+        ground_light = 0.5 * self.ground_light * (1.0 - smaller(blocked.z, 1.0))
+        return direct + dr.fma(ground_light, 1.0 - normal.z, diffuse)
 
 
 def single_scattering(mu: Values, mu0: Values, cos_g: Values, depth: Values, asymmetry: Values) -> Values:
@@ -76,12 +83,13 @@ def henyey_greenstein(cos_g: Values, asymmetry: Values) -> Values:
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """Uniform radiance factor of the sky; of a dusty sky also factor of scattered light, optical depth and asymmetry.
+    """Radiance factor of a uniform sky (`scattering` is None), or a dusty layer.
 
-    `scattering` is None for a uniform sky.
+    - diffuse: radiance factor of a uniform sky, or of a layer of infinite depth by multiple scattering
+    - scattering, depth, asymmetry: factor of the singly scattered light, optical depth, and asymmetry of the layer
     """
 
-    uniform: Values
+    diffuse: Values
     scattering: Values | None
     depth: Values
     asymmetry: Values
@@ -94,26 +102,32 @@ class Sky:
         - pixel_rad: angle that the pixel subtends, radians: the width of the disc's edge
         """
         if self.scattering is None:
-            return self.uniform
+            return self.diffuse
+        layer = 1.0 - dr.exp(-self.depth / larger(mu, MIN_ELEVATION_SINE))
         scattered = self.scattering * single_scattering(mu, sun_z, cos_g, self.depth, self.asymmetry)
         angle = dr.acos(clip(cos_g, -1.0, 1.0))
         disc_fraction = clip((sun_radius - angle) / pixel_rad + 0.5, 0.0, 1.0)
         # the radiance factor of the disc is pi / solid angle, 1 / radius**2; the ramp across the edge adds
         # pixel**2 / 12 to the squared radius, on average
-        return self.uniform + scattered + disc_fraction / (sun_radius**2 + pixel_rad**2 / 12.0)
+        return self.diffuse * layer + scattered + disc_fraction / (sun_radius**2 + pixel_rad**2 / 12.0)
 
 
-def scattered_irradiance(sun_z: float, depth: float, asymmetry: float) -> float:
-    """Irradiance of level ground divided by pi, under the sky of `single_scattering`: ``1 / pi int L mu dOmega``.
+def scattered_moments(sun_z: float, depth: float, asymmetry: float) -> tuple[float, float, float]:
+    """Moments of the sky of `single_scattering`.
 
+    Returns the irradiance of level ground divided by pi, ``1 / pi int L mu dOmega``; the mean radiance over the
+    hemisphere, ``1 / (2 pi) int L dOmega``; and the horizontal component towards the sun of ``1 / pi int L w dOmega``.
     Midpoint rule with 256 steps in the squared sine of elevation and 256 steps in azimuth over 180 deg (the other half
     is symmetric).
     """
     midpoints = (np.arange(256) + 0.5) / 256
     mu, azimuth = np.sqrt(midpoints)[:, None], np.pi * midpoints
-    cos_g = mu * sun_z + np.sqrt(1.0 - mu**2) * np.sqrt(max(1.0 - sun_z**2, 0.0)) * np.cos(azimuth)
+    towards_sun = np.sqrt(1.0 - mu**2) * np.cos(azimuth)
+    cos_g = mu * sun_z + towards_sun * np.sqrt(max(1.0 - sun_z**2, 0.0))
     elevations, angles = to_device(Float64, np.repeat(mu, 256)), to_device(Float64, cos_g)
-    return float(to_host(single_scattering(elevations, Float64(sun_z), angles, depth, asymmetry)).mean())
+    # the directions have a density proportional to mu
+    radiance = to_host(single_scattering(elevations, Float64(sun_z), angles, depth, asymmetry)).reshape(256, 256)
+    return float(radiance.mean()), float((0.5 * radiance / mu).mean()), float((radiance * towards_sun / mu).mean())
 
 
 def add_air_light(

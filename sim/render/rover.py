@@ -79,7 +79,13 @@ def rover_objects(
     normals = face_normals / np.linalg.norm(face_normals, axis=1, keepdims=True)
     faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
     names = np.full(len(triangles), ROVER_NAME, dtype=np.int32)
-    return Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
+    objects = Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
+    # the sky is hidden by a frustum from the bottom of the body to the deck; wheels and legs are below the deck
+    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    bottom = np.column_stack([0.5 * corners * (length, width), np.full(4, rover.clearance_m)])
+    deck_size = (rover.body_length_m, rover.body_width_m)
+    top = np.column_stack([0.5 * corners * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
+    return objects.with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
 
 
 def rover_sphere(

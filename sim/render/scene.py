@@ -19,13 +19,16 @@ from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64,
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.sweep import height_range, heights_in_rows, max_rises, sweep_shadow
 from marsyard.sim.render.objects import Objects, spheres_in_cone
+from marsyard.sim.render.pebbles import PebbleField
 from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture
 from marsyard.sim.render.shading import Light, Materials
 from marsyard.sim.render.shadows import ObjectSurfaces, Occluders
+from marsyard.sim.render.skylight import MOUND_RANGE, Mounds, Obstructions, Shelter
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.render.sunlight import Footprint, Grid, GroundShadow
 from marsyard.sim.render.texture import MicroRelief, RoughGround
 from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain.sites import SitePebbles
 from marsyard.sim.terrain.surface import UNIFORM, empty_aligned
 
 #: Rounding error of a mean of heights of a few km in single precision, metres.
@@ -56,6 +59,8 @@ class Scene:
     - centre_m: world x, y around which the mesh is dense: below a camera near the ground, or the site of a descent
     - relief: relief finer than the terrain's samples; its slopes change the shading, but not normals and range
     - ground_texture, object_texture: albedo variation finer than the terrain's samples
+    - pebbles: pebbles on the ground; None without
+    - dust_albedo, dust_cover: albedo of dust, and fraction of the level faces of rocks that it covers
     - caster_diameter_m: diameter of a round body at the camera that casts a shadow, such as a lander
     - ground_shadows: whether the ground casts shadows, with a penumbra; shadows of objects have hard edges
     - clouds: drifting clouds that cast shadows
@@ -75,6 +80,9 @@ class Scene:
     relief: MicroRelief = NO_RELIEF
     ground_texture: Texture = NO_TEXTURE
     object_texture: Texture = NO_TEXTURE
+    pebbles: SitePebbles | None = None
+    dust_albedo: float = 0.3
+    dust_cover: float = 0.0
     caster_diameter_m: float = 0.0
     ground_shadows: bool = True
     clouds: CloudLayer | None = None
@@ -144,8 +152,10 @@ class Scene:
         """Return the scene without objects and ground shadows that are invisible in images within these cones."""
         sun, min_height = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
         is_visible = np.zeros(len(self.objects), dtype=np.bool_)
+        # rocks hide the sky from visible ground up to this distance
+        reach = np.array([1.0, 1.0, 1.0, MOUND_RANGE if self.among_objects else 1.0])
         for cone in cones:
-            is_visible |= potentially_visible(self.objects.spheres, sun, min_height, cone)
+            is_visible |= potentially_visible(self.objects.spheres * reach, sun, min_height, cone)
         scene = replace(self, objects=self.objects.select(is_visible), visible_m=ground_in_cones(cones, min_height))
         return self._keep_results(scene, "mesh_offsets", "height_range_m", "max_slopes")
 
@@ -199,6 +209,15 @@ class Scene:
         return Occluders(self.shadow, casters_towards(self.objects, self.sun), self.footprint)
 
     @cached_property
+    def obstructions(self) -> Obstructions | None:
+        """Bodies that hide the sky from the ground around them; None from afar, where their effect is not visible."""
+        if not self.among_objects or len(self.objects) == 0:
+            return None
+        shelter = self.objects.shelter
+        mounds = Mounds.of_boxes(*self.objects.bounds_on_ground())
+        return Obstructions(mounds, None if shelter is None else Shelter.of(shelter))
+
+    @cached_property
     def materials(self) -> Materials:
         """Relief, textures, normals and albedo."""
         objects, surfaces = self.objects, None
@@ -207,10 +226,20 @@ class Scene:
                 vectors_to_device(Array3f, objects.normals.reshape(-1, 3)),
                 to_device(Int32, objects.body_of_triangle),
                 to_device(Float, objects.albedo),
+                to_device(Float, self._dust_albedo()),
             )
         return Materials(
-            RoughGround.of(self.relief), self.ground_texture.octaves, self.object_texture.octaves, surfaces
+            RoughGround.of(self.relief),
+            PebbleField.of(self.pebbles) if self.pebbles is not None else None,
+            self.ground_texture.octaves,
+            self.object_texture.octaves,
+            surfaces,
         )
+
+    def _dust_albedo(self) -> FloatArray[np.ndarray, "bodies"]:
+        """Mean albedo of the level faces of each body: dust covers a part of those of rocks."""
+        covered = self.dust_cover * self.objects.is_rock
+        return np.asarray((1.0 - covered) * self.objects.albedo + covered * self.dust_albedo)
 
     def light(self, time_s: float) -> Light:
         """Return the illumination at a time."""
@@ -227,6 +256,7 @@ class Scene:
             self.photometry.sky_model(self.sun),
             Float64(self.caster_diameter_m) if self.caster_diameter_m > 0.0 else None,
             clouds,
+            self.obstructions,
         )
 
 

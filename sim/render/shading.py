@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
 
-from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
+from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, where
 from marsyard.sim.render.device import Array3f, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.pebbles import PebbleField, pebble_surface
 from marsyard.sim.render.primary import Hits, Points, Pose, Rays, locate
 from marsyard.sim.render.reflectance import Angles, Law, Sky
 from marsyard.sim.render.shadows import ObjectSurfaces
+from marsyard.sim.render.skylight import Obstructions
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.render.sunlight import Clouds, disc_overlap
 from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albedo, relief_slopes, smith_shadowing
 
 #: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
 MAX_SHARP_FOOTPRINT = 1.2
+#: Angles between a rock's face and the horizontal, radians, up to which dust stays on it (about the angle of repose),
+#: and from which it is bare: a thin, cohesive film stays on steep faces (assumed).
+MAX_DUSTY_TILT, MIN_BARE_TILT = math.radians(30.0), math.radians(100.0)
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
 
@@ -25,7 +31,7 @@ GROUND, SKY = -1, -2
 class Light:
     """Illumination at one time: unit vector to the sun, its angular radius, reflectance law, sky, and clouds.
 
-    `caster_diameter` is that of a round body at the camera, metres; None without one.
+    `caster_diameter` is that of a round body at the camera, metres; None without one. `obstructions` hide the sky.
     """
 
     sun: Values
@@ -34,6 +40,7 @@ class Light:
     sky: Sky
     caster_diameter: Values | None
     clouds: Clouds | None
+    obstructions: Obstructions | None
 
     def sky_radiance(self, direction: Values, pixel_rad: Values) -> Values:
         """Radiance factor of the sky in directions."""
@@ -43,9 +50,10 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Materials:
-    """Micro-relief, textures of ground and objects, and the objects' surfaces; None where there are none."""
+    """Micro-relief, pebbles, textures of ground and objects, and the objects' surfaces; None where there are none."""
 
     relief: RoughGround | None
+    pebbles: PebbleField | None
     ground_texture: Octaves
     object_texture: Octaves
     objects: ObjectSurfaces | None
@@ -97,6 +105,15 @@ def _sample_ground(terrain: Terrain, points: Points, level: Values) -> _Surface:
     )[0]
 
 
+def dust_cover(normal_z: Values) -> Values:
+    """Fraction of the dust on level faces that stays on a face: all below `MAX_DUSTY_TILT`, none above `MIN_BARE_TILT`.
+
+    Between them it is linear in the vertical component of the unit normal.
+    """
+    bare, dusty = math.cos(MIN_BARE_TILT), math.cos(MAX_DUSTY_TILT)
+    return clip((normal_z - bare) / (dusty - bare), 0.0, 1.0)
+
+
 @compiled
 def shade(
     terrain: Terrain, pose: Pose, rays: Rays, hits: Hits, light: Light, sun_fraction: Values, materials: Materials
@@ -116,7 +133,8 @@ def shade(
         object_body = dr.gather(Int32, materials.objects.body_of_triangle, UInt32(hits.triangle), is_object)
         body = dr.select(is_object, object_body, body)
         object_albedo = dr.gather(Float, materials.objects.albedo, UInt32(object_body), is_object)
-        albedo = dr.select(is_object, object_albedo, albedo)
+        dust_albedo = dr.gather(Float, materials.objects.dust_albedo, UInt32(object_body), is_object)
+        albedo = dr.select(is_object, dr.lerp(object_albedo, dust_albedo, dust_cover(object_normal.z)), albedo)
         facing = -dr.dot(Array3f(points.direction), object_normal)
         object_footprint = Float(hits.distance) * rays.pixel_angles / dr.sqrt(larger(facing, 0.05))
         texture_footprint = dr.select(is_object, object_footprint, texture_footprint)
@@ -135,6 +153,14 @@ def shade(
         slopes.resolved, slopes.unresolved = (
             roughness * roughness * variance for variance in (slopes.resolved, slopes.unresolved)
         )
+    pebbles = None
+    if materials.pebbles is not None:
+        footprint = dr.select(is_ground, points.footprint, dr.inf)
+        pebbles = pebble_surface(materials.pebbles, points.position, footprint, Array3f(light.sun))
+        bump_x, bump_y = pebbles.normal.x / pebbles.normal.z, pebbles.normal.y / pebbles.normal.z
+        bumped = Array3f(normal.x / normal.z + bump_x, normal.y / normal.z + bump_y, 1.0)
+        normal = dr.select(is_ground, dr.normalize(bumped), normal)
+        albedo *= dr.exp(pebbles.log_albedo)
     angles = Angles.of(normal, points.direction, light.sun)
     textures = materials.ground_texture, materials.object_texture
     albedo *= dr.exp(log_relative_albedo(*textures, is_object, points.position, texture_footprint, strength))
@@ -146,12 +172,18 @@ def shade(
             lambda: 1.0 - Float(disc_overlap(radius, light.sun_radius, dr.acos(angles.cos_g))),
             Float(1.0),
         )
+    if pebbles is not None:
+        # the reflectance law includes the mean effect of all roughness
+        fraction *= (1.0 - pebbles.shadow) * (1.0 + pebbles.loss)
     if light.clouds is not None:
         fraction *= light.clouds.transmittance(points.position, light.sun)
     if slopes is not None:
         # on level ground the mean of n_z, 1 / sqrt(1 + slope**2), is 1 - variance to second order in the slope
         cosine = smaller(larger(angles.cos_i, 1e-6), 1.0)
         fraction *= (1.0 + slopes.resolved) * smith_shadowing(cosine, slopes.unresolved)
-    radiance = albedo * light.law.radiance(angles, normal.z, fraction)
+    blocked = Array3f(0.0)
+    if light.obstructions is not None:
+        blocked = light.obstructions.hide_sky(points.position, is_ground, is_object)
+    radiance = albedo * light.law.radiance(angles, normal, fraction, blocked)
     radiance = where(~is_surface, lambda: Float(light.sky_radiance(points.direction, rays.pixel_angles)), radiance)
     return ShadedImage(radiance, body, smooth_normal)

@@ -25,11 +25,15 @@ class Occluders:
 
 @dataclass(frozen=True, eq=False)
 class ObjectSurfaces:
-    """Normals at the corners of all triangles, body of each triangle, and albedo of each body."""
+    """Normals at the corners of all triangles, body of each triangle, and albedo of each body.
+
+    `dust_albedo` is that of a body's level faces.
+    """
 
     normals: Values
     body_of_triangle: Values
     albedo: Values
+    dust_albedo: Values
 
     def normal_at(self, hits: Hits, active: Values) -> Values:
         """Interpolate the unit normals at the corners of the triangles that are hit."""

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from marsyard.sim.parameters import Parameters, Positive
+from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.parameters import TerrainParameters
 
 MIN_SUN_SINE = 0.05  #: Lower limit of the sine of the sun's elevation in the plane-parallel atmosphere model.
@@ -92,6 +92,8 @@ class SitePhotometry(Parameters):
     surge_amplitude: Annotated[float, Field(ge=0.0, le=3.0, description="B0: amplitude of the surge")] = 0.7
     surge_width: Annotated[float, Field(gt=0.0, le=1.0, description="h: angular width of the surge")] = 0.06
     rock_albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="albedo of rocks")] = 0.15
+    dust_albedo: Annotated[float, Field(gt=0.0, lt=1.0, description="albedo of dust on rocks")] = 0.3
+    dust_cover: Annotated[Fraction, Field(description="fraction of level faces of rocks that dust covers")] = 0.0
     source: Annotated[str, Field(description="source of these values")] = "assumed"
 
 
@@ -116,6 +118,22 @@ class SiteTexture(Parameters):
     amplitudes: Annotated[tuple[float, ...], Field(description="amplitude of each octave")]
 
 
+class SitePebbles(Parameters):
+    """Pebbles and granules that are too many and too small for triangles.
+
+    All octaves of the diameter cover the same fraction of the ground: the number of pebbles larger than D is in
+    proportion to D**-2, as for fragmented rock (Turcotte 1997). The law of Golombek & Rapp (1997), with an exponent of
+    -1 at these sizes, was fitted to rocks above 3 cm.
+    """
+
+    coverage: Annotated[float, bounded_field(0.0, 0.4, "fraction of the ground that pebbles cover")]
+    largest_m: Annotated[Positive, Field(description="largest diameter, m")] = 0.02
+    smallest_m: Annotated[Positive, Field(description="smallest diameter, m")] = 0.002
+    height_ratio: Annotated[float, bounded_field(0.05, 1.0, "height divided by diameter; assumed")] = 0.4
+    log_albedo: Annotated[float, bounded_field(-1.5, 1.5, "mean logarithm of albedo divided by the ground's")] = 0.0
+    log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm; assumed")] = 0.2
+
+
 class Hill(Parameters):
     """A hill on the horizon of a site; the direction is that from the origin of the site's terrain."""
 
@@ -130,7 +148,8 @@ class Site(Parameters):
     """A site with its environment, photometry and terrain.
 
     `descent` is the terrain for images of a descent (spacing of metres over kilometres). `ground` is the terrain for
-    images of a rover or a helicopter (spacing of centimetres over 100-200 m). A site has at least one of them.
+    images of a rover or a helicopter (spacing of centimetres over 100-200 m). A site has at least one of them. Pebbles
+    are visible at the scale of the ground only.
     """
 
     name: str
@@ -139,6 +158,7 @@ class Site(Parameters):
     photometry: SitePhotometry = SitePhotometry()
     ground_texture: SiteTexture
     rock_texture: SiteTexture
+    pebbles: SitePebbles | None = None
     descent: TerrainParameters | None = None
     ground: TerrainParameters | None = None
     hills: tuple[Hill, ...] = ()

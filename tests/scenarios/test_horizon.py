@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from marsyard.scenarios.horizon import HILL_NAME, add_unresolved_rocks, hill_objects
-from marsyard.scenarios.meshes import FIRST_MESH_NUMBER
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene
+from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain import RockField, site
 from marsyard.sim.terrain.sites import Hill

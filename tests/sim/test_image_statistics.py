@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from marsyard.sim.image_statistics import (
     SIDE,
+    compute_ground_statistics,
     compute_image_statistics,
     compute_map_statistics,
     compute_pair_statistics,
@@ -59,6 +60,34 @@ def test_sparse_dark_spots_have_kurtosis_and_negative_skewness() -> None:
     assert spots.skewness_8 < -1.0
     assert spots.best_template > 1.5 * plain.best_template
     assert spots.sift > 10
+
+
+def test_statistics_of_ground_see_noise_and_sparse_dark_pixels() -> None:
+    """Blurred noise of 5 % has this contrast and no kurtosis; 2 % of dark blocks of 3 x 3 pixels change both tails."""
+    rng = np.random.default_rng(5)
+    noise = gaussian_filter(rng.standard_normal((384, 384)), 0.8)
+    image = 1000.0 * (1.0 + 0.05 * noise / noise.std())
+    plain = compute_ground_statistics(image)
+    assert plain.local_p50 == pytest.approx(0.05, rel=0.1)
+    assert plain.local_p10 < plain.local_p50 < plain.local_p90
+    assert abs(plain.kurtosis) < 0.2
+    # 1st percentile of a normal distribution: -2.33 standard deviations
+    assert plain.darkest == pytest.approx(1.0 - 2.33 * 0.05, abs=0.02)
+    spotted = image.copy()
+    for row, column in rng.integers(3, 380, (384 * 384 // 450, 2)):
+        spotted[row : row + 3, column : column + 3] *= 0.5
+    spots = compute_ground_statistics(spotted)
+    assert spots.darkest == pytest.approx(0.5, abs=0.05)
+    assert spots.kurtosis > 3.0
+    assert spots.local_p90 > 1.5 * plain.local_p90
+
+
+def test_corners_are_counted_per_megapixel() -> None:
+    """A board of squares of 12 pixels has a corner at each vertex, 1 / 144 of the pixels, that all are found."""
+    y, x = np.mgrid[:384, :384]
+    board = 1000.0 * (1.0 + 0.3 * np.sign(np.sin(np.pi * (x + 0.5) / 12.0) * np.sin(np.pi * (y + 0.5) / 12.0)))
+    # 31 x 31 inner vertices, and some corners at the border
+    assert compute_ground_statistics(board).corners == pytest.approx(1e3 * 31**2 / 384**2, rel=0.15)
 
 
 def _draw_texture(seed: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
+from scipy.spatial import ConvexHull
 
 from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.kernel_cache import processor_features
@@ -29,7 +30,8 @@ class RockForm:
     - sharpness: exponents of the first and the last shape in the norm that combines the cuts and rounds their edges
     - bumps: RMS height of bumps divided by the radius, in each wavenumber band
     - short_axis_ratios: range of shortest / longest axis; middle / longest axis is 0.65 to 0.95
-    - buried_fractions: range of the fraction of the height that is below the ground
+    - buried_fractions: range of the fraction of the height that is below the ground: 20 to 60 % (assumed). Overhangs
+      are buried too, up to `MAX_BURIED_FRACTION`
     - flatness: factor of the ratio of height to diameter of a terrain's rocks
     - folded: whether bumps form sharp ridges
     - bedding: whether two of the cuts are almost horizontal, and the others steep
@@ -41,7 +43,7 @@ class RockForm:
     sharpness: tuple[float, float] = (200.0, 10.0)
     bumps: tuple[float, float, float, float] = (0.03, 0.015, 0.008, 0.004)
     short_axis_ratios: tuple[float, float] = (0.6, 0.85)
-    buried_fractions: tuple[float, float] = (0.15, 0.4)
+    buried_fractions: tuple[float, float] = (0.2, 0.6)
     flatness: float = 1.0
     folded: bool = False
     bedding: bool = False
@@ -53,9 +55,7 @@ class RockForm:
 FORMS = {
     "block": RockForm(),
     "clinker": RockForm(bumps=(0.1, 0.045, 0.022, 0.0), buried_fractions=(0.3, 0.5), folded=True),
-    "vesicular": RockForm(
-        cuts=(10, 18), sharpness=(80.0, 12.0), bumps=(0.03, 0.02, 0.012, 0.006), buried_fractions=(0.1, 0.6), pits=90
-    ),
+    "vesicular": RockForm(cuts=(10, 18), sharpness=(80.0, 12.0), bumps=(0.03, 0.02, 0.012, 0.006), pits=90),
     "slab": RockForm(
         cuts=(8, 12),
         cut_distances=(0.55, 0.95),
@@ -66,14 +66,12 @@ FORMS = {
         bedding=True,
     ),
     "ventifact": RockForm(
-        cuts=(5, 9),
-        cut_distances=(0.4, 0.75),
-        sharpness=(400.0, 120.0),
-        bumps=(0.012, 0.008, 0.004, 0.002),
-        buried_fractions=(0.1, 0.5),
+        cuts=(5, 9), cut_distances=(0.4, 0.75), sharpness=(400.0, 120.0), bumps=(0.012, 0.008, 0.004, 0.002)
     ),
 }
 SHAPES = SHAPES_OF_FORM * len(FORMS)
+MAX_BURIED_FRACTION = 0.7  #: Maximum fraction of the height that is below the ground.
+_FILLED_OUTLINE = 0.8  #: Fraction of the outline that is below the ground, at least (assumed).
 #: Range of the angular radii of vesicles, radians, and ratio of their depth to their radius.
 _PIT_RADII, _PIT_DEPTH = (0.07, 0.2), 0.5
 #: Range of the half thickness of slabs in their own axes, and maximum tilt of their bedding planes, radians.
@@ -97,7 +95,7 @@ class ShapeSet:
 
     - normals: normals of the smooth shape at the vertices
     - faces: vertex numbers of each triangle, counter-clockwise seen from outside
-    - max_radius: largest horizontal distance of each shape's surface from its origin
+    - max_radius: largest horizontal distance of each shape's surface above the ground from its origin
     """
 
     vertices: Float64[np.ndarray, "shapes vertices 3"]
@@ -187,9 +185,11 @@ def _build_vertices(detail: int) -> Float64[np.ndarray, "shapes vertices 3"]:
 
 @cache
 def _compute_max_radius() -> Float64[np.ndarray, "shapes"]:
-    """Compute the maximum horizontal distance from the origin over all levels; coarse levels can be the widest."""
-    levels = [np.hypot(_vertices(k)[..., 0], _vertices(k)[..., 1]).max(axis=1) for k in range(len(SUBDIVISIONS))]
-    radius: Float64[np.ndarray, "shapes"] = np.max(levels, axis=0)
+    """Compute the maximum horizontal distance from the origin, of the part above ground, over all levels."""
+    radius: Float64[np.ndarray, "shapes"] = np.zeros(SHAPES)
+    for vertices in map(_vertices, range(len(SUBDIVISIONS))):
+        distance = np.hypot(vertices[..., 0], vertices[..., 1])
+        radius = np.maximum(radius, np.where(vertices[..., 2] >= 0.0, distance, 0.0).max(axis=1))
     radius.setflags(write=False)
     return radius
 
@@ -303,6 +303,10 @@ class _RockShape:
         points = _icosphere(FINEST)[0] * self.finest_radius[:, None] * self.axes
         lowest, highest = points[:, 2].min(), points[:, 2].max()
         ground = lowest + self.buried_fraction * (highest - lowest)
+        # sand and dust collect below overhangs: most of the outline seen from above is below the ground
+        outline = points[ConvexHull(points[:, :2]).vertices, 2]
+        filled = float(np.quantile(outline, _FILLED_OUTLINE))
+        ground = min(max(ground, filled), lowest + MAX_BURIED_FRACTION * (highest - lowest))
         visible = points[points[:, 2] >= ground, :2]
         azimuth = np.linspace(0.0, np.pi, 180, endpoint=False)
         projections = visible[:, :1] * np.cos(azimuth) + visible[:, 1:] * np.sin(azimuth)

@@ -1,0 +1,171 @@
+"""Pebbles and granules on the ground: half spheroids at random positions of nested grids, with their shadows.
+
+Each octave of diameters has a square grid whose cells are twice the largest diameter wide. A hash of the cell decides
+whether it contains a pebble, and its position, diameter, outline and albedo. Like texture, pebbles belong to the
+ground: they change normals, albedo and shadows, but not the range. They fade where they become smaller than a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import drjit as dr
+
+from marsyard.sim.render.arrays import Values, clip, larger, smaller
+from marsyard.sim.render.device import Array3f, Float, Float64, Int32, UInt32
+from marsyard.sim.render.noise import hash_cell, mix_bits
+from marsyard.sim.terrain.sites import SitePebbles
+
+#: Width of a cell divided by the largest diameter of its octave: a pebble and its shadow touch at most four cells.
+CELL_DIAMETERS = 2.0
+#: Smallest diameter of an octave, divided by its largest.
+_SMALLEST = 0.5
+#: Range of the ratio of the axes of the outline (assumed), and diameter in footprints at which an octave vanishes.
+_MIN_AXIS_RATIO, _MIN_FOOTPRINTS = 0.6, 0.5
+#: Light that the sides of a pebble take from the mean over its outline (fitted, see the test); its shadow takes that of
+#: half an ellipse beyond the outline.
+SIDE_LOSS = 0.25
+#: Maximum length of a shadow, in diameters, so that it ends in a neighbouring cell.
+_MAX_SHADOW = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class PebbleField:
+    """Pebbles on the device; see `marsyard.sim.terrain.sites.SitePebbles`.
+
+    - largest: largest diameter of the coarsest octave, metres; halved with each octave
+    - octaves: number of octaves
+    - probability: that a cell contains a pebble
+    - coverage: fraction of the ground that one octave covers
+    - height_ratio, log_albedo, log_albedo_sd: of a pebble
+    """
+
+    largest: Values
+    octaves: Values
+    probability: Values
+    coverage: Values
+    height_ratio: Values
+    log_albedo: Values
+    log_albedo_sd: Values
+
+    @classmethod
+    def of(cls, pebbles: SitePebbles) -> PebbleField:
+        """Copy pebbles to the device."""
+        p = pebbles
+        octaves = max(math.ceil(math.log2(p.largest_m / p.smallest_m) - 1e-9), 1)
+        # mean area of an outline relative to a cell; the diameter, and the ratio of axes, are distributed uniformly
+        mean_square = (1.0 - _SMALLEST**3) / (3.0 * (1.0 - _SMALLEST))
+        area = 0.25 * math.pi * mean_square * 0.5 * (1.0 + _MIN_AXIS_RATIO) / CELL_DIAMETERS**2
+        probability = min(p.coverage / octaves / area, 1.0)
+        numbers = map(Float, (probability, p.coverage / octaves, p.height_ratio, p.log_albedo, p.log_albedo_sd))
+        return cls(Float64(p.largest_m), UInt32(octaves), *numbers)
+
+
+@dataclass(eq=False)
+class PebbleSurface:
+    """The pebbles that a pixel sees: normal relative to level ground, log albedo, shaded fraction, and lost light.
+
+    `loss` is the mean fraction of direct sunlight that the visible pebbles and their shadows take from the ground.
+    The normal, not of unit length, and the log albedo are means over the pixel: those of ground without pebbles are
+    (0, 0, 1) and 0.
+    """
+
+    normal: Values
+    log_albedo: Values
+    shadow: Values
+    loss: Values
+
+
+def _uniform(h: Values, shift: int) -> Values:
+    """Convert eight bits of a hash to a number between 0 and 1."""
+    return (Float((h >> shift) & 255) + 0.5) * (1.0 / 256.0)
+
+
+def _evaluate_cell(
+    pebbles: PebbleField,
+    octave: Values,
+    diameter: Values,
+    cell: list[Values],
+    offset: list[Values],
+    footprint: Values,
+    sun: Values,
+) -> tuple[Values, PebbleSurface]:
+    """Evaluate the pebble of one cell: covered fraction of the pixel, and its surface.
+
+    - cell: column and row of the cell
+    - offset: position relative to the cell's corner, metres
+    """
+    width, first = CELL_DIAMETERS * diameter, hash_cell(cell, octave)
+    second = mix_bits(first + UInt32(0x9E3779B1))
+    exists = Float(((first >> 24) << 8) | (second >> 24)) * (1.0 / 65536.0) < pebbles.probability
+    size = diameter * (_SMALLEST + (1.0 - _SMALLEST) * _uniform(first, 0))
+    centre = [0.5 * size + (width - size) * _uniform(second, shift) for shift in (0, 8)]
+    # offset from the centre in radii, stretched along a random axis of the outline
+    x, y = (2.0 * (position - middle) / size for position, middle in zip(offset, centre, strict=True))
+    angle = math.pi * _uniform(first, 8)
+    axis_x, axis_y = dr.cos(angle), dr.sin(angle)
+    stretch = 1.0 / (_MIN_AXIS_RATIO + (1.0 - _MIN_AXIS_RATIO) * _uniform(second, 16)) - 1.0
+    across = stretch * (x * axis_x + y * axis_y)
+    x, y = x + across * axis_x, y + across * axis_y
+    squared = x * x + y * y
+    edge = larger(2.0 * footprint / size, 1e-3)
+    covered = dr.select(exists, clip((1.0 - dr.sqrt(squared)) / edge + 0.5, 0.0, 1.0), 0.0)
+    # half spheroid: the normal is in proportion to (x / r, y / r, z / h**2)
+    height = 2.0 * pebbles.height_ratio
+    upwards = dr.sqrt(larger(1.0 - squared, 0.04))
+    normal = dr.normalize(Array3f(x * height, y * height, upwards))
+    log_albedo = pebbles.log_albedo + pebbles.log_albedo_sd * 3.464 * (_uniform(first, 16) - 0.5)
+    # nearest distance of the ray to the sun from the axis of the spheroid, in units in which it is a sphere
+    sun_across = stretch * (sun.x * axis_x + sun.y * axis_y)
+    sun_x, sun_y = sun.x + sun_across * axis_x, sun.y + sun_across * axis_y
+    along = (x * sun_x + y * sun_y) / (sun_x * sun_x + sun_y * sun_y + (sun.z / height) ** 2)
+    miss = dr.sqrt(larger(squared - along * (x * sun_x + y * sun_y), 0.0))
+    shaded = exists & (along < 0.0)
+    shadow = dr.select(shaded, clip((1.0 - miss) / edge + 0.5, 0.0, 1.0), 0.0) * (1.0 - covered)
+    return covered, PebbleSurface(normal, log_albedo, shadow, Float(0.0))
+
+
+def pebble_surface(pebbles: PebbleField, position: Values, footprint: Values, sun: Values) -> PebbleSurface:
+    """Compute the pebbles at positions on the ground for pixels with a footprint, metres, under a sun (unit vector)."""
+    limit = Float64(_MIN_FOOTPRINTS * footprint)
+    # a low sun is raised, so that no shadow is longer than `_MAX_SHADOW` diameters
+    horizontal = larger(dr.sqrt(sun.x * sun.x + sun.y * sun.y), 1e-6)
+    sun_z = larger(sun.z, horizontal * pebbles.height_ratio / _MAX_SHADOW)
+    light = Array3f(sun.x, sun.y, sun_z)
+    stretch = 2.0 * pebbles.height_ratio * horizontal / sun_z
+    loss = pebbles.coverage * (SIDE_LOSS + 0.5 * (dr.sqrt(1.0 + stretch * stretch) - 1.0))
+    step_x, step_y = (dr.select(component > 0.0, Int32(1), -1) for component in (light.x, light.y))
+
+    def add_octave(octave: Values, diameter: Values, total: PebbleSurface) -> tuple[Values, Values, PebbleSurface]:
+        width = CELL_DIAMETERS * diameter
+        columns, offsets = [], []
+        for coordinate in (position.x, position.y):
+            floor = dr.floor(coordinate / width)
+            columns.append(Int32(floor))
+            offsets.append(Float(coordinate - floor * width))
+        # an octave vanishes where its largest pebbles are smaller than the limit
+        ratio = smaller(_MIN_FOOTPRINTS * footprint / Float(diameter), 1.0)
+        fade = (1.0 - ratio * ratio) * (1.0 - ratio * ratio)
+        shadow = Float(0.0)
+        for j, i in product((0, 1), repeat=2):
+            cell = [columns[0] + i * step_x, columns[1] + j * step_y]
+            offset = [offsets[0] - Float(i * step_x) * Float(width), offsets[1] - Float(j * step_y) * Float(width)]
+            covered, surface = _evaluate_cell(pebbles, octave, Float(diameter), cell, offset, footprint, light)
+            shadow = larger(shadow, surface.shadow)
+            if (i, j) == (0, 0):
+                weight = fade * covered
+                normal = dr.lerp(total.normal, surface.normal, weight)
+                log_albedo = dr.lerp(total.log_albedo, surface.log_albedo, weight)
+        shaded = dr.lerp(total.shadow * (1.0 - weight), 1.0, fade * shadow)
+        return octave + 1, 0.5 * diameter, PebbleSurface(normal, log_albedo, shaded, total.loss + fade * loss)
+
+    state = (
+        UInt32(0),
+        Float64(pebbles.largest),
+        PebbleSurface(Array3f(0.0, 0.0, 1.0), Float(0.0), Float(0.0), Float(0.0)),
+    )
+    return dr.while_loop(
+        state, lambda octave, diameter, total: (octave < pebbles.octaves) & (diameter > limit), add_octave
+    )[2]

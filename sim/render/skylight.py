@@ -1,0 +1,189 @@
+"""Light of the sky on surfaces: brighter towards the sun and the horizon, and hidden by rocks and by a rover.
+
+Irradiances are divided by pi. The sky above level ground has the radiance ``D (a + g . w)`` in the direction w. Bodies
+hide a part of it: their vector ``B = 1 / pi int w d(solid angle)`` over the directions that they cover is known in
+closed form for a mound and for a convex body, so a surface with the unit normal n loses ``n . B`` of a uniform sky.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+from jaxtyping import Float64 as FloatArray
+
+from marsyard.sim.render.arrays import Values, clip, larger, smaller, to_device, vectors_to_device, where
+from marsyard.sim.render.casters import Grids, list_in_grids
+from marsyard.sim.render.device import Array2f, Array2f64, Array3f, Array3f64, Float, Float64, Int32, UInt32
+
+#: Distance from a mound's axis, in radii, beyond which it hides no sky (below 0.5 % of it).
+MOUND_RANGE = 4.0
+#: Distance from the centre of a shelter, in half diagonals, beyond which it hides no sky (below 1 % of it).
+SHELTER_RANGE = 4.0
+#: Parts of the hemisphere's vector in which that of a mound is counted.
+_PARTS = float(2**22)
+#: Average number of mounds in a cell of their grid, and maximum number of cells along a side.
+_MOUNDS_PER_CELL, _MAX_CELLS = 1.0, 512
+#: Faces of a shelter, counter-clockwise seen from outside: bottom, top, and the sides i from corner i to corner i + 1.
+_FACES = ((0, 3, 2), (4, 5, 6), (0, 1, 5), (1, 2, 6), (2, 3, 7), (3, 0, 4))
+_BOTTOM, _TOP, _FIRST_SIDE = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class SkyLight:
+    """Diffuse light: irradiance D of level ground; radiance a, and its gradient g, of a sky with the irradiance 1."""
+
+    level: Values
+    base: Values
+    gradient: Values
+
+    @classmethod
+    def of(cls, level: float, mean_radiance: float, towards_sun: float, sun: FloatArray[np.ndarray, "3"]) -> SkyLight:
+        """Fit the linear sky to moments of a sky with the irradiance 1.
+
+        - mean_radiance: mean of the radiance over the hemisphere; above 1 if the horizon is brighter than the zenith
+        - towards_sun: horizontal component, towards the sun, of ``1 / pi int L w d(solid angle)``
+        """
+        horizontal = sun[:2] / max(float(np.hypot(*sun[:2])), 1e-9)
+        # the radiance at the zenith, a + g_z = 1 + g_z / 3, is not negative
+        upwards = max(6.0 * (1.0 - mean_radiance), -3.0)
+        gradient = [*(1.5 * towards_sun * horizontal).tolist(), upwards]
+        return cls(Float(level), Float(1.0 - 2.0 / 3.0 * upwards), Array3f(*gradient))
+
+    def irradiance(self, normal: Values, blocked: Values) -> Values:
+        """Irradiance of surfaces with unit normals, of whose sky the vectors `blocked` are hidden.
+
+        Exact for the linear sky above a horizontal horizon: the sky that a surface sees is a lune with the angle pi -
+        acos(n_z).
+        """
+        cosine = clip(normal.z, -1.0, 1.0)
+        tilt, sine = dr.acos(cosine) / dr.pi, dr.sqrt(1.0 - cosine * cosine) / dr.pi
+        gradient = dr.fma(1.0 - tilt, dr.dot(self.gradient, normal), sine * self.gradient.z)
+        visible = dr.fma(0.5 * self.base, 1.0 + cosine, 2.0 / 3.0 * gradient)
+        direction = blocked / larger(dr.norm(blocked), 1e-6)
+        radiance = larger(self.base + dr.dot(self.gradient, direction), 0.0)
+        return self.level * larger(dr.fma(-radiance, larger(dr.dot(normal, blocked), 0.0), visible), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Mounds:
+    """Bodies on the ground, as half spheroids, in a grid: centre, and radius and height of the top, metres."""
+
+    grid: Grids
+    centre: Values
+    radius: Values
+    top: Values
+
+    @classmethod
+    def of_boxes(
+        cls, low: FloatArray[np.ndarray, "bodies 3"], high: FloatArray[np.ndarray, "bodies 3"]
+    ) -> Mounds | None:
+        """List bodies with these bounds in a grid; None without bodies."""
+        if len(low) == 0:
+            return None
+        centre, radius = 0.5 * (low + high)[:, :2], 0.25 * (high - low)[:, :2].sum(axis=1)
+        reach = MOUND_RANGE * radius[:, None]
+        bounds = np.zeros((1, 6))
+        bounds[0, :2], bounds[0, 3:5] = (centre - reach).min(axis=0), (centre + reach).max(axis=0)
+        side = np.clip(np.ceil(np.sqrt([len(low) / _MOUNDS_PER_CELL])), 1, _MAX_CELLS).astype(np.int64)
+        first, last = (vectors_to_device(Array2f64, centre + sign * reach) for sign in (-1, 1))
+        numbers = dr.arange(UInt32, len(low))
+        grid = list_in_grids(first, last, dr.zeros(UInt32, len(low)), bounds, side, numbers)
+        centres = vectors_to_device(Array2f64, centre)
+        return cls(grid, centres, to_device(Float, radius), to_device(Float64, high[:, 2]))
+
+    def hide_sky(self, position: Values, active: Values) -> Values:
+        """Compute the vectors of the sky that mounds hide from positions on the ground.
+
+        A half sphere of the angular radius t on the horizon covers half a cap. Its vector has the horizontal component
+        ``sin(t)**2 / 2``, and the vertical component ``(t - sin(t) cos(t)) / pi``: the area of its projection on the
+        ground. Both are scaled by the ratio of height to radius. The sum of integers does not depend on the order of
+        the mounds, which is not fixed.
+        """
+        first, end = self.grid.list_range(
+            UInt32(0), *self.grid.locate(UInt32(0), position.x, position.y, active), active
+        )
+
+        def add_mound(
+            k: Values, east: Values, north: Values, up: Values, is_active: Values
+        ) -> tuple[Values, Values, Values, Values, Values]:
+            number = dr.gather(UInt32, self.grid.items, k, is_active)
+            offset = Array2f(dr.gather(Array2f64, self.centre, number, is_active) - position.xy)
+            radius = dr.gather(Float, self.radius, number, is_active)
+            top = Float(dr.gather(Float64, self.top, number, is_active) - position.z)
+            distance = larger(dr.norm(offset), 1e-6)
+            height, sine = clip(top / larger(radius, 1e-6), 0.0, 1.0), smaller(radius / distance, 1.0)
+            sine = dr.select(distance < MOUND_RANGE * radius, sine, 0.0)
+            height = dr.select(is_active, height * _PARTS, 0.0)
+            sideways = 0.5 * height * sine * sine / distance
+            east, north = east + Int32(sideways * offset.x), north + Int32(sideways * offset.y)
+            up += Int32(height * (dr.asin(sine) - sine * dr.sqrt(1.0 - sine * sine)) / dr.pi)
+            return k + 1, east, north, up, is_active & (k + 1 < end)
+
+        state = (UInt32(first), Int32(0), Int32(0), Int32(0), active & (first < end))
+        parts = dr.while_loop(state, lambda k, east, north, up, is_active: is_active, add_mound)[1:4]
+        return Array3f(*(Float(part) for part in parts)) / _PARTS
+
+
+@dataclass(frozen=True, eq=False)
+class Shelter:
+    """A convex body with eight corners above the ground, such as a rover's body: its corners, centre and range."""
+
+    corners: Values
+    centre: Values
+    reach: Values
+
+    @classmethod
+    def of(cls, corners: FloatArray[np.ndarray, "8 3"]) -> Shelter:
+        """Copy a shelter to the device: corners of the bottom, counter-clockwise from above, then those of the top."""
+        centre = corners.mean(axis=0)
+        reach = SHELTER_RANGE * float(np.linalg.norm(corners - centre, axis=1).max())
+        return cls(vectors_to_device(Array3f64, corners), Array3f64(*centre.tolist()), Float(reach))
+
+    def hide_sky(self, position: Values, active: Values) -> Values:
+        """Compute the vectors of the sky that the body hides from positions outside it; 0 for positions inside.
+
+        The vector of a polygon is the sum over its edges of half the angle of the edge times the unit vector
+        perpendicular to the edge and the position (Lambert 1760). The visible faces of a convex body do not overlap;
+        their common edges cancel.
+        """
+        is_near = active & (dr.norm(Array3f(self.centre - position)) < self.reach)
+        return where(is_near, lambda: self._sum_edges(position), Array3f(0.0))
+
+    def _sum_edges(self, position: Values) -> Values:
+        offsets = [Array3f(dr.gather(Array3f64, self.corners, UInt32(k)) - position) for k in range(8)]
+        faces = [
+            dr.select(dr.dot(offsets[a], dr.cross(offsets[b] - offsets[a], offsets[c] - offsets[a])) < 0.0, 1.0, 0.0)
+            for a, b, c in _FACES
+        ]
+        units = [dr.normalize(offset) for offset in offsets]
+        sides = faces[_FIRST_SIDE:]
+        total = Array3f(0.0)
+        for i in range(4):
+            for first, second, weight in (
+                (i, (i + 1) % 4, sides[i] - faces[_BOTTOM]),
+                (4 + i, 4 + (i + 1) % 4, faces[_TOP] - sides[i]),
+                (i, 4 + i, sides[i - 1] - sides[i]),
+            ):
+                cosine = clip(dr.dot(units[first], units[second]), -0.999999, 0.999999)
+                length = weight * dr.acos(cosine) / dr.sqrt(1.0 - cosine * cosine)
+                total -= length * dr.cross(units[first], units[second])
+        return total / (2.0 * dr.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Obstructions:
+    """Bodies that hide a part of the sky; None where there are none."""
+
+    mounds: Mounds | None
+    shelter: Shelter | None
+
+    def hide_sky(self, position: Values, is_ground: Values, is_object: Values) -> Values:
+        """Compute the vectors of the hidden sky: mounds hide it from the ground only, a shelter from all surfaces."""
+        blocked = Array3f(0.0)
+        if self.mounds is not None:
+            blocked += self.mounds.hide_sky(position, is_ground)
+        if self.shelter is not None:
+            blocked += self.shelter.hide_sky(position, is_ground | is_object)
+        return blocked

@@ -1,0 +1,100 @@
+"""Tests of pebbles: coverage, fading, position on the ground, shadows, and dust on rocks."""
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from marsyard.sim.camera import Cahv
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import to_host
+from marsyard.sim.render.device import Array3f, Array3f64, Float
+from marsyard.sim.render.pebbles import PebbleField, pebble_surface
+from marsyard.sim.render.rover import ROVER_NAME
+from marsyard.sim.terrain.sites import SitePebbles
+from tests.sim.scenes import DOWN, LAMBERT, flat_ground
+
+ONE_SIZE = SitePebbles(coverage=0.1, largest_m=0.04, smallest_m=0.02, log_albedo=-0.5, log_albedo_sd=0.0)
+MESH: dict[str, Any] = {"mesh_finest_m": 0.2, "mesh_half_width_m": 60.0}
+SUN = Sun(direction(0.5 * np.pi, np.radians(35.0)))
+
+
+def _sample(
+    pebbles: SitePebbles, footprint_m: float, side: int = 700, spacing_m: float = 0.0071
+) -> tuple[np.ndarray, ...]:
+    """Return normals, log albedo and shadow on a square grid of positions; rows are north."""
+    side = 700
+    grid = 0.0071 * np.arange(side)
+    x, y = np.meshgrid(grid, grid)
+    position = Array3f64(*(np.ravel(values) for values in (x, y, np.zeros_like(x))))
+    footprint = dr.full(Float, footprint_m, side * side)
+    surface = pebble_surface(PebbleField.of(pebbles), position, footprint, Array3f(*SUN.direction.tolist()))
+    normal, albedo, shadow = (to_host(values) for values in (surface.normal, surface.log_albedo, surface.shadow))
+    return normal.reshape(side, side, 3), albedo.reshape(side, side), shadow.reshape(side, side)
+
+
+def test_pebbles_cover_the_specified_fraction_of_the_ground() -> None:
+    _, log_albedo, _ = _sample(ONE_SIZE, 1e-4)
+    # 25 m2 with cells of 8 cm: 3900 cells, about 1000 pebbles, so the coverage varies by 3 %
+    assert np.mean(log_albedo < -0.25) == pytest.approx(0.1, rel=0.1)
+
+
+def test_shadows_point_away_from_the_sun() -> None:
+    _, log_albedo, shadow = _sample(ONE_SIZE, 1e-4)
+    pebble, shade = log_albedo < -0.25, shadow > 0.5
+    # the sun is in the east; the mean shadow of a half spheroid is half the ellipse beyond its outline:
+    # 0.5 (sqrt(1 + (2 ratio / tan)^2) - 1) of the outline's area, with the ratio 0.4 and tan(35 deg) = 0.70
+    assert shade.sum() / pebble.sum() == pytest.approx(0.5 * (np.hypot(1.0, 0.8 / 0.70) - 1.0), rel=0.25)
+    west_of_pebbles, east_of_pebbles = np.roll(pebble, -2, axis=1), np.roll(pebble, 2, axis=1)
+    assert np.mean(shade[west_of_pebbles & ~pebble]) > 5.0 * np.mean(shade[east_of_pebbles & ~pebble])
+
+
+def test_pebbles_fade_where_they_are_smaller_than_a_pixel() -> None:
+    strengths = [float(np.std(_sample(ONE_SIZE, footprint)[1])) for footprint in (0.002, 0.02, 0.04, 0.08)]
+    assert strengths[0] > strengths[1] > strengths[2] > 0.0
+    assert strengths[3] == 0.0
+
+
+@pytest.mark.parametrize("elevation_deg", [25.0, 35.0, 60.0])
+def test_pebbles_move_with_the_ground_and_keep_its_mean_brightness(renderer: Renderer, elevation_deg: float) -> None:
+    camera = Cahv.from_field_of_view(0.6, (300, 300), **DOWN)
+    rays, sun = PixelRays.from_camera(camera), Sun(direction(0.5 * np.pi, np.radians(elevation_deg)))
+    plain, pebbly = (
+        Scene(flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=pebbles, **MESH)
+        for pebbles in (None, SitePebbles(coverage=0.2))
+    )
+    pixel_m = 2.0 * np.tan(0.3) * 1.5 / 300
+    poses = [rigid(Rotation.identity(), np.array([8.0 + 40.0 * step * pixel_m, 8.0, 1.5])) for step in (0, 1)]
+    level = renderer.render(plain, rays, poses[0]).radiance
+    first, second = (renderer.render(pebbly, rays, pose).radiance for pose in poses)
+    assert first.std() > 10.0 * level.std()
+    assert first.mean() == pytest.approx(level.mean(), rel=0.03)
+    # the second image is the first one shifted by 40 pixels
+    assert np.corrcoef(first[:, 45:].ravel(), second[:, 5:-40].ravel())[0, 1] > 0.99
+
+
+def test_dust_lies_on_level_faces_of_rocks_only(renderer: Renderer) -> None:
+    level = np.array([[8.0, 8.0, 0.4], [8.4, 8.0, 0.4], [8.4, 8.4, 0.4], [8.0, 8.4, 0.4]])
+    steep = np.array([[7.0, 8.0, 0.3], [7.05, 8.0, 1.0], [7.05, 8.4, 1.0], [7.0, 8.4, 0.3]])
+    normal = np.cross(steep[1] - steep[0], steep[2] - steep[0])
+    normals = np.repeat([[0.0, 0.0, 1.0], normal / np.linalg.norm(normal)], 4, axis=0)
+    faces, body = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.int32), np.array([0, 0, 1, 1])
+    sky_only = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=1.0, surrounding_albedo=0.0)
+    night, camera = Sun(direction(0.0, np.radians(-10.0))), Cahv.from_field_of_view(1.2, (400, 400), **DOWN)
+    pose = rigid(Rotation.identity(), np.array([6.6, 8.2, 3.0]))
+    brightness = {}
+    for name in (5, ROVER_NAME):
+        names = np.full(4, name, dtype=np.int32)
+        objects = Objects.of_mesh(np.concatenate([level, steep]), normals, faces, names, 0.1, body.astype(np.int32))
+        dust: dict[str, Any] = {"dust_albedo": 0.5, "dust_cover": 0.8}
+        scene = Scene(flat_ground(64, 1.0), (8.0, 8.0), night, sky_only, objects, **dust, **MESH)
+        frame = renderer.render(scene, PixelRays.from_camera(camera), pose)
+        brightness[name] = [float(np.median(frame.radiance[frame.body == number])) for number in (0, 1)]
+    # 0.2 * 0.1 + 0.8 * 0.5 on the rock; a rover has no dust
+    assert brightness[5][0] == pytest.approx(0.42, abs=1e-3)
+    assert brightness[ROVER_NAME][0] == pytest.approx(0.1, abs=1e-3)
+    # the steep face, 86 deg from level, has (cos(86) - cos(100)) / (cos(30) - cos(100)) = 23.6 % of this dust
+    assert brightness[5][1] / brightness[ROVER_NAME][1] == pytest.approx(1.0 + 3.2 * 0.236, abs=0.05)

@@ -1,0 +1,119 @@
+"""Tests of the sky's light on surfaces against numerical integration over directions."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
+
+from benchmarks.validation.raycast import cast_triangles
+from marsyard.sim.camera import Cahv
+from marsyard.sim.dynamics.rover import MER, settle
+from marsyard.sim.frames import direction, rigid
+from marsyard.sim.render import DustySky, Objects, Photometry, PixelRays, Renderer, Scene, Sun
+from marsyard.sim.render.arrays import to_host, vectors_to_device
+from marsyard.sim.render.device import Array3f, Array3f64, Bool
+from marsyard.sim.render.rover import rover_objects
+from marsyard.sim.render.skylight import Mounds, Shelter, SkyLight
+from marsyard.sim.sensor.mast import MER_MAST
+from tests.sim.scenes import LAMBERT, flat_ground, make_ground
+
+SUN = Sun(direction(0.4, np.radians(40.0)))
+
+
+def _draw_sphere(log2_count: int) -> Float64[np.ndarray, "n 3"]:
+    """Draw directions that are distributed uniformly over the sphere."""
+    up, turns = qmc.Sobol(2, rng=np.random.default_rng(1)).random_base2(log2_count).T
+    z = 2.0 * up - 1.0
+    horizontal, azimuth = np.sqrt(1.0 - z * z), 2.0 * np.pi * turns
+    return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), z], axis=1)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 20.0, 90.0, 150.0])
+def test_tilted_surfaces_receive_the_light_of_a_linear_sky(tilt_deg: float) -> None:
+    light = SkyLight.of(0.4, mean_radiance=1.1, towards_sun=0.15, sun=SUN.direction)
+    normal = direction(2.0, np.radians(90.0 - tilt_deg))
+    directions = _draw_sphere(16)
+    gradient = to_host(light.gradient)[0].astype(np.float64)
+    radiance = 0.4 * (to_host(light.base)[0] + directions @ gradient) * (directions[:, 2] > 0.0)
+    # 1 / pi times the solid angle 4 pi of the sphere
+    expected = 4.0 * float(np.mean(radiance * np.maximum(directions @ normal, 0.0)))
+    surface = vectors_to_device(Array3f, normal[None])
+    assert to_host(light.irradiance(surface, Array3f(0.0)))[0] == pytest.approx(expected, abs=1e-3)
+
+
+def test_moments_of_the_linear_sky_are_those_of_the_dusty_sky() -> None:
+    light = DustySky(0.9, 0.94, 0.65).light(SUN, 0.45)
+    gradient, base = to_host(light.gradient)[0], to_host(light.base)[0]
+    # level ground receives the specified irradiance: base + 2/3 of the vertical gradient is 1
+    assert base + gradient[2] / 1.5 == pytest.approx(1.0, abs=1e-6)
+    azimuth = SUN.direction[:2] / np.linalg.norm(SUN.direction[:2])
+    towards_sun = gradient[:2] @ azimuth
+    assert gradient[:2] == pytest.approx(towards_sun * azimuth, abs=1e-6)
+    # light scattered once, and not forwards, is brighter on the side of the sun: in the plane of the sun
+    # P(g') = 1 + 3 * 0.39 cos(g) + ..., so the relative gradient is about 3 * 0.39 cos(40 deg) = 0.9
+    assert 0.5 < towards_sun < 1.2
+
+
+def test_sky_hidden_by_a_convex_body_equals_ray_casting() -> None:
+    corners = np.array([[-1.0, -0.6], [1.0, -0.6], [1.0, 0.6], [-1.0, 0.6]])
+    bottom, top = np.column_stack([0.5 * corners, np.full(4, 0.3)]), np.column_stack([corners, np.full(4, 0.7)])
+    body = np.concatenate([bottom, top])
+    quads = [(0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
+    faces = np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))], dtype=np.int32)
+    objects = Objects.of_mesh(body, body, faces, np.zeros(len(faces), dtype=np.int32), albedo=0.2)
+    positions = np.array([[0.1, -0.2, 0.0], [0.9, 0.5, 0.0], [1.6, -0.3, 0.1], [-0.2, 2.5, 0.0], [0.0, 0.3, 1.2]])
+    shelter = Shelter.of(body)
+    hidden = to_host(shelter.hide_sky(vectors_to_device(Array3f64, positions), Bool([True] * len(positions))))
+    directions = _draw_sphere(14)
+    for position, vector in zip(positions, hidden, strict=True):
+        is_hit = np.isfinite(cast_triangles(objects, np.broadcast_to(position, directions.shape), directions))
+        expected = 4.0 * np.mean(directions * is_hit[:, None], axis=0)
+        assert vector == pytest.approx(expected, abs=6e-3)
+    inside = vectors_to_device(Array3f64, np.array([[0.0, 0.0, 0.5]]))
+    assert to_host(shelter.hide_sky(inside, Bool([True])))[0] == pytest.approx(0.0)
+
+
+def test_sky_hidden_by_a_half_sphere_equals_integration() -> None:
+    low, high = np.array([[1.5, -0.5, -0.3]]), np.array([[2.5, 0.5, 0.5]])
+    mounds = Mounds.of_boxes(low, high)
+    assert mounds is not None
+    directions = _draw_sphere(17)
+    directions = directions[directions[:, 2] > 0.0]
+    positions = np.array([[1.3, 0.0, 0.0], [2.0, 1.2, 0.0], [0.5, -0.6, 0.0], [7.0, 0.0, 0.0]])
+    hidden = to_host(mounds.hide_sky(vectors_to_device(Array3f64, positions), Bool([True] * len(positions))))
+    for position, vector in zip(positions[:3], hidden[:3], strict=True):
+        offset = np.array([2.0, 0.0, 0.0]) - position
+        along = directions @ offset
+        is_hit = (along > 0.0) & (offset @ offset - along**2 < 0.25)
+        # half of the sphere: 2 pi / pi
+        expected = 2.0 * np.mean(directions * is_hit[:, None], axis=0)
+        assert vector == pytest.approx(expected, abs=4e-3)
+    assert hidden[3] == pytest.approx(0.0)
+
+
+def test_rover_darkens_its_shadow_and_slopes_remain_visible_in_it(renderer: Renderer) -> None:
+    """Below a rover the ground has a fraction of the sky's light, which comes from the side."""
+    x = np.arange(256) * 0.05
+    heights = 0.01 * np.sin(2.0 * np.pi * x / 0.4) * np.ones((256, 1))
+    surface = make_ground(heights, 0.05)
+    stance = settle(MER, flat_ground(64, 0.2), 6.4, 6.4, 0.5 * np.pi)
+    photometry = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.45, sky=DustySky(0.9, 0.94, 0.65))
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    sun = Sun(direction(1.5 * np.pi, np.radians(30.0)))
+    scene = Scene(surface, (6.4, 6.4), sun, photometry, objects, mesh_finest_m=0.02, mesh_half_width_m=30.0)
+    camera = Cahv.from_field_of_view(np.radians(70.0), (160, 160), axis=(-1.0, 0.0, -0.25), right=(0.0, 1.0, 0.0))
+    pose = rigid(Rotation.identity(), np.array([8.3, 6.4, 0.5]))
+    rays = PixelRays.from_camera(camera)
+    direct = renderer.render(scene.with_photometry(LAMBERT), rays, pose)
+    frames = [renderer.render(replace(scene, among_objects=among), rays, pose).radiance for among in (False, True)]
+    points = direct.points_world()
+    shaded = (direct.body == -1) & (direct.radiance == 0.0)
+    below = shaded & (np.abs(points[..., 0] - 6.4) < 0.6) & (np.abs(points[..., 1] - 6.4) < 0.3)
+    assert below.sum() > 200
+    open_sky, sheltered = (frame[below].astype(np.float64) for frame in frames)
+    assert sheltered.mean() < 0.5 * open_sky.mean()
+    # slopes of +-0.16: light from the side changes more with them
+    assert sheltered.std() / sheltered.mean() > 2.0 * open_sky.std() / open_sky.mean()
