@@ -77,7 +77,7 @@ def lossy_bits_per_pixel(path: Path) -> float | None:
 
 def read_elevation(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
     """Read an array of elevations, and interpolate it to a number of columns and rows. Raises IngestError."""
-    elevation = _read_array(path).astype(np.float32)
+    elevation = _read_array(path, "array of elevations").astype(np.float32)
     if not np.all(np.isfinite(elevation)):
         raise IngestError(f"{path}: has elevations that are not finite; allowed: metres, without holes")
     return np.asarray(cv2.resize(elevation, size, interpolation=cv2.INTER_LINEAR))
@@ -126,7 +126,7 @@ def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
     """Read a flat field: an array unchanged, or an image divided by its largest count. Raises IngestError."""
     head = read_header(path)
     if head.startswith(b"\x93NUMPY"):
-        response = _read_array(path)
+        response = _read_array(path, "flat field")
     else:
         counts = read_counts(path)
         response = counts / max(int(counts.max()), 1)
@@ -135,10 +135,10 @@ def read_flat_field(path: Path) -> Float64[np.ndarray, "rows columns"]:
     return response
 
 
-def _read_array(path: Path) -> Float64[np.ndarray, "rows columns"]:
+def _read_array(path: Path, content: str) -> Float64[np.ndarray, "rows columns"]:
     """Read a `.npy` of numbers with two dimensions. Raises IngestError."""
     read_header(path)
-    with report_damage(path, IngestError, "is not a valid array"):
+    with report_damage(path, IngestError, f"is not a valid {content}"):
         with path.open("rb") as file:
             shape, dtype = read_npy_header(file)
         if len(shape) != 2 or max(shape) > _MAX_SIDE or dtype.kind not in "iuf":

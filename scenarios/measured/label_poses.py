@@ -31,8 +31,10 @@ def label_pose(
 
 def is_mars_fixed(framed: FramedCamera, product: Pds3Product | None) -> bool:
     """Return whether the label contains the pose of the camera, or of its rover, in the Mars-fixed frame."""
-    pose = None if product is None else product.pose
-    return MARS_FIXED in (framed.frame.name, None if pose is None else pose[0].name)
+    frame = framed.frame
+    if frame.is_vehicle and product is not None and product.pose is not None:
+        frame = product.pose[0]
+    return frame.name == MARS_FIXED
 
 
 def world_from(row: ImageRow, frame: LabelFrame, origin_m: Float64[np.ndarray, "3"]) -> RigidTransform:

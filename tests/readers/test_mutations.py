@@ -40,7 +40,7 @@ from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 from marsyard.reports.stored import read_run
 from marsyard.scenarios.conformance import inputs
-from marsyard.scenarios.measured.image_files import read_counts, read_flat_field
+from marsyard.scenarios.measured.image_files import read_counts, read_elevation, read_flat_field
 from marsyard.scenarios.measured.layout import VELOCITY as TASK
 from marsyard.scenarios.measured.layout import IngestError, read_ingest_file, read_table
 from marsyard.scenarios.meshes import MeshFileError, read_mesh
@@ -225,6 +225,13 @@ READERS: Mapping[str, Reader] = {
         f"image {kind}": Reader(f"image.{kind}", _write_image, lambda path: read_counts(path, (48, 32)), IngestError)
         for kind in ("png", "pgm", "tif")
     },
+    "published image": Reader(
+        "image.jpg", _write_image, lambda path: read_counts(path, (48, 32), is_published=True), IngestError
+    ),
+    "elevations": Reader(
+        "elevation.npy", lambda path: np.save(path, np.ones((32, 48))), lambda path: read_elevation(path, (24, 16)),
+        IngestError,
+    ),
     "flat field npy": Reader("flat.npy", lambda path: np.save(path, np.ones((32, 48))), read_flat_field, IngestError),
     "flat field png": Reader("flat.png", _write_image, read_flat_field, IngestError),
     "ingest.toml": Reader("ingest.toml", _write_ingest, lambda path: read_ingest_file(path.parent), IngestError),

@@ -143,7 +143,10 @@ POSE_TABLE = '[poses]\naxes = "enu"\nattitude_of = "body"\n'
         (lambda folder: cv2.imwrite(str(folder / "map.png"), np.zeros((64, 64), np.uint8)), ["64 x 64", "128 to 4096"]),
         (lambda folder: cv2.imwrite(str(folder / "map.png"), np.ones((256, 256), np.uint8)), ["all pixels of the map"]),
         (lambda folder: np.save(folder / "elevation.npy", np.full((9, 9), np.nan)), ["elevation.npy", "not finite"]),
-        (lambda folder: (folder / "elevation.npy").write_text("1 2"), ["elevation.npy", "is not a valid array"]),
+        (
+            lambda folder: (folder / "elevation.npy").write_text("1 2"),
+            ["elevation.npy", "is not a valid array of elevations"],
+        ),
         (change_text("ingest.toml", 'task = "map"', 'task = "matching"'), ["map: the task map, and no other"]),
         (
             change_text("ingest.toml", "bits = 12", "bits = 12\nrows_summed = 4"),
@@ -286,25 +289,23 @@ LCAM_MODEL = Cahvore(
 def test_frames_of_the_landing_camera_are_registered_over_jezero(tmp_path: Path, shared_data: Path) -> None:
     folder, source = tmp_path / "in", shared_data / "mars2020_lcam"
     folder.mkdir()
-    for name in ("frame_28.jpg", "frame_46.jpg", "frame_73.jpg", "jezero_map_small.jpg"):
+    for name in ("frame_46.jpg", "frame_73.jpg", "jezero_map_small.jpg"):
         shutil.copy(source / name, folder)
     write_cahvor(LCAM_MODEL.scale(800 / 1024), folder / "lcam.cahvor")
-    (folder / "images.csv").write_text("case,file\n28,frame_28.jpg\n46,frame_46.jpg\n73,frame_73.jpg\n")
+    (folder / "images.csv").write_text("case,file\n46,frame_46.jpg\n73,frame_73.jpg\n")
     (folder / "ingest.toml").write_text(
         'name = "lcam"\ntask = "map"\n[camera]\nfile = "lcam.cahvor"\n[detector]\nbits = 8\n'
         '[map]\nfile = "jezero_map_small.jpg"\npixel_m = 16.0\n'
     )
     cases = ingest_map(folder, tmp_path / "out")
-    high, low, last = (case.images[0] for case in cases.stored.cases)
-    # 16 m a pixel was found by fitting. Frame 28 is at about 4 km; from frame 28 to frame 47, at 2.1 km, the lander
-    # descends uniformly under its parachute, so that frame 46 is at 2.2 km. The ground is uneven by some 100 m.
-    assert high.position_m is not None
-    assert low.position_m is not None
-    assert high.position_m[2] == pytest.approx(4000.0, abs=300.0)
-    assert low.position_m[2] == pytest.approx(2200.0, abs=200.0)
+    image, last = (case.images[0] for case in cases.stored.cases)
+    # frame 47 is at 2.1 km, and frame 28 at about 4 km: 0.1 km between successive frames. The size of the map's pixels
+    # was found by fitting, and the ground is uneven by some 100 m.
+    assert image.position_m is not None
+    assert image.position_m[2] == pytest.approx(2200.0, abs=200.0)
     # an image from tens of metres shows no feature of a map with pixels of 16 m
     assert last.registration_inliers is None
-    row = compare(cases, 1).row
+    row = compare(cases, 0).row
     # of templates of this data 91 to 98 % are valid, with correlations of 0.67 to 0.76 (of other windows)
     assert float(row["template_yield"]) > 0.85
     assert 0.55 < float(row["template_correlation"]) < 0.85
