@@ -98,7 +98,7 @@ def compare_maps(quick: bool) -> Iterator[Measure]:
     The limits apply to the site that resembles the flown one; no flown images of the other sites were available.
     """
     for site in (FLOWN_SITE,) if quick else SITES:
-        seeds = range(FIRST_SEED, FIRST_SEED + (1 if quick else 6 if site == FLOWN_SITE else 2))
+        seeds = range(FIRST_SEED, FIRST_SEED + (1 if quick or site != FLOWN_SITE else 6))
         equal, turned = (
             np.array([row for seed in seeds for row in compare_on_map(site, seed, turn_deg)])
             for turn_deg in (0.0, TURN_DEG)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import Generator
 from pydantic import Field
 
-from marsyard.sim.parameters import Fraction, Parameters, Positive, bounded_field
+from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, resample
 from marsyard.sim.terrain.landforms.kernels import cast_lee, expose_strata
 from marsyard.sim.terrain.landforms.relief import Dunes
@@ -58,7 +58,7 @@ class Drifts(Parameters):
     """
 
     wind_from_deg: Annotated[float, Field(ge=0.0, lt=360.0, description="azimuth from which the wind blows")] = 270.0
-    wind_spread_deg: Annotated[float, Field(ge=0.0, description="SD of this azimuth between terrains, deg")] = 10.0
+    wind_spread_deg: Annotated[NonNegative, Field(description="SD of this azimuth between terrains, deg")] = 10.0
     lee_slope_deg: Annotated[float, Field(gt=0.0, le=30.0, description="slope of the lee behind a crest")] = 6.0
     depth_m: Annotated[Positive, Field(description="depth in the lee at which sand covers half the ground, m")] = 3.0
     filled: Annotated[Fraction, Field(description="fraction of the lee's depth that the sand fills")] = 0.3

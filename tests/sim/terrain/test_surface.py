@@ -8,9 +8,9 @@ from scipy.ndimage import map_coordinates
 
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
-from marsyard.sim.terrain.landforms.ground import Spectrum
+from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
 from marsyard.sim.terrain.landforms.kernels import EJECTA_OPACITY, stamp_craters
-from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
+from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, add_craters, draw_craters
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +133,42 @@ def test_albedo_has_the_specified_mean_and_contrast() -> None:
     albedo = synthesise(parameters, np.random.default_rng(1)).levels[0][..., 1]
     assert albedo.mean() == pytest.approx(0.25, rel=0.02)
     assert np.log(albedo).std() == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("hurst", [0.0, 0.75])
+def test_white_noise_replaces_the_finest_octave(hurst: float) -> None:
+    """The spectrum of the field's values is that of a power law at all samples, also where the octaves meet."""
+    fields = (FractalField.power_law(512, 2.0, hurst, 200.0), Spectrum.power_law(512, 2.0, hurst, 200.0))
+    power = []
+    for field in fields:
+        rng, total = np.random.default_rng(7), np.zeros((512, 257))
+        for _ in range(6):
+            control = field.draw_field(rng, 1.5).astype(np.float64)
+            values = map_coordinates(control, np.mgrid[:512, :512], order=3, mode="grid-wrap", prefilter=False)
+            total += np.abs(np.fft.rfft2(values)) ** 2
+        power.append(total)
+    frequency = np.hypot(np.fft.fftfreq(512)[:, None], np.fft.rfftfreq(512))
+    for low, high in ((0.005, 0.02), (0.02, 0.06), (0.06, 0.12), (0.12, 0.18), (0.18, 0.25), (0.25, 0.33)):
+        ring = (frequency > low) & (frequency < high)
+        # beyond a quarter of the sampling frequency the spline attenuates both to a tenth of their power
+        tolerance = 0.12 if high < 0.2 else 0.5
+        assert power[0][ring].sum() == pytest.approx(power[1][ring].sum(), rel=tolerance)
+    rms_slopes = [field.line_slope_rms(30.0) for field in fields]
+    assert rms_slopes[0] == pytest.approx(rms_slopes[1], rel=0.02)
+
+
+def test_large_craters_are_equal_on_a_coarser_grid() -> None:
+    """A crater with a radius of 150 samples, on a grid of every fourth sample: equal within 2 % of its depth."""
+    shape = (512, 512)
+    crater = np.array([[200.0, 260.0, 150.0, 24.0, 6.0, 2.4, 0.0, 0.1, -0.3, 0.8, *np.zeros(10), 0.3]])
+    height, log_albedo = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+    stamp_craters(height, log_albedo, 1.0, crater, 3.0)
+    ground = TerrainGround(np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32), 1.0)
+    add_craters(ground, crater)
+    # the B-spline of the coarser grid smooths the crest over a sample
+    assert np.sqrt(np.mean((ground.height - height) ** 2)) < 0.01 * 24.0
+    assert np.abs(ground.height - height).max() < 0.05 * 24.0
+    assert np.sqrt(np.mean((ground.log_albedo - log_albedo) ** 2)) < 0.01
 
 
 def test_crater_sizes_follow_the_power_law() -> None:
