@@ -8,7 +8,7 @@ from typing import Annotated, Any, get_args
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field, merge_parameters
-from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
+from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Outcrop, Playa, Ramp, Swell
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rasters import RealTerrain
 from marsyard.sim.terrain.rocks.field import RockParameters
@@ -66,6 +66,7 @@ class TerrainParameters(Parameters):
     ripples: Annotated[Dunes | None, Field(description="ripples, as small dunes")] = None
     swell: Annotated[Swell | None, Field(description="relief of a few waves about as long as the terrain")] = None
     ramp: Annotated[Ramp | None, Field(description="a slope of constant angle")] = None
+    outcrop: Annotated[Outcrop | None, Field(description="patches of bedrock")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
     source: Annotated[RealTerrain | None, Field(description="real terrain; the synthetic terrain surrounds it")] = None
     rocks: Annotated[RockParameters | None, Field(description="rocks on the ground")] = None
@@ -94,7 +95,7 @@ class TerrainParameters(Parameters):
 
 
 #: The landforms in the order in which they are added to the fractal ground.
-LANDFORMS = ("fans", "playa", "lava", "swell", "ramp", "gullies", "dunes", "ripples")
+LANDFORMS = ("fans", "playa", "lava", "swell", "ramp", "outcrop", "gullies", "dunes", "ripples")
 
 
 def _check_names(model: type[BaseModel], changes: Mapping[str, Any], prefix: str) -> None:

@@ -1,6 +1,7 @@
 """Landforms, each with its own parameters and random substream; all add to one grid of heights and albedos."""
 
 from marsyard.sim.terrain.landforms.ground import TerrainGround
+from marsyard.sim.terrain.landforms.outcrop import Outcrop
 from marsyard.sim.terrain.landforms.relief import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 
-__all__ = ["Dunes", "Fans", "Gullies", "Lava", "Playa", "Ramp", "Swell", "TerrainGround"]
+__all__ = ["Dunes", "Fans", "Gullies", "Lava", "Outcrop", "Playa", "Ramp", "Swell", "TerrainGround"]
