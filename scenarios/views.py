@@ -88,7 +88,7 @@ class SiteGround:
         """Return the photometry of this ground under a sun and the sky of the site's atmosphere."""
         reflectance = self.site.photometry
         air = self.site.environment
-        sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))))
+        sky = air.sky_fraction(float(np.arcsin(np.clip(sun.direction[2], -1.0, 1.0))), self.terrain.albedo)
         return Photometry(
             lunar_fraction=reflectance.lunar_fraction,
             surge_amplitude=reflectance.surge_amplitude,

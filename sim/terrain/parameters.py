@@ -8,7 +8,7 @@ from typing import Annotated, Any, get_args
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field, merge_parameters
-from marsyard.sim.terrain.landforms import Drifts, Dunes, Fans, Gullies, Lava, Playa, Ramp, Strata, Swell
+from marsyard.sim.terrain.landforms import Drifts, Dunes, Fans, Gullies, Lava, Outcrop, Playa, Ramp, Strata, Swell
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rasters import RealTerrain
 from marsyard.sim.terrain.rocks.field import RockParameters
@@ -67,6 +67,7 @@ class TerrainParameters(Parameters):
     swell: Annotated[Swell | None, Field(description="relief of a few waves about as long as the terrain")] = None
     ramp: Annotated[Ramp | None, Field(description="a slope of constant angle")] = None
     strata: Annotated[Strata | None, Field(description="layers with scarps")] = None
+    outcrop: Annotated[Outcrop | None, Field(description="patches of bedrock")] = None
     gullies: Annotated[Gullies | None, Field(description="steep-walled gullies")] = None
     drifts: Annotated[Drifts | None, Field(description="sand in the lee of relief and in craters")] = None
     source: Annotated[RealTerrain | None, Field(description="real terrain; the synthetic terrain surrounds it")] = None
@@ -96,7 +97,7 @@ class TerrainParameters(Parameters):
 
 
 #: The landforms in the order in which they are added to the fractal ground; drifts follow the craters.
-LANDFORMS = ("fans", "playa", "lava", "swell", "strata", "ramp", "gullies", "dunes", "ripples")
+LANDFORMS = ("fans", "playa", "lava", "swell", "strata", "ramp", "outcrop", "gullies", "dunes", "ripples")
 
 
 def _check_names(model: type[BaseModel], changes: Mapping[str, Any], prefix: str) -> None:

@@ -44,11 +44,11 @@ class Environment(Parameters):
         """
         return float(np.exp(-self._apply_delta_scaling()[0] / max(np.sin(sun_elevation_rad), MIN_SUN_SINE)))
 
-    def sky_fraction(self, sun_elevation_rad: float) -> float:
+    def sky_fraction(self, sun_elevation_rad: float, ground_albedo: float = 0.0) -> float:
         """Compute the diffuse irradiance on level ground divided by the direct irradiance on a plane facing the sun.
 
-        Delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over black ground, without light that the ground
-        reflects to the atmosphere. The value is also the radiance factor of a uniform sky with this irradiance.
+        Delta-Eddington approximation (Joseph, Wiscombe & Weinman 1976) over ground with an albedo, which reflects light
+        to the atmosphere. The value is also the radiance factor of a uniform sky with this irradiance.
         """
         tau, albedo, asymmetry = self._apply_delta_scaling()
         if tau == 0.0:
@@ -62,12 +62,15 @@ class Environment(Parameters):
         alpha = 0.75 * albedo * mu**2 * (1.0 + asymmetry * (1.0 - albedo)) / (1.0 - (k * mu) ** 2)
         beta = 0.75 * albedo * mu * (1.0 + 3.0 * asymmetry * (1.0 - albedo) * mu**2) / (1.0 - (k * mu) ** 2)
         # I = C1 e^-kt + C2 e^kt - alpha e^-t/mu, I1 = p (C1 e^-kt - C2 e^kt) - beta e^-t/mu; boundary conditions: no
-        # downward diffuse light at the top (I + 2/3 I1 = 0), no upward light from the ground (I - 2/3 I1 = 0)
+        # downward diffuse light at the top (I + 2/3 I1 = 0); upward light from ground with the albedo A:
+        # I - 2/3 I1 = A (I + 2/3 I1 + mu e^-t/mu)
         two_thirds = 2.0 / 3.0
         direct = np.exp(-tau / mu)
         plus, minus = 1.0 + two_thirds * p, 1.0 - two_thirds * p
-        system = np.array([[plus, minus], [minus * np.exp(-k * tau), plus * np.exp(k * tau)]])
-        c1, c2 = np.linalg.solve(system, [alpha + two_thirds * beta, (alpha - two_thirds * beta) * direct])
+        a = ground_albedo
+        at_ground = [(minus - a * plus) * np.exp(-k * tau), (plus - a * minus) * np.exp(k * tau)]
+        source = alpha - two_thirds * beta - a * (alpha + two_thirds * beta - mu)
+        c1, c2 = np.linalg.solve(np.array([[plus, minus], at_ground]), [alpha + two_thirds * beta, source * direct])
         i0 = c1 * np.exp(-k * tau) + c2 * np.exp(k * tau) - alpha * direct
         i1 = p * (c1 * np.exp(-k * tau) - c2 * np.exp(k * tau)) - beta * direct
         return float(max(i0 + two_thirds * i1, 0.0) / direct)

@@ -131,7 +131,8 @@ def test_ground_without_rocks_has_no_objects() -> None:
 
 def test_photometry_has_the_sky_radiance_of_the_environment(ground: SiteGround) -> None:
     photometry = ground.photometry(SUN)
-    assert photometry.sky_fraction == photometry.sky_radiance == ground.site.environment.sky_fraction(np.radians(35.0))
+    sky_fraction = ground.site.environment.sky_fraction(np.radians(35.0), ground.terrain.albedo)
+    assert photometry.sky_fraction == photometry.sky_radiance == sky_fraction
     assert photometry.surrounding_albedo == ground.terrain.albedo
 
 

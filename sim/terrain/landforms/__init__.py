@@ -2,6 +2,8 @@
 
 from marsyard.sim.terrain.landforms.deposits import Drifts, Strata
 from marsyard.sim.terrain.landforms.ground import TerrainGround
+from marsyard.sim.terrain.landforms.outcrop import Outcrop
 from marsyard.sim.terrain.landforms.relief import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell
 
-__all__ = ["Drifts", "Dunes", "Fans", "Gullies", "Lava", "Playa", "Ramp", "Strata", "Swell", "TerrainGround"]
+__all__ = ["Drifts", "Dunes", "Fans", "Gullies", "Lava", "Outcrop", "Playa", "Ramp", "Strata", "Swell"]
+__all__ += ["TerrainGround"]

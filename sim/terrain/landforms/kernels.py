@@ -358,6 +358,47 @@ def add_cracks(
 
 
 @njit(cache=True)
+def add_slabs(
+    height: Grid, log_albedo: Grid, spacing: float, points: Array, slabs: Array, cell: float, joint: float
+) -> None:
+    """Add tilted slabs: Voronoi cells with one point in each square of a periodic grid, rounded towards the joints.
+
+    - points: position of each point within its square, from 0 to 1, shape (count, count, 2)
+    - slabs: height at the point, slopes along x and y, and logarithm of albedo of each cell, shape (count, count, 4)
+    - cell: side of a square, metres
+    - joint: distance from the border over which a slab rises from the ground, metres
+    """
+    count = points.shape[0]
+    for i in range(height.shape[0]):
+        y = i * spacing / cell
+        row = int(y)
+        for j in range(height.shape[0]):
+            x = j * spacing / cell
+            column = int(x)
+            nearest2, nearest_x, nearest_y, nearest_row, nearest_column = 1e9, 0.0, 0.0, 0, 0
+            second2, second_x, second_y = 1e9, 0.0, 0.0
+            for di in range(-1, 2):
+                for dj in range(-1, 2):
+                    n, m = (row + di) % count, (column + dj) % count
+                    dx, dy = column + dj + points[n, m, 0] - x, row + di + points[n, m, 1] - y
+                    distance2 = dx * dx + dy * dy
+                    if distance2 < nearest2:
+                        second2, second_x, second_y = nearest2, nearest_x, nearest_y
+                        nearest2, nearest_x, nearest_y, nearest_row, nearest_column = distance2, dx, dy, n, m
+                    elif distance2 < second2:
+                        second2, second_x, second_y = distance2, dx, dy
+            slab_height, slope_x, slope_y, contrast = slabs[nearest_row, nearest_column]
+            if slab_height > 0.0:
+                separation = math.sqrt((second_x - nearest_x) ** 2 + (second_y - nearest_y) ** 2)
+                border = 0.5 * (second2 - nearest2) / max(separation, 1e-6) * cell
+                t = min(border / joint, 1.0)
+                rise = t * t * (3.0 - 2.0 * t)
+                top = slab_height - cell * (slope_x * nearest_x + slope_y * nearest_y)
+                height[i, j] += rise * max(top, 0.0)
+                log_albedo[i, j] += rise * contrast
+
+
+@njit(cache=True)
 def cut_channels(depths: Grid, spacing: float, discs: Array, sharpness: float) -> None:
     """Cut channels: discs with rows (x, y, half width w, depth) and the profile ``depth (1 - (r / w)**sharpness)``.
 

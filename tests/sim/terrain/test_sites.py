@@ -140,14 +140,16 @@ def test_sky_light_increases_with_dust() -> None:
     assert fractions[0] == 0.0
     assert all(less < more for less, more in pairwise(fractions))
     assert Environment(optical_depth=0.0).direct_fraction(sun_elevation) == 1.0
-    # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over black ground
-    # the transmitted fraction is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 tau) (Shettle & Weinman 1970).
+    # Without absorption and with isotropic scattering Eddington's approximation has a closed form. Over ground with the
+    # albedo A the fraction of sunlight that arrives is (2 + 3 mu + (2 - 3 mu) exp(-tau / mu)) / (4 + 3 (1 - A) tau)
+    # (Shettle & Weinman 1970).
     conservative = Environment(optical_depth=1.0, single_scattering_albedo=0.9999999, asymmetry=0.0)
     for mu in (1.0, 0.5):
         sun = np.arcsin(mu)
-        total = conservative.direct_fraction(sun) * (mu + conservative.sky_fraction(sun)) / mu
-        expected = (2 + 3 * mu + (2 - 3 * mu) * np.exp(-1.0 / mu)) / (4 + 3)
-        assert total == pytest.approx(expected, abs=1e-4)
+        for ground_albedo in (0.0, 0.3):
+            total = conservative.direct_fraction(sun) * (mu + conservative.sky_fraction(sun, ground_albedo)) / mu
+            expected = (2 + 3 * mu + (2 - 3 * mu) * np.exp(-1.0 / mu)) / (4 + 3 * (1.0 - ground_albedo))
+            assert total == pytest.approx(expected, abs=1e-4)
 
 
 def test_terrain_with_landforms_is_read_from_a_file() -> None:
