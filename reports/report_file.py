@@ -54,8 +54,8 @@ class CampaignReport:
     - worst_cases: numbers of the cases with the largest errors, the largest first
     - sections: data of each further section of the page, by the section's anchor
     - showcases: cases with stored products
-    - robustness: for each requirement that the rate of the cases meets, the smallest change of each kind to FAIL, with the
-      properties `name`, `pass_text` and `fail_text`
+    - robustness: for each requirement that the rate of the cases meets, the smallest change of each kind to FAIL,
+      with the properties `name`, `pass_text` and `fail_text`
     """
 
     schema: Schema
