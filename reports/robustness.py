@@ -162,8 +162,10 @@ class Robustness:
     def _describe(self, value: float, change: float, addition: str = "") -> str:
         if self.kind is Kind.DIVERGENCE:
             return f"any change of {self.name} up to a divergence of {number(value)} nat"
-        unknown = "the declared one" if math.isnan(self.assumed) else self.format_value(self.assumed, 0.0)
-        return f"{self.name} {self.format_value(value, change)} ({unknown} assumed{addition})"
+        assumed = "" if math.isnan(self.assumed) else f"{self.format_value(self.assumed, 0.0)} assumed"
+        return f"{self.name} {self.format_value(value, change)} ({f'{assumed}{addition}'.removeprefix('; ')})".removesuffix(
+            " ()"
+        )
 
 
 @dataclass(frozen=True)
@@ -388,7 +390,9 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
         if item.fail_text and item is not ball:
             nearest.setdefault(item.parameter, item)
     changes = "; ".join(item.fail_text for item in [*nearest.values()][:max_changes])
-    word = "Met by the rate" if verdict.decide_by == ESTIMATE else "PASS holds"
+    # a calibration excludes PASS
+    word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"
+    word = "Met by the rate" if verdict.decide_by == ESTIMATE else word
     reach = f"{word} ({format_fraction(verdict.confidence)} confidence, one change at a time) {', '.join(ranges)}."
     nearest_text = f"Nearest changes to FAIL: {changes or 'unknown, because too few cases fail'}."
     return f"{reach if ranges else 'These cases do not show PASS.'} {nearest_text}"

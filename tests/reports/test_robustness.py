@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -284,6 +285,13 @@ def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
     nearest = wider if wider.change < up.change else up
     assert f"Nearest changes to FAIL: {nearest.fail_text}" in text
     assert " assumed; PASS up to " in nearest.fail_text
+
+
+def test_withheld_pass_is_not_stated(tmp_path: Path) -> None:
+    """The verdict of a calibration is never PASS: the sentence does not say that PASS holds."""
+    verdicts, _, records = evaluate(tmp_path, 400, 0.95, lambda first, second, kind: first > 9.0)
+    withheld = replace(verdicts[0], status=Status.INSUFFICIENT, withheld_status=Status.PASS)
+    assert robustness_text(withheld, records).startswith("PASS would hold for another kind of evidence (90 % ")
 
 
 def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:
