@@ -157,15 +157,14 @@ class Robustness:
         if self.outcome is not Outcome.FOUND or math.isnan(self.upper):
             return ""
         passes = "not shown" if math.isnan(self.lower) else f"up to {self.format_value(self.passes_at, self.lower)}"
-        return self._describe(self.fails_at, self.change, f"; PASS {passes}")
+        return self._describe(self.fails_at, self.change, f"PASS {passes}")
 
     def _describe(self, value: float, change: float, addition: str = "") -> str:
         if self.kind is Kind.DIVERGENCE:
             return f"any change of {self.name} up to a divergence of {number(value)} nat"
         assumed = "" if math.isnan(self.assumed) else f"{self.format_value(self.assumed, 0.0)} assumed"
-        return f"{self.name} {self.format_value(value, change)} ({f'{assumed}{addition}'.removeprefix('; ')})".removesuffix(
-            " ()"
-        )
+        notes = "; ".join(filter(None, (assumed, addition)))
+        return f"{self.name} {self.format_value(value, change)}{f' ({notes})' if notes else ''}"
 
 
 @dataclass(frozen=True)
