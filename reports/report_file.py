@@ -56,8 +56,8 @@ class CampaignReport:
     - validity: cases outside of the conditions in which the simulation was checked, and missed checks
     - sections: data of each further section of the page, by the section's anchor
     - showcases: cases with stored products
-    - robustness: for each requirement that is met, the smallest change of each kind that turns PASS into FAIL, with the
-      properties `name`, `pass_text` and `fail_text`
+    - robustness: for each requirement that the rate of the cases meets, the smallest change of each kind to FAIL,
+      with the properties `name`, `pass_text` and `fail_text`
     """
 
     schema: Schema

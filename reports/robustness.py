@@ -157,13 +157,14 @@ class Robustness:
         if self.outcome is not Outcome.FOUND or math.isnan(self.upper):
             return ""
         passes = "not shown" if math.isnan(self.lower) else f"up to {self.format_value(self.passes_at, self.lower)}"
-        return self._describe(self.fails_at, self.change, f"; PASS {passes}")
+        return self._describe(self.fails_at, self.change, f"PASS {passes}")
 
     def _describe(self, value: float, change: float, addition: str = "") -> str:
         if self.kind is Kind.DIVERGENCE:
             return f"any change of {self.name} up to a divergence of {number(value)} nat"
-        unknown = "the declared one" if math.isnan(self.assumed) else self.format_value(self.assumed, 0.0)
-        return f"{self.name} {self.format_value(value, change)} ({unknown} assumed{addition})"
+        assumed = "" if math.isnan(self.assumed) else f"{self.format_value(self.assumed, 0.0)} assumed"
+        notes = "; ".join(filter(None, (assumed, addition)))
+        return f"{self.name} {self.format_value(value, change)}{f' ({notes})' if notes else ''}"
 
 
 @dataclass(frozen=True)
@@ -186,11 +187,11 @@ class _Change:
 def evaluate_robustness(
     run: StoredRun, verdicts: Sequence[Verdict], sampling: SamplingDesign
 ) -> tuple[Robustness, ...]:
-    """Compute the robustness of each requirement that is met, also if its PASS is withheld for a calibration.
+    """Compute the robustness of each requirement that is met by the rate of the cases (`select_met`).
 
     Empty for cases that are not independent random draws. Above 50,000 cases, the first 20,000 are used.
     """
-    met = [item for item in verdicts if (item.withheld_status or item.status).is_met]
+    met = select_met(verdicts)
     frame = sampling.exclude_nominal_case(run.frame)
     if not met or not sampling.independent or "case" not in frame:
         return ()
@@ -213,11 +214,20 @@ def evaluate_robustness(
     return tuple(sorted(records, key=lambda item: (order[item.requirement], sort_key(item))))
 
 
+def select_met(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """Select the requirements that the rate of the cases meets, also if the cases are too few or exclude PASS.
+
+    Campaigns that are not finished have no bounds and are omitted.
+    """
+    return [item for item in verdicts if item.estimate >= item.probability and not math.isnan(item.lower)]
+
+
 def sort_key(item: Robustness) -> tuple[int, float]:
-    """Sort values of parameters, then changes to FAIL by their size, then the others by that for which PASS holds."""
-    if item.outcome is Outcome.FOUND:
-        return 0 if item.kind is Kind.VALUE else 1 if item.fail_text else 2, item.change
-    return 3, math.inf if math.isnan(item.lower) else item.lower
+    """Sort changes of parameters that show FAIL first, by their size, then the others by that for which PASS holds."""
+    if item.fail_text or item.kind is Kind.VALUE:
+        return 0 if item.kind is Kind.VALUE else 1, item.change
+    sizes = (size for size in (item.lower, item.change, math.inf) if not math.isnan(size))
+    return 2, next(sizes)
 
 
 def read_campaign(run: StoredRun) -> Campaign | None:
@@ -352,7 +362,7 @@ def _divergence(verdict: Verdict) -> Robustness:
     permitted = 1.0 - verdict.probability
     radii = [binary_divergence(permitted, 1.0 - rate) for rate in (verdict.estimate, verdict.lower, verdict.upper)]
     change, lower, upper = (math.sqrt(2.0 * radius) if math.isfinite(radius) else math.nan for radius in radii)
-    lower = change if verdict.decide_by == ESTIMATE else lower
+    lower = change if verdict.decide_by == ESTIMATE else lower or math.nan  # 0 without PASS
     crossing = Crossing(change, lower, upper, math.nan, float(verdict.n))
     outcome = Outcome.of(crossing, is_complete=False)
     return Robustness(
@@ -372,14 +382,16 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     ball = next(item for item in own if item.kind is Kind.DIVERGENCE)
     ranges = [f"for a shift of any mean by {number(min(shifts))} standard deviations"] if shifts else []
     ranges += [f"for any standard deviation up to + {percent(min(factors))}"] if factors else []
-    ranges.append(f"for any change of all dispersions up to a divergence of {number(ball.passes_at)} nat")
+    if ball.lower > 0.0:
+        ranges.append(f"for any change of all dispersions up to a divergence of {number(ball.passes_at)} nat")
     nearest: dict[str, Robustness] = {}
     for item in sorted(own, key=sort_key):
         if item.fail_text and item is not ball:
             nearest.setdefault(item.parameter, item)
     changes = "; ".join(item.fail_text for item in [*nearest.values()][:max_changes])
-    word = "Met by the rate" if verdict.decide_by == ESTIMATE else "PASS holds"
-    return (
-        f"{word} ({format_fraction(verdict.confidence)} confidence, one change at a time) {', '.join(ranges)}. "
-        f"Nearest changes to FAIL: {changes or 'unknown, because too few cases fail'}."
-    )
+    # a calibration excludes PASS
+    word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"
+    word = "Met by the rate" if verdict.decide_by == ESTIMATE else word
+    reach = f"{word} ({format_fraction(verdict.confidence)} confidence, one change at a time) {', '.join(ranges)}."
+    nearest_text = f"Nearest changes to FAIL: {changes or 'unknown, because too few cases fail'}."
+    return f"{reach if ranges else 'These cases do not show PASS.'} {nearest_text}"

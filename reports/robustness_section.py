@@ -19,6 +19,7 @@ from marsyard.reports.wording import NOTHING, count, note_text, number, percent
 
 #: Maximum number of rows of the table of a requirement, and of parameters in the figure.
 _MAX_ROWS, _MAX_PARAMETERS = 12, 16
+_DIRECTIONS = {Kind.MEAN_UP: ", up", Kind.MEAN_DOWN: ", down", Kind.WIDER: ", up", Kind.NARROWER: ", down"}
 _OUTCOMES: Mapping[Outcome, str] = {Outcome.FOUND: "", Outcome.REFUSED: "unknown beyond", Outcome.NONE: "none up to"}
 
 
@@ -42,7 +43,7 @@ def change_grid(records: Sequence[Robustness]) -> Grid:
     head = ["Quantity", "Assumed", "PASS up to", "FAIL from", "Change (spreads)", "Interval (spreads)", "Cases"]
     rows = [
         [
-            item.name,
+            f"{item.name}{_DIRECTIONS.get(item.kind, '')}",
             NOTHING if item.kind is Kind.DIVERGENCE else item.format_value(item.assumed, 0.0),
             NOTHING if math.isnan(item.lower) else item.format_value(item.passes_at, item.lower),
             item.format_value(item.fails_at, item.change) if item.outcome is Outcome.FOUND else _OUTCOMES[item.outcome],

@@ -22,7 +22,7 @@ from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVari
 from marsyard.reports import rates
 from marsyard.reports.decision import collect_evidence
 from marsyard.reports.requirement_cases import compute_margins
-from marsyard.reports.robustness import Kind, Outcome, Robustness
+from marsyard.reports.robustness import Kind, Outcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
@@ -134,9 +134,9 @@ def _groups(frame: pd.DataFrame, member: Bool[np.ndarray, " n"]) -> Int[np.ndarr
 def evaluate_steps(
     run: StoredRun, studies: Sequence[RobustStudy], verdicts: Sequence[Verdict]
 ) -> tuple[Robustness, ...]:
-    """Find the change to FAIL of each requirement that is met, for each parameter that a study changes in steps."""
+    """Find the change to FAIL of each requirement of `select_met`, for each parameter that a study changes in steps."""
     columns = {str(item.get("id")): item.get("margin") for item in run.requirements}
-    met = [item for item in verdicts if (item.withheld_status or item.status).is_met]
+    met = select_met(verdicts)
     records = []
     for study in studies:
         for path in dict.fromkeys(variant.parameter for variant, _ in study.variants if variant.parameter):

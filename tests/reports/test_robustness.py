@@ -8,6 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -226,13 +227,20 @@ def test_change_is_refused_below_30_effective_cases(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("failures", [0, 3, 8, 15, 25])
 def test_pass_at_no_change_is_that_of_the_verdict(tmp_path: Path, failures: int) -> None:
-    verdicts, records, _ = evaluate(
+    verdicts, records, all_ = evaluate(
         tmp_path, 300, 0.95, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures
     )
-    if verdicts[0].status is Status.PASS:
-        assert all(item.lower > 0.0 for item in records.values())
-    else:
+    assert verdicts[0].status is (
+        Status.PASS if failures <= 8 else Status.INSUFFICIENT if failures <= 15 else Status.FAIL
+    )
+    if verdicts[0].status is Status.FAIL:
         assert not records
+    else:
+        is_pass = verdicts[0].status is Status.PASS
+        assert {item.lower > 0.0 for item in records.values()} == {is_pass}
+        assert is_pass or "These cases do not show PASS. Nearest changes to FAIL: " in robustness_text(
+            verdicts[0], all_
+        )
 
 
 @pytest.mark.parametrize("failures", [0, 2, 6])
@@ -277,6 +285,13 @@ def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
     nearest = wider if wider.change < up.change else up
     assert f"Nearest changes to FAIL: {nearest.fail_text}" in text
     assert " assumed; PASS up to " in nearest.fail_text
+
+
+def test_withheld_pass_is_not_stated(tmp_path: Path) -> None:
+    """The verdict of a calibration is never PASS: the sentence does not say that PASS holds."""
+    verdicts, _, records = evaluate(tmp_path, 400, 0.95, lambda first, second, kind: first > 9.0)
+    withheld = replace(verdicts[0], status=Status.INSUFFICIENT, withheld_status=Status.PASS)
+    assert robustness_text(withheld, records).startswith("PASS would hold for another kind of evidence (90 % ")
 
 
 def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ The limit state fails if beta - u < 0 for a standard normal u: the rate is Phi(-
 import json
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ from marsyard.reports.robustness import Kind, Outcome
 from marsyard.reports.variants import RobustStudy, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
+from marsyard.sim.terrain import Site
 from tests.campaigns.fake_campaign import RecordingWatch, read_case_rows
 from tests.campaigns.studies.limit_state import CAMPAIGN
 
@@ -285,9 +286,23 @@ def test_variants_of_the_included_systems_are_valid() -> None:
         assert {"residuals", "detector"} & kinds[scenario]
 
 
-def test_photometry_of_a_variant_reaches_the_site() -> None:
-    campaign = load_campaign("dimes-gusev")
-    parameters: Any = campaign.with_values({"photometry.lunar_fraction": 0.0, "photometry.surge_amplitude": 0.0})
-    photometry = parameters.preset.photometry
-    assert (photometry.lunar_fraction, photometry.surge_amplitude) == (0.0, 0.0)
-    assert photometry.rock_albedo == campaign.base_parameters().preset.photometry.rock_albedo  # type: ignore[attr-defined]
+@pytest.mark.parametrize(
+    ("campaign_name", "table", "find_site"),
+    [
+        ("dimes-gusev", "photometry", lambda parameters: parameters.preset),
+        ("hda-mars", "photometry", lambda parameters: parameters.preset),
+        ("loc-jezero", "photometry", lambda parameters: parameters.preset),
+        ("vtt-montecarlo", "world.photometry", lambda parameters: parameters.world.lit_site),
+    ],
+)
+def test_photometry_of_a_variant_reaches_the_site(
+    campaign_name: str, table: str, find_site: Callable[[Any], Site]
+) -> None:
+    """The law changes, the albedo of rocks and the dust of the case do not."""
+    campaign = load_campaign(campaign_name)
+    own = find_site(campaign.base_parameters())
+    changed = find_site(campaign.with_values({f"{table}.lunar_fraction": 0.0, f"{table}.surge_amplitude": 0.0}))
+    assert (changed.photometry.lunar_fraction, changed.photometry.surge_amplitude) == (0.0, 0.0)
+    assert own.photometry.lunar_fraction > 0.0
+    assert changed.photometry.rock_albedo == own.photometry.rock_albedo
+    assert changed.environment == own.environment
