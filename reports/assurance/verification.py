@@ -28,9 +28,8 @@ from marsyard.reports.assurance.package import (
     render_case,
 )
 from marsyard.reports.assurance.signature import check_signature, signature_path
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign import build_report, create_subject
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.report_file import REPORT_JSON
 from marsyard.reports.stored import table
 from marsyard.reports.validation_rows import VALIDATION_FILE
 from marsyard.reports.verdicts import Status, Verdict
@@ -141,14 +140,12 @@ def _verify_run(directory: Path, run: AssuredRun) -> Iterator[str]:
             yield f"{run.folder}/report.json: the requirement {name} is missing, or not in campaign.json"
         elif difference := _find_difference(stored[name], computed[name]):
             yield f"{run.folder}/report.json: {name} does not follow from the rows: {difference}"
-    with tempfile.TemporaryDirectory(prefix="marsyard-") as name:
-        write_evaluation(evaluation, Path(name))
-        rewritten = json.loads((Path(name) / REPORT_JSON).read_text(encoding="utf-8"))
+    computed_report = build_report(evaluation, create_subject(evaluation), ()).to_json()
     compared = (
         _COMPARED if (directory / "../.." / VALIDATION).read_bytes() == VALIDATION_FILE.read_bytes() else _FROM_ROWS
     )
     for key in compared:
-        if not _is_equal(run.data.get(key), rewritten.get(key)):
+        if not _is_equal(run.data.get(key), computed_report.get(key)):
             yield f"{run.folder}/report.json: {key} does not follow from the rows"
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.assurance.case import Kind, State, number_elements
+from marsyard.reports.assurance.case import Case, Kind, State, number_elements
 from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
@@ -21,13 +21,18 @@ from tests.reports.assurance.stored_run import write_stored_run
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a package of one campaign of 240 cases."""
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Case]:
+    """Write a package of one campaign of 240 cases; return its folder and its case."""
     folder = tmp_path_factory.mktemp("assured")
     run = write_stored_run(folder / "run")
     (folder / "package").mkdir()
-    write_package([run], folder / "package")
-    return folder / "package"
+    return folder / "package", write_package([run], folder / "package")
+
+
+@pytest.fixture
+def stored(written: tuple[Path, Case]) -> Path:
+    """Return the folder of the package, which must not be changed."""
+    return written[0]
 
 
 @pytest.fixture
@@ -177,9 +182,8 @@ def test_signature_shows_who_wrote_the_hashes(package: Path, tmp_path: Path) -> 
     assert any(problem.startswith("manifest.json.sig: ") for problem in verify_package(package).problems)
 
 
-def test_case_has_all_kinds_of_defeaters(tmp_path: Path) -> None:
-    (tmp_path / "package").mkdir()
-    case = write_package([write_stored_run(tmp_path / "run")], tmp_path / "package")
+def test_case_has_all_kinds_of_defeaters(written: tuple[Path, Case]) -> None:
+    folder, case = written
     texts = [item.text for _, item, _ in case.defeaters]
     beginnings = (
         "The required rate or bound is assumed", "Exploration: the seed was chosen freely", "Missed check (validation)",
@@ -195,7 +199,7 @@ def test_case_has_all_kinds_of_defeaters(tmp_path: Path) -> None:
     assert {link["target"] for link in content["links"] if link["type"] == "supportedBy"} <= set(names)
     assert len([link for link in content["links"] if link["type"] == "challenges"]) == len(case.defeaters)
     for _, item, _ in number_elements(case.root):
-        assert not item.evidence or (tmp_path / "package" / item.evidence).is_file()
+        assert not item.evidence or (folder / item.evidence).is_file()
 
 
 def test_failed_requirement_refutes_the_claim(tmp_path: Path) -> None:
