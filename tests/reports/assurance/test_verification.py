@@ -6,14 +6,15 @@ import sqlite3
 import subprocess
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.assurance.case import Case, Kind, State, number_elements
-from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, write_package
+from marsyard.reports.assurance.case import Case, Kind, State, build_case, number_elements
+from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
 from tests.command import marsyard
@@ -280,3 +281,33 @@ def test_package_of_another_version_is_checked_without_its_page(package: Path) -
     result = verify_package(package)
     assert result.problems == ()
     assert any("checked by their hashes only" in note for note in result.notes)
+
+
+def test_robustness_of_the_report_supports_or_challenges_a_verdict(stored: Path) -> None:
+    run = read_run_evidence(stored, RUN)
+    (verdict,) = run.report.verdicts
+    assert verdict.status.is_met
+    items = [
+        {"requirement": "DIMES-VEL", "parameter": "imu.scale", "pass_text": "131 ppm of gyro scale (100 assumed)"},
+        {"requirement": "DIMES-VEL", "parameter": "wind", "pass_text": ""},
+        {"requirement": "OTHER", "parameter": "haze", "pass_text": "haze 0.8"},
+    ]
+    texts = [
+        [item.text for _, item, _ in number_elements(build_case([case_run], stored).root)]
+        for case_run in (run, replace(run, data={"robustness": items}), replace(run, data={"robustness": []}))
+    ]
+    not_computed = "Robustness against other dispersions: not computed."
+    assert "PASS holds up to: 131 ppm of gyro scale (100 assumed)" in texts[1]
+    assert "The cases do not show that PASS holds under a change of: wind." in texts[1]
+    assert not_computed not in texts[1]
+    assert not_computed in texts[2]
+
+
+def test_computing_time_and_observed_rate_are_defeaters(stored: Path) -> None:
+    run = read_run_evidence(stored, RUN)
+    (verdict,) = run.report.verdicts
+    timed = replace(verdict, metric="estimation_time_s", scale=60.0, decide_by="estimate")
+    root = build_case([replace(run, report=replace(run.report, verdicts=(timed,)))], stored).root
+    texts = [item.text for _, item, _ in number_elements(root)]
+    assert any("assumed to be 60 times slower than the host" in text for text in texts)
+    assert "Evaluated by observed rate, not at a confidence." in texts
