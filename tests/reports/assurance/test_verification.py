@@ -110,7 +110,7 @@ def change_requirement(folder: Path) -> None:
 def test_package_verifies(package: Path) -> None:
     result = verify_package(package)
     assert result.problems == ()
-    assert any("case and page, computed again" in note for note in result.notes)
+    assert any("claims and page, computed again" in note for note in result.notes)
     # the verification does not write into the package
     assert hash_files(package) == json.loads((package / MANIFEST).read_text())["files"]
 
@@ -277,10 +277,12 @@ def test_package_of_another_layout_is_refused(package: Path) -> None:
 
 def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:
     manifest = json.loads((package / MANIFEST).read_text())
-    (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9"}))
+    (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9", "program": "0"}))
     result = verify_package(package)
     assert result.problems == ()
-    assert any("checked by their hashes only" in note for note in result.notes)
+    assert any(
+        "claims and page by their hashes only; written by marsyard 9.9 (0), this is" in note for note in result.notes
+    )
 
 
 def test_robustness_of_the_report_supports_or_challenges_a_verdict(stored: Path) -> None:
