@@ -74,17 +74,8 @@ def write_report(directory: Path, requirements: Sequence[Mapping[str, Any]] | No
 def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     """Write the report of an evaluated campaign into the folder `out`; None for the campaign's folder."""
     run, verdicts, overall_verdict = evaluation.run, evaluation.verdicts, evaluation.overall_verdict
-    directory = run.directory if out is None else out
-    # statistics use only random cases
-    exclude_nominal = evaluation.sampling.exclude_nominal_case
-    random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
-    is_study = bool(run.recorded("study"))
-    # the cases of a study are not a random sample; statistics of their errors would be meaningless
-    metric = None if is_study else primary_metric(random_run.frame, run.requirements)
-    metric_verdicts = [verdict for verdict in verdicts if verdict.metric == metric and math.isfinite(verdict.bound)]
-    bound = metric_verdicts[0].bound / metric_verdicts[0].scale if metric_verdicts else None
-    subject = Subject(random_run, metric, bound)
-    makers = STUDY_SECTIONS if is_study else section_makers()
+    directory, subject = run.directory if out is None else out, create_subject(evaluation)
+    makers = STUDY_SECTIONS if run.recorded("study") else section_makers()
     robustness = robustness_section(evaluation.robustness, evaluation.variants)
     made_sections = [robustness, *(maker(subject) for maker in makers)]
     extra_sections = [section for section in made_sections if section is not None]
@@ -107,6 +98,16 @@ def write_evaluation(evaluation: Evaluation, out: Path | None = None) -> Path:
     with suppress(StoreError, RuntimeError):  # without a key or a home folder, the dashboard writes the report again
         sign_report(directory, run.directory)
     return page_file
+
+
+def create_subject(evaluation: Evaluation) -> Subject:
+    """Create the subject of a report: the random cases of a campaign, and the page's metric with its bound."""
+    run, exclude_nominal = evaluation.run, evaluation.sampling.exclude_nominal_case
+    random_run = replace(run, frame=exclude_nominal(run.frame), all_cases=exclude_nominal(run.all_cases))
+    # the cases of a study are not a random sample; statistics of their errors would be meaningless
+    metric = None if run.recorded("study") else primary_metric(random_run.frame, run.requirements)
+    bounds = (item.bound / item.scale for item in evaluation.verdicts if item.metric == metric)
+    return Subject(random_run, metric, next((bound for bound in bounds if math.isfinite(bound)), None))
 
 
 def section_makers() -> list[SectionMaker]:

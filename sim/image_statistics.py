@@ -164,7 +164,7 @@ def compute_pair_statistics(
     image, other = images = tuple(_equalise(_reduce(item, FEATURE_SIDE)) for item in (first, second))
     matched = _match(cv2.SIFT.create(6000, contrastThreshold=0.008), cv2.NORM_L2, *images)
     homography, inliers = _fit_homography(matched, 2.5)
-    if homography is None:
+    if homography is None or inliers is None:
         return None
     in_overlap = _is_inside(_warp(matched.features, homography), other).sum()
     corners, other_corners = (
@@ -209,7 +209,8 @@ def compute_map_statistics(
         return None
     strongest = strength >= np.quantile(strength, 1.0 - _STRONGEST)
     valid = float((distance < _MAP_TOLERANCE_PX).mean())
-    return MapStatistics(*yields, float(np.median(largest)), float(np.median(largest[strongest])), valid)
+    sift, orb = yields
+    return MapStatistics(sift, orb, float(np.median(largest)), float(np.median(largest[strongest])), valid)
 
 
 def _search_templates(

@@ -6,6 +6,7 @@ The limits are ranges around the values of the images from Mars; each row states
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ from jaxtyping import Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, measure_within
 from benchmarks.validation.records import Check, Measure
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.image_statistics import BLOCK, GroundStatistics, compute_ground_statistics
+from marsyard.sim.terrain import sites
 from marsyard.site_images import ImageRequest, RenderedImage, render_images, truth_layers
 
 #: Side of the crops of ground, pixels, and angles of their upper edge below the horizon, degrees. With 384 pixels of
@@ -158,4 +161,44 @@ def compare_ground_images(quick: bool) -> Iterator[Measure]:
         yield from _compare(crops, f"{site} from 10 m", limits, FLOWN_HELICOPTER)
 
 
-CHECKS = (Check("flight-ground", "Images from Mars", compare_ground_images),)
+def _conditions(rows: str, name: str, data: str, camera: str, sun_deg: float) -> Conditions:
+    """Conditions of rows on the ground of a site."""
+    parameters = sites()[name]
+    slope, depth = parameters.terrain("ground").rms_slope_deg, parameters.environment.optical_depth
+    sun = (sun_deg, sun_deg)
+    return Conditions(
+        rows,
+        ("vtt", "hda"),
+        data,
+        site=(name,),
+        camera=(camera,),
+        sun_elevation_deg=sun,
+        slope_deg=(slope, slope),
+        optical_depth=(depth, depth),
+    )
+
+
+CHECKS = (
+    Check(
+        "flight-ground",
+        "Images from Mars",
+        compare_ground_images,
+        conditions=(
+            *(
+                condition
+                for name, (_, sun_deg) in MAST_SUNS_DEG.items()
+                for condition in (
+                    _conditions(f"*, mast images over {name}*", name, "mast-images", "mer-navcam", sun_deg),
+                    _conditions(f"sky over ground*, {name}*", name, "sky-images", "mer-navcam", sun_deg),
+                    _conditions(f"*shadow*, {name}*", name, "hazard-images", "mer-hazcam", HAZARD_SUN_DEG[1]),
+                )
+            ),
+            *(
+                replace(
+                    _conditions(f"*, {name} from 10 m*", name, "helicopter-images", "xc-55", 35.0), range_m=(10.0, 10.0)
+                )
+                for name in ("heli-hazardous", "gusev")
+            ),
+        ),
+    ),
+)

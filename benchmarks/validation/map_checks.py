@@ -14,9 +14,11 @@ from jaxtyping import Float, Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, copy_image
 from benchmarks.validation.records import Check, Measure
+from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.localisation.instruments import true_camera
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisedDescent
+from marsyard.scenarios.localisation.sites import localisation_site
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.image_statistics import MapStatistics, compute_map_statistics
 from marsyard.sim.streams import Streams
@@ -122,4 +124,21 @@ def compare_maps(quick: bool) -> Iterator[Measure]:
         yield Measure(f"images that are not found, {where}", lost, "", most_lost, how)
 
 
-CHECKS = (Check("flight-map", "Images from Mars", compare_maps),)
+def _conditions(name: str) -> Conditions:
+    """Conditions of the descents to a site."""
+    site, sun = localisation_site(name), (LANDING_SUN_DEG[1], LANDING_SUN_DEG[1])
+    slope, depth = site.terrain("descent").rms_slope_deg, site.environment.optical_depth
+    return Conditions(
+        f"*descent on map, {name}*",
+        ("localisation",),
+        "lcam-frames",
+        site=(name,),
+        camera=("lander vision camera",),
+        sun_elevation_deg=sun,
+        slope_deg=(slope, slope),
+        optical_depth=(depth, depth),
+        range_m=(2300.0, 4100.0),
+    )
+
+
+CHECKS = (Check("flight-map", "Images from Mars", compare_maps, conditions=tuple(map(_conditions, SITES))),)

@@ -50,11 +50,13 @@ def _write(runs: list[Path], out: Path, key: Path | None) -> None:
     from marsyard.campaigns.errors import StoreError, report_write_errors
     from marsyard.campaigns.store.temporary_files import create_folder
     from marsyard.reports.assurance.package import MANIFEST, PAGE, write_package
-    from marsyard.reports.assurance.signature import sign_file
+    from marsyard.reports.assurance.signature import check_key, sign_file
     from marsyard.reports.wording import count
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"{out} is not an empty folder; choose another folder with --out")
+    if key is not None:
+        check_key(key)
     with report_write_errors(out), create_folder(out) as folder:
         case = write_package(runs, folder)
         if key is not None:

@@ -259,7 +259,7 @@ def _argue_requirement(run: AssuredRun, verdict: Verdict) -> Element:
         f"{verdict.requirement_id}: {verdict.statement} Required: {required}.",
         Element(Kind.SOLUTION, numbers.strip(), evidence=run.file("report.html"), own_state=state),
         defeater(f"PASS needs a decision of a person: {verdict.status}.") if verdict.status.is_qualified else None,
-        defeater("Decided by the observed rate, not at a confidence.") if verdict.decide_by == ESTIMATE else None,
+        defeater("Evaluated by observed rate, not at a confidence.") if verdict.decide_by == ESTIMATE else None,
         defeater(f"The required rate or bound is assumed: {verdict.source or 'no source'}.") if is_assumed else None,
         _describe_time_factor(verdict),
         *_argue_robustness(run, verdict),

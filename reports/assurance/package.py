@@ -17,6 +17,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from marsyard.campaigns.definition.identity import hash_sources
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store.confirmations import read_record
 from marsyard.campaigns.store.record import utc_now
@@ -39,6 +40,7 @@ PAGE, CASE, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "manifest
 #: Version of the layout of a package.
 SCHEMA = 1
 CONFIRMATIONS = "confirmations.jsonl"
+_REPORTS_FOLDER = REGISTER_FILE.parent
 _CREDIBILITY_FILE = REGISTER_FILE.with_name("credibility.toml")
 
 
@@ -61,6 +63,7 @@ def write_package(directories: Sequence[Path], folder: Path) -> Case:
     manifest = {
         "schema": SCHEMA,
         "marsyard": version("marsyard"),
+        "program": hash_program(),
         "written_utc": utc_now(),
         "runs": names,
         "files": hash_files(folder),
@@ -130,6 +133,12 @@ def _create_context(case: Case, drawing: str) -> dict[str, Any]:
     """Create the context of the page."""
     # the drawing escapes all texts
     return {"case": case, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704
+
+
+def hash_program() -> str:
+    """Compute the hash of the program that writes packages: all files of the package `reports`, also its evidence."""
+    files = sorted(path for path in _REPORTS_FOLDER.rglob("*") if path.is_file() and path.suffix != ".pyc")
+    return hash_sources((path.relative_to(_REPORTS_FOLDER).as_posix(), path) for path in files)
 
 
 def hash_files(folder: Path) -> dict[str, str]:

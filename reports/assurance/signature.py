@@ -19,10 +19,14 @@ def signature_path(path: Path) -> Path:
     return path.with_name(path.name + _ENDING)
 
 
-def sign_file(path: Path, key: Path) -> None:
-    """Sign a file with a private key, or with a public key whose private key is in the agent. Raises CampaignError."""
+def check_key(key: Path) -> None:
+    """Raise CampaignError if a key does not exist."""
     if not key.is_file():
         raise CampaignError(f"--sign {key}: no such file; `ssh-keygen -t ed25519 -f {key}` creates a key")
+
+
+def sign_file(path: Path, key: Path) -> None:
+    """Sign a file with a private key, or with a public key whose private key is in the agent. Raises CampaignError."""
     signature_path(path).unlink(missing_ok=True)
     process = _run(["sign", "-f", str(key), "-n", NAMESPACE, str(path)])
     if process.returncode or not signature_path(path).is_file():

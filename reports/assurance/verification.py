@@ -18,30 +18,30 @@ from typing import Any
 
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.store.confirmations import find_own_entry, read_record
-from marsyard.reports.assurance.case import VALIDATION, AssuredRun, build_case
+from marsyard.reports.assurance.case import AssuredRun, build_case
 from marsyard.reports.assurance.package import (
     CONFIRMATIONS,
     MANIFEST,
     SCHEMA,
     hash_files,
+    hash_program,
     read_run_evidence,
     render_case,
 )
 from marsyard.reports.assurance.signature import check_signature, signature_path
-from marsyard.reports.campaign import write_evaluation
+from marsyard.reports.campaign import build_report, create_subject
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.report_file import REPORT_JSON
 from marsyard.reports.stored import table
-from marsyard.reports.validation_rows import VALIDATION_FILE
 from marsyard.reports.verdicts import Status, Verdict
 
 #: Numbers of a verdict that follow from the requirement, the rows and the record of confirmations.
 _NUMBERS = ("bound", "probability", "confidence", "scale", "n", "failures", "estimate", "lower", "upper")
 _TEXTS = ("statement", "metric", "population", "decide_by", "source", "kind")
 _TOLERANCE = 1e-9
-#: Further content of `report.json` that follows from the rows, and from the rows and the packaged validation rows.
-_FROM_ROWS = ("cases", "crashed", "outcomes", "metric", "statistics", "worst_cases", "sampling", "algorithm_details")
-_COMPARED = (*_FROM_ROWS, "validity")
+#: Further content of `report.json` that follows from the rows.
+_FROM_ROWS = (
+    "cases", "crashed", "outcomes", "metric", "statistics", "worst_cases", "sampling", "algorithm_details", "validity",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,7 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
     signature_problems, note = _check_signature(folder, signers)
     problems += signature_problems
     notes.append(note)
+    is_same_program = manifest.get("program") == hash_program()
     runs = []
     # a copy, because SQLite writes into the folder of its file even for reading
     with tempfile.TemporaryDirectory(prefix="marsyard-") as name:
@@ -74,16 +75,15 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
         for run_name in names:
             try:
                 run = read_run_evidence(copy, f"runs/{run_name}")
-                problems += _verify_run(copy / run.folder, run)
+                problems += _verify_run(copy / run.folder, run, is_same_program)
                 runs.append(run)
             except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
                 problems.append(f"runs/{run_name}: {_relative(error, copy)}")
-        if manifest.get("marsyard") != version("marsyard"):
-            written = f"the package was written by marsyard {manifest.get('marsyard')}, this is {version('marsyard')}"
-            notes.append(f"case and page are checked by their hashes only: {written}")
+        if not is_same_program:
+            notes.append(f"claims and page by their hashes only; {_describe_program(manifest)}")
         elif len(runs) == len(names):
             problems += _compare_case(copy, runs)
-            notes.append("case and page, computed again from the evidence")
+            notes.append("claims and page, computed again from the evidence")
     notes.append(f"rows, verdicts and confirmations of {len(runs)} campaigns")
     return Verification(tuple(dict.fromkeys(problems)), tuple(notes))
 
@@ -123,8 +123,14 @@ def _check_signature(folder: Path, signers: Path | None) -> tuple[list[str], str
     return ([] if is_valid else [f"{signature_path(path).name}: {text}"]), f"signature: {text}{identity}"
 
 
-def _verify_run(directory: Path, run: AssuredRun) -> Iterator[str]:
-    """Verify rows, record of confirmations, and verdicts of a campaign."""
+def _describe_program(manifest: Mapping[str, Any]) -> str:
+    """Describe that another program wrote the package."""
+    own = f"marsyard {version('marsyard')} ({hash_program()[:8]})"
+    return f"written by marsyard {manifest.get('marsyard')} ({str(manifest.get('program'))[:8]}), this is {own}"
+
+
+def _verify_run(directory: Path, run: AssuredRun, is_same_program: bool) -> Iterator[str]:
+    """Verify rows, record of confirmations and verdicts, and for the same program further numbers of the report."""
     record = directory / CONFIRMATIONS
     evidence = run.report.evidence
     if evidence.is_confirmation and evidence.record:
@@ -141,14 +147,9 @@ def _verify_run(directory: Path, run: AssuredRun) -> Iterator[str]:
             yield f"{run.folder}/report.json: the requirement {name} is missing, or not in campaign.json"
         elif difference := _find_difference(stored[name], computed[name]):
             yield f"{run.folder}/report.json: {name} does not follow from the rows: {difference}"
-    with tempfile.TemporaryDirectory(prefix="marsyard-") as name:
-        write_evaluation(evaluation, Path(name))
-        rewritten = json.loads((Path(name) / REPORT_JSON).read_text(encoding="utf-8"))
-    compared = (
-        _COMPARED if (directory / "../.." / VALIDATION).read_bytes() == VALIDATION_FILE.read_bytes() else _FROM_ROWS
-    )
-    for key in compared:
-        if not _is_equal(run.data.get(key), rewritten.get(key)):
+    computed_report = build_report(evaluation, create_subject(evaluation), ()).to_json()
+    for key in _FROM_ROWS if is_same_program else ():
+        if not _is_equal(run.data.get(key), computed_report.get(key)):
             yield f"{run.folder}/report.json: {key} does not follow from the rows"
 
 

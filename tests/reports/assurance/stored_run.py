@@ -13,7 +13,7 @@ from tests.reports.synthetic_run import VELOCITY, make_rows, synthetic_record
 
 def write_stored_run(directory: Path, cases: int = 240, **changes: Any) -> Path:
     """Write a campaign over Gusev, each case on a terrain of its own; `changes` replace entries of the record."""
-    frame = make_rows(cases, answer_rate=1.0)
+    frame = make_rows(cases, answer_rate=1.0, error_scale=0.5)
     frame["terrain"], frame["site"] = np.arange(cases), "gusev"
     directory.mkdir(parents=True)
     record = synthetic_record(frame, [{**VELOCITY, "source": "the paper; the rate is assumed"}])

@@ -6,14 +6,15 @@ import sqlite3
 import subprocess
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.assurance.case import Kind, State, number_elements
-from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, write_package
+from marsyard.reports.assurance.case import Case, Kind, State, build_case, number_elements
+from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
 from tests.command import marsyard
@@ -21,13 +22,18 @@ from tests.reports.assurance.stored_run import write_stored_run
 
 
 @pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write a package of one campaign of 240 cases."""
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Case]:
+    """Write a package of one campaign of 240 cases; return its folder and its case."""
     folder = tmp_path_factory.mktemp("assured")
     run = write_stored_run(folder / "run")
     (folder / "package").mkdir()
-    write_package([run], folder / "package")
-    return folder / "package"
+    return folder / "package", write_package([run], folder / "package")
+
+
+@pytest.fixture
+def stored(written: tuple[Path, Case]) -> Path:
+    """Return the folder of the package, which must not be changed."""
+    return written[0]
 
 
 @pytest.fixture
@@ -104,7 +110,7 @@ def change_requirement(folder: Path) -> None:
 def test_package_verifies(package: Path) -> None:
     result = verify_package(package)
     assert result.problems == ()
-    assert any("case and page, computed again" in note for note in result.notes)
+    assert any("claims and page, computed again" in note for note in result.notes)
     # the verification does not write into the package
     assert hash_files(package) == json.loads((package / MANIFEST).read_text())["files"]
 
@@ -177,9 +183,8 @@ def test_signature_shows_who_wrote_the_hashes(package: Path, tmp_path: Path) -> 
     assert any(problem.startswith("manifest.json.sig: ") for problem in verify_package(package).problems)
 
 
-def test_case_has_all_kinds_of_defeaters(tmp_path: Path) -> None:
-    (tmp_path / "package").mkdir()
-    case = write_package([write_stored_run(tmp_path / "run")], tmp_path / "package")
+def test_case_has_all_kinds_of_defeaters(written: tuple[Path, Case]) -> None:
+    folder, case = written
     texts = [item.text for _, item, _ in case.defeaters]
     beginnings = (
         "The required rate or bound is assumed", "Exploration: the seed was chosen freely", "Missed check (validation)",
@@ -195,7 +200,7 @@ def test_case_has_all_kinds_of_defeaters(tmp_path: Path) -> None:
     assert {link["target"] for link in content["links"] if link["type"] == "supportedBy"} <= set(names)
     assert len([link for link in content["links"] if link["type"] == "challenges"]) == len(case.defeaters)
     for _, item, _ in number_elements(case.root):
-        assert not item.evidence or (tmp_path / "package" / item.evidence).is_file()
+        assert not item.evidence or (folder / item.evidence).is_file()
 
 
 def test_failed_requirement_refutes_the_claim(tmp_path: Path) -> None:
@@ -272,7 +277,39 @@ def test_package_of_another_layout_is_refused(package: Path) -> None:
 
 def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:
     manifest = json.loads((package / MANIFEST).read_text())
-    (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9"}))
+    (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9", "program": "0"}))
     result = verify_package(package)
     assert result.problems == ()
-    assert any("checked by their hashes only" in note for note in result.notes)
+    assert any(
+        "claims and page by their hashes only; written by marsyard 9.9 (0), this is" in note for note in result.notes
+    )
+
+
+def test_robustness_of_the_report_supports_or_challenges_a_verdict(stored: Path) -> None:
+    run = read_run_evidence(stored, RUN)
+    (verdict,) = run.report.verdicts
+    assert verdict.status.is_met
+    items = [
+        {"requirement": "DIMES-VEL", "parameter": "imu.scale", "pass_text": "131 ppm of gyro scale (100 assumed)"},
+        {"requirement": "DIMES-VEL", "parameter": "wind", "pass_text": ""},
+        {"requirement": "OTHER", "parameter": "haze", "pass_text": "haze 0.8"},
+    ]
+    texts = [
+        [item.text for _, item, _ in number_elements(build_case([case_run], stored).root)]
+        for case_run in (run, replace(run, data={"robustness": items}), replace(run, data={"robustness": []}))
+    ]
+    not_computed = "Robustness against other dispersions: not computed."
+    assert "PASS holds up to: 131 ppm of gyro scale (100 assumed)" in texts[1]
+    assert "The cases do not show that PASS holds under a change of: wind." in texts[1]
+    assert not_computed not in texts[1]
+    assert not_computed in texts[2]
+
+
+def test_computing_time_and_observed_rate_are_defeaters(stored: Path) -> None:
+    run = read_run_evidence(stored, RUN)
+    (verdict,) = run.report.verdicts
+    timed = replace(verdict, metric="estimation_time_s", scale=60.0, decide_by="estimate")
+    root = build_case([replace(run, report=replace(run.report, verdicts=(timed,)))], stored).root
+    texts = [item.text for _, item, _ in number_elements(root)]
+    assert any("assumed to be 60 times slower than the host" in text for text in texts)
+    assert "Evaluated by observed rate, not at a confidence." in texts

@@ -52,6 +52,8 @@ def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: p
     section = field_test_section(Subject(read_run(directory), "velocity_error_m_s", 5.0))
     assert section is not None
     assert len(section.blocks[1].figures) == 2  # the third category has no answers
+    # the comparison is with data to which constants were fitted
+    assert "Fit, not validation: fitted to these data are crest_length, regularity, cover" in section.blocks[0].note
 
 
 def test_stored_table_has_the_misprints_of_the_paper() -> None:

@@ -98,6 +98,9 @@ def test_touchdown_errors_are_compared_with_table_2() -> None:
     assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landings["touchdown_error_gps_m"].mean())
     # landings 1, 3 and 4 of Table 2
     assert section.data["paper_m"] == {"1": 1.21, "3": 1.20, "4": 0.89}
+    assert any(
+        "Fit, not validation: fitted to these data are averaging_after_s" in block.note for block in section.blocks
+    )
     assert np.mean([run["error_m"] for run in PAPER["landings"]]) == pytest.approx(1.1)
     assert touchdown_section(_make_subject(frame.assign(landed=False))) is None
 
