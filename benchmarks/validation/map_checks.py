@@ -107,21 +107,21 @@ def compare_maps(quick: bool) -> Iterator[Measure]:
         )
         median, median_turned = (MapStatistics(*np.nanmedian(rows, axis=0)) for rows in (equal, turned))
         how = f"median of {len(equal)} images of {len(seeds)} terrains, {SUNS}"
-        low, high, least, most_lost = (*CORRELATION, 1.0, MAX_LOST) if site == FLOWN_SITE else (None,) * 4
+        low, high, smallest_ratio, max_lost = (*CORRELATION, 1.0, MAX_LOST) if site == FLOWN_SITE else (None,) * 4
         where = f"descent on map, {site}"
         claim, flown = f"correlation of templates, {where}", f"{how}; Mars 2020: {FLOWN['correlation']}"
         yield Measure(claim, median.correlation, "1", low, flown, "at least")
         yield Measure(f"{claim}, upper limit", median.correlation, "1", high, flown)
         ratio = median.sift / median.orb
         yields = f"{how}; {median.sift:.3f} and {median.orb:.3f}; Mars 2020: {FLOWN['sift']} and {FLOWN['orb']}"
-        yield Measure(f"yield of SIFT divided by yield of ORB, {where}", ratio, "1", least, yields, "at least")
+        yield Measure(f"yield of SIFT divided by yield of ORB, {where}", ratio, "1", smallest_ratio, yields, "at least")
         for name, values, text in (("", median, how), (", sun turned", median_turned, f"{how}, turned by 120 deg")):
             ratio = values.strongest / values.correlation
             text = f"{text}; {values.strongest:.2f} and {values.correlation:.2f}; Mars 2020: {FLOWN['strongest']}"
             claim = f"correlation of the strongest templates divided by that of all, {where}{name}"
-            yield Measure(claim, ratio, "1", least, text, "at least")
+            yield Measure(claim, ratio, "1", smallest_ratio, text, "at least")
         lost = float(np.isnan(equal[:, 0]).mean())
-        yield Measure(f"images that are not found, {where}", lost, "", most_lost, how)
+        yield Measure(f"images that are not found, {where}", lost, "", max_lost, how)
 
 
 def _conditions(name: str) -> Conditions:
