@@ -163,9 +163,10 @@ def compute_pair_statistics(
     """
     image, other = images = tuple(_equalise(_reduce(item, FEATURE_SIDE)) for item in (first, second))
     matched = _match(cv2.SIFT.create(6000, contrastThreshold=0.008), cv2.NORM_L2, *images)
-    homography, inliers = _fit_homography(matched, 2.5)
-    if homography is None or inliers is None:
+    fit = _fit_homography(matched, 2.5)
+    if fit is None:
         return None
+    homography, inliers = fit
     in_overlap = _is_inside(_warp(matched.features, homography), other).sum()
     corners, other_corners = (
         cv2.goodFeaturesToTrack(item, count, 0.01, 7)[:, 0] for item, count in zip(images, (500, 700), strict=True)
@@ -195,9 +196,10 @@ def compute_map_statistics(
     """
     picture, chart = (_equalise(np.asarray(item, dtype=np.float64)) for item in (image, mapped))
     many = _match(cv2.SIFT.create(contrastThreshold=0.008), cv2.NORM_L2, picture, chart)
-    homography, _ = _fit_homography(many, _MAP_TOLERANCE_PX)
-    if homography is None:
+    fit = _fit_homography(many, _MAP_TOLERANCE_PX)
+    if fit is None:
         return None
+    homography = fit[0]
     yields = []
     for detector, norm in ((cv2.SIFT.create(), cv2.NORM_L2), (cv2.ORB.create(_ORB_FEATURES), cv2.NORM_HAMMING)):
         matched = _match(detector, norm, picture, chart)
@@ -209,8 +211,8 @@ def compute_map_statistics(
         return None
     strongest = strength >= np.quantile(strength, 1.0 - _STRONGEST)
     valid = float((distance < _MAP_TOLERANCE_PX).mean())
-    sift, orb = yields
-    return MapStatistics(sift, orb, float(np.median(largest)), float(np.median(largest[strongest])), valid)
+    correlations = float(np.median(largest)), float(np.median(largest[strongest]))
+    return MapStatistics(yields[0], yields[1], *correlations, valid)
 
 
 def _search_templates(
@@ -351,14 +353,14 @@ def _match(
 
 def _fit_homography(
     matched: _Matches, tolerance_px: float
-) -> tuple[Float64[np.ndarray, "3 3"], UInt8[np.ndarray, "matches 1"]] | tuple[None, None]:
-    """Fit the homography from an image to the other by RANSAC; None where too few matches agree."""
+) -> tuple[Float64[np.ndarray, "3 3"], UInt8[np.ndarray, "matches 1"]] | None:
+    """Fit the homography from an image to the other by RANSAC, and mark the matches that agree; None if too few do."""
     if len(matched.points) < _MIN_MATCHES:
-        return None, None
+        return None
     homography, inliers = cv2.findHomography(
         matched.points, matched.other_points, cv2.RANSAC, tolerance_px, maxIters=20000, confidence=0.9999
     )
-    return (None, None) if homography is None or inliers.sum() < _MIN_INLIERS else (homography, inliers)
+    return None if homography is None or inliers.sum() < _MIN_INLIERS else (homography, inliers)
 
 
 def _decorrelation(

@@ -1,0 +1,43 @@
+"""Tests of the comparison of images with maps: rectified images, and the values of flown images that it states."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.validation.map_checks import FLOWN, HALF_FIELD_DEG, PIXEL_M, rectify, reduce_to_map
+from marsyard.scenarios.localisation.instruments import LanderCameraParameters, true_camera
+from marsyard.sim.image_statistics import compute_map_statistics
+
+
+def test_rectified_image_shows_directions_at_the_pixels_of_a_pinhole() -> None:
+    """A dot in the fisheye image appears at the pinhole projection of its direction."""
+    camera = true_camera(LanderCameraParameters())
+    point = np.array([0.5, -0.3, -1.0])
+    (u, v), _ = camera.project(point)
+    y, x = np.mgrid[:1024, :1024]
+    rectified = rectify(np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / 3.0**2), camera)
+    row, column = np.unravel_index(rectified.argmax(), rectified.shape)
+    focal_px = 0.5 * len(rectified) / np.tan(np.radians(HALF_FIELD_DEG))
+    centre = 0.5 * (len(rectified) - 1)
+    assert (column - centre, row - centre) == pytest.approx((0.5 * focal_px, 0.3 * focal_px), abs=1.0)
+    height_m = 2000.0
+    side = len(reduce_to_map(rectified, height_m))
+    assert side * PIXEL_M == pytest.approx(2.0 * height_m * np.tan(np.radians(HALF_FIELD_DEG)), rel=0.01)
+
+
+def test_flown_frame_has_the_stated_yields_and_correlations(shared_data: Path) -> None:
+    """Frame 34 of Mars 2020, about 3.5 km above Jezero (linear between 4 km and 1.2 km), on the map of 16 m a pixel."""
+    folder = shared_data / "mars2020_lcam"
+    frame = cv2.imread(str(folder / "frame_34.jpg"), cv2.IMREAD_GRAYSCALE)
+    mapped = cv2.imread(str(folder / "jezero_map_small.jpg"), cv2.IMREAD_GRAYSCALE)[800:1568, 900:1668]
+    camera = true_camera(LanderCameraParameters())
+    image = reduce_to_map(rectify(cv2.resize(frame, (1024, 1024)), camera), 3490.0)
+    statistics = compute_map_statistics(image, mapped.astype(np.float64))
+    assert statistics is not None
+    for name in ("sift", "orb", "correlation"):
+        low, high = (float(value) for value in FLOWN[name].split(" to "))
+        assert 0.95 * low <= getattr(statistics, name) <= 1.05 * high
+    assert statistics.sift > statistics.orb
+    assert statistics.strongest > statistics.correlation
