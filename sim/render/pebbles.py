@@ -104,8 +104,7 @@ def _evaluate_cell(
     centre = [0.5 * size + (width - size) * _uniform(second, shift) for shift in (0, 8)]
     # offset from the centre in radii, stretched along a random axis of the outline
     x, y = (2.0 * (position - middle) / size for position, middle in zip(offset, centre, strict=True))
-    angle = math.pi * _uniform(first, 8)
-    axis_x, axis_y = dr.cos(angle), dr.sin(angle)
+    axis_y, axis_x = dr.sincos(math.pi * _uniform(first, 8))
     stretch = 1.0 / (_MIN_AXIS_RATIO + (1.0 - _MIN_AXIS_RATIO) * _uniform(second, 16)) - 1.0
     across = stretch * (x * axis_x + y * axis_y)
     x, y = x + across * axis_x, y + across * axis_y
