@@ -275,6 +275,19 @@ def test_package_of_another_layout_is_refused(package: Path) -> None:
         verify_package(package)
 
 
+def test_report_of_another_layout_is_checked_by_its_rows_and_hashes(package: Path) -> None:
+    replace_text(package / RUN / "report.json", '"schema": 8', '"schema": 9')
+    manifest = json.loads((package / MANIFEST).read_text())
+    (package / MANIFEST).write_text(json.dumps(manifest | {"program": "0"}))
+    rehash(package)
+    result = verify_package(package)
+    assert result.problems == ()
+    assert f"{RUN}: verdicts by their hash only; the report has another layout" in result.notes
+    change_row(package)
+    rehash(package)
+    assert "the row of case 7 was changed" in " ".join(verify_package(package).problems)
+
+
 def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:
     manifest = json.loads((package / MANIFEST).read_text())
     (package / MANIFEST).write_text(json.dumps(manifest | {"marsyard": "9.9", "program": "0"}))
