@@ -43,6 +43,7 @@ _TOLERANCE = 1e-9
 #: Further content of `report.json` that follows from the rows.
 _FROM_ROWS = (
     "cases", "crashed", "outcomes", "metric", "statistics", "worst_cases", "sampling", "algorithm_details", "validity",
+    "robustness",
 )  # fmt: skip
 
 

@@ -86,6 +86,13 @@ def change_validity(folder: Path) -> None:
     path.write_text(json.dumps(report))
 
 
+def change_robustness(folder: Path) -> None:
+    path = folder / RUN / "report.json"
+    report = json.loads(path.read_text())
+    report["robustness"][0]["passes_at"] = 20.0
+    path.write_text(json.dumps(report))
+
+
 def change_statement(folder: Path) -> None:
     replace_text(folder / CASE, "supported, with open defeaters", "supported")
 
@@ -122,6 +129,7 @@ def test_package_verifies(package: Path) -> None:
         (change_table, f"{RUN}: {RUN}/cases.parquet was changed"),
         (change_verdict, f"{RUN}/report.json: DIMES-VEL does not follow from the rows: failures"),
         (change_validity, f"{RUN}/report.json: validity does not follow from the rows"),
+        (change_robustness, f"{RUN}/report.json: robustness does not follow from the rows"),
         (change_statement, "case.json: element G"),
         (change_drawing, "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
