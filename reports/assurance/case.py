@@ -320,7 +320,7 @@ def _argue_evidence(run: AssuredRun) -> Element:
 
 def _argue_rows(run: AssuredRun) -> Element:
     """Argue that the rows are those that the program stored."""
-    versions = ", ".join(f"{name} {version}" for name, version in table(run.record.get("versions")).items())
+    version = f"marsyard {table(run.record.get('versions')).get('marsyard', 'of unknown version')}"
     machine = table(run.record.get("environment"))
     environment = ", ".join(str(machine[name]) for name in ("platform", "processor", "python") if machine.get(name))
     commit = str(run.report.git_commit or "")
@@ -329,7 +329,7 @@ def _argue_rows(run: AssuredRun) -> Element:
         "The rows are those of the stated program, in the stated environment.",
         Element(Kind.SOLUTION, rows, evidence=run.file("cases.sqlite")),
         Element(
-            Kind.CONTEXT, f"commit {commit or 'unknown'}; {versions}; {environment}", evidence=run.file("campaign.json")
+            Kind.CONTEXT, f"commit {commit or 'unknown'}; {version}; {environment}", evidence=run.file("campaign.json")
         ),
         defeater(f"The program had changes without a commit ({commit or 'unknown'}).")
         if "+" in commit or not commit

@@ -22,6 +22,7 @@ from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store.confirmations import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
+from marsyard.campaigns.studies.results import ROBUST_FOLDER
 from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuredRun, Case, build_case
 from marsyard.reports.assurance.drawing import draw_case
 from marsyard.reports.assurance.signature import signature_path
@@ -89,16 +90,24 @@ def _write_run(directory: Path, folder: Path, names: Sequence[str]) -> str:
         if (text := base if number == 1 else f"{base}-{number}") not in names
     )
     target = folder / "runs" / name
-    target.mkdir(parents=True)
-    for file in (RECORD_FILE, TABLE_FILE):
-        shutil.copyfile(directory / file, target / file)
-    with readable_store(directory / ROWS_FILE) as store:
-        store.copy(target / ROWS_FILE)
+    _copy_rows(directory, target)
+    for study in sorted((directory / ROBUST_FOLDER).glob("*/")):  # those of `marsyard robust`
+        if all((study / file).is_file() for file in (RECORD_FILE, TABLE_FILE, ROWS_FILE)):
+            _copy_rows(study, target / ROBUST_FOLDER / study.name)
     write_evaluation(evaluation, target)
     (target / SIGNATURE_FILE).unlink(missing_ok=True)  # it is for the dashboard of this user
     if evaluation.evidence.is_confirmation and Path(evaluation.evidence.record).is_file():
         shutil.copyfile(evaluation.evidence.record, target / CONFIRMATIONS)
     return name
+
+
+def _copy_rows(directory: Path, target: Path) -> None:
+    """Copy record and rows of a campaign or of a study into a new folder."""
+    target.mkdir(parents=True)
+    for file in (RECORD_FILE, TABLE_FILE):
+        shutil.copyfile(directory / file, target / file)
+    with readable_store(directory / ROWS_FILE) as store:
+        store.copy(target / ROWS_FILE)
 
 
 def read_run_evidence(folder: Path, name: str) -> AssuredRun:

@@ -30,9 +30,11 @@ from marsyard.reports.assurance.package import (
 )
 from marsyard.reports.assurance.signature import check_signature, signature_path
 from marsyard.reports.campaign import build_report, create_subject
-from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.evaluation import Evaluation, evaluate_run
+from marsyard.reports.report_file import REPORT_JSON, read_report
 from marsyard.reports.stored import table
 from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.wording import count
 
 #: Numbers of a verdict that follow from the requirement, the rows and the record of confirmations.
 _NUMBERS = ("bound", "probability", "confidence", "scale", "n", "failures", "estimate", "lower", "upper")
@@ -41,6 +43,7 @@ _TOLERANCE = 1e-9
 #: Further content of `report.json` that follows from the rows.
 _FROM_ROWS = (
     "cases", "crashed", "outcomes", "metric", "statistics", "worst_cases", "sampling", "algorithm_details", "validity",
+    "robustness",
 )  # fmt: skip
 
 
@@ -74,8 +77,14 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
             problems.append(f"{MANIFEST}: the package contains no campaign")
         for run_name in names:
             try:
+                directory = copy / "runs" / run_name
+                record = directory / CONFIRMATIONS
+                evaluation = evaluate_run(directory, record=record if record.is_file() else None)
+                if not is_same_program and read_report((directory / REPORT_JSON).read_bytes()) is None:
+                    notes.append(f"runs/{run_name}: verdicts by their hash only; the report has another layout")
+                    continue
                 run = read_run_evidence(copy, f"runs/{run_name}")
-                problems += _verify_run(copy / run.folder, run, is_same_program)
+                problems += _verify_run(run, evaluation, record, is_same_program)
                 runs.append(run)
             except (CampaignError, OSError, ValueError, KeyError, TypeError) as error:
                 problems.append(f"runs/{run_name}: {_relative(error, copy)}")
@@ -84,7 +93,7 @@ def verify_package(folder: Path, signers: Path | None = None) -> Verification:
         elif len(runs) == len(names):
             problems += _compare_case(copy, runs)
             notes.append("claims and page, computed again from the evidence")
-    notes.append(f"rows, verdicts and confirmations of {len(runs)} campaigns")
+    notes.append(f"rows and confirmations of {count(len(names), 'campaign')}, verdicts of {len(runs)}")
     return Verification(tuple(dict.fromkeys(problems)), tuple(notes))
 
 
@@ -129,15 +138,13 @@ def _describe_program(manifest: Mapping[str, Any]) -> str:
     return f"written by marsyard {manifest.get('marsyard')} ({str(manifest.get('program'))[:8]}), this is {own}"
 
 
-def _verify_run(directory: Path, run: AssuredRun, is_same_program: bool) -> Iterator[str]:
-    """Verify rows, record of confirmations and verdicts, and for the same program further numbers of the report."""
-    record = directory / CONFIRMATIONS
+def _verify_run(run: AssuredRun, evaluation: Evaluation, record: Path, is_same_program: bool) -> Iterator[str]:
+    """Verify that record and verdicts agree with the rows, and for the same program further numbers of the report."""
     evidence = run.report.evidence
     if evidence.is_confirmation and evidence.record:
         entry = find_own_entry(read_record(record), evidence)
         if entry is None:
             yield f"{run.folder}/{CONFIRMATIONS}: the record does not contain confirmation {evidence.number}"
-    evaluation = evaluate_run(directory, record=record if record.is_file() else None)
     if len(evaluation.run.all_cases) != run.report.cases:
         yield f"{run.folder}/report.json: {run.report.cases} cases, but {len(evaluation.run.all_cases)} rows"
     stored = {verdict.requirement_id: verdict for verdict in run.report.verdicts}

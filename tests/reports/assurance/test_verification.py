@@ -86,6 +86,13 @@ def change_validity(folder: Path) -> None:
     path.write_text(json.dumps(report))
 
 
+def change_robustness(folder: Path) -> None:
+    path = folder / RUN / "report.json"
+    report = json.loads(path.read_text())
+    report["robustness"][0]["passes_at"] = 20.0
+    path.write_text(json.dumps(report))
+
+
 def change_statement(folder: Path) -> None:
     replace_text(folder / CASE, "supported, with open defeaters", "supported")
 
@@ -122,6 +129,7 @@ def test_package_verifies(package: Path) -> None:
         (change_table, f"{RUN}: {RUN}/cases.parquet was changed"),
         (change_verdict, f"{RUN}/report.json: DIMES-VEL does not follow from the rows: failures"),
         (change_validity, f"{RUN}/report.json: validity does not follow from the rows"),
+        (change_robustness, f"{RUN}/report.json: robustness does not follow from the rows"),
         (change_statement, "case.json: element G"),
         (change_drawing, "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
@@ -273,6 +281,19 @@ def test_package_of_another_layout_is_refused(package: Path) -> None:
     (package / MANIFEST).write_text(json.dumps({"schema": 99}))
     with pytest.raises(CampaignError, match="schema 99"):
         verify_package(package)
+
+
+def test_report_of_another_layout_is_checked_by_its_rows_and_hashes(package: Path) -> None:
+    replace_text(package / RUN / "report.json", '"schema": 8', '"schema": 9')
+    manifest = json.loads((package / MANIFEST).read_text())
+    (package / MANIFEST).write_text(json.dumps(manifest | {"program": "0"}))
+    rehash(package)
+    result = verify_package(package)
+    assert result.problems == ()
+    assert f"{RUN}: verdicts by their hash only; the report has another layout" in result.notes
+    change_row(package)
+    rehash(package)
+    assert "the row of case 7 was changed" in " ".join(verify_package(package).problems)
 
 
 def test_package_of_another_version_is_checked_without_its_page(package: Path) -> None:
