@@ -106,7 +106,7 @@ def compare_maps(quick: bool) -> Iterator[Measure]:
             for turn_deg in (0.0, TURN_DEG)
         )
         how = f"median of {len(equal)} images of {len(seeds)} terrains, {SUNS}"
-        low, high, smallest_ratio, max_lost = (*CORRELATION, 1.0, MAX_LOST) if site == FLOWN_SITE else (None,) * 4
+        low, high, min_ratio, max_lost = (*CORRELATION, 1.0, MAX_LOST) if site == FLOWN_SITE else (None,) * 4
         where = f"descent on map, {site}"
         for name, rows, text in (("", equal, how), (", sun turned", turned, f"{how}, turned by {TURN_DEG:g} deg")):
             is_found = np.isfinite(rows[:, 0])
@@ -116,25 +116,25 @@ def compare_maps(quick: bool) -> Iterator[Measure]:
                 continue
             median = MapStatistics(*np.median(rows[is_found], axis=0))
             if not name:
-                yield from _compare_equal_suns(median, where, how, (low, high, smallest_ratio))
+                yield from _compare_equal_suns(median, where, how, (low, high, min_ratio))
             ratio = median.strongest / median.correlation
             text = f"{text}; {median.strongest:.2f} and {median.correlation:.2f}; Mars 2020: {FLOWN['strongest']}"
             claim = f"correlation of the strongest templates divided by that of all, {where}{name}"
-            yield Measure(claim, ratio, "1", smallest_ratio, text, "at least")
+            yield Measure(claim, ratio, "1", min_ratio, text, "at least")
 
 
 def _compare_equal_suns(
     median: MapStatistics, where: str, how: str, limits: tuple[float | None, float | None, float | None]
 ) -> Iterator[Measure]:
     """Compare the correlation of templates, and the yields of SIFT and ORB, under nearly equal suns."""
-    low, high, smallest_ratio = limits
+    low, high, min_ratio = limits
     claim, flown = f"correlation of templates, {where}", f"{how}; Mars 2020: {FLOWN['correlation']}"
     yield Measure(claim, median.correlation, "1", low, flown, "at least")
     if high is not None:
         yield Measure(f"{claim}, upper limit", median.correlation, "1", high, flown)
     yields = f"{how}; {median.sift:.3f} and {median.orb:.3f}; Mars 2020: {FLOWN['sift']} and {FLOWN['orb']}"
     ratio = median.sift / median.orb
-    yield Measure(f"yield of SIFT divided by yield of ORB, {where}", ratio, "1", smallest_ratio, yields, "at least")
+    yield Measure(f"yield of SIFT divided by yield of ORB, {where}", ratio, "1", min_ratio, yields, "at least")
 
 
 def _conditions(name: str) -> Conditions:

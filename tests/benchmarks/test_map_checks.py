@@ -30,12 +30,12 @@ def test_rectified_image_shows_directions_at_the_pixels_of_a_pinhole() -> None:
 def test_flown_frame_has_the_stated_yields_and_correlations(shared_data: Path) -> None:
     """Frame 34 of Mars 2020, about 3.5 km above Jezero (linear between 4 km and 1.2 km), on the map of 16 m a pixel."""
     folder = shared_data / "mars2020_lcam"
-    frame, mapped = (
-        np.asarray(cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE))
-        for name in ("frame_34.jpg", "jezero_map_small.jpg")
-    )
-    camera = true_camera(LanderCameraParameters())
+    frame = cv2.imread(str(folder / "frame_34.jpg"), cv2.IMREAD_GRAYSCALE)
+    mapped = cv2.imread(str(folder / "jezero_map_small.jpg"), cv2.IMREAD_GRAYSCALE)
+    assert frame is not None
+    assert mapped is not None
     mapped = mapped[800:1568, 900:1668]
+    camera = true_camera(LanderCameraParameters())
     image = reduce_to_map(rectify(cv2.resize(frame, (1024, 1024)), camera), 3490.0)
     statistics = compute_map_statistics(image, mapped.astype(np.float64))
     assert statistics is not None
