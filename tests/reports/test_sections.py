@@ -240,6 +240,7 @@ def test_page_and_json_contain_every_section(make_run: MakeRun) -> None:
     directory = make_run(frame)
     text = write_report(directory).read_text(encoding="utf-8")
     report: dict[str, Any] = json.loads((directory / "report.json").read_text(encoding="utf-8"))
-    keys = ["answers", "scatter", "explained", "convergence", "faults", "landing", "sensitivity", "conditions"]
+    keys = ["robustness", "answers", "scatter", "explained", "convergence", "faults", "validity", "landing"]
+    keys += ["sensitivity", "conditions"]
     assert list(report["sections"]) == keys
     assert all(f'<section id="{key}"' in text for key in keys)

@@ -106,7 +106,10 @@ def change_page(folder: Path) -> None:
 
 
 def change_validation_row(folder: Path) -> None:
-    replace_text(folder / "evidence/validation.json", '"measured": 0.6230026031237486', '"measured": 0.5')
+    path = folder / "evidence/validation.json"
+    rows = (row for check in json.loads(path.read_text()).values() for row in check["rows"])
+    missed = next(row for row in rows if row["claim"] == "width of the correlation peak, px: minimum")
+    replace_text(path, f'"measured": {missed["measured"]!r}', f'"measured": {missed["limit"]!r}')
 
 
 def change_requirement(folder: Path) -> None:
