@@ -10,7 +10,6 @@ cell of each body with a projection that contains the ray.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -173,27 +172,21 @@ def list_in_grids(
         for position in (bound - origin) * per_metre + margin
     )
     columns = last_column - first_column + 1
-    count = UInt32(columns * (last_row - first_row + 1))
-
-    def visit_cells(visit: Callable[[Values, Values], None]) -> None:
-        """Call `visit` for all cells of each item."""
-
-        def step(k: Values, is_active: Values) -> tuple[Values, Values]:
-            row = Int32(k) // columns
-            visit(first + UInt32((first_row + row) * side + first_column + Int32(k) - row * columns), is_active)
-            return k + 1, is_active & (k + 1 < count)
-
-        dr.while_loop((UInt32(0), count > 0), lambda k, is_active: is_active, step)
-
-    visit_cells(lambda cell, is_active: dr.scatter_add(grids.starts, UInt32(1), cell, is_active))
+    count = to_host(columns * (last_row - first_row + 1))
+    # an entry for each cell of each item: a loop over the cells of an item would wait for the largest item
+    item = to_device(UInt32, np.repeat(np.arange(count.size), count))
+    entry = dr.arange(Int32, int(count.sum())) - dr.gather(Int32, to_device(Int32, np.cumsum(count) - count), item)
+    width, left, top = (dr.gather(Int32, values, item) for values in (columns, first_column, first_row))
+    # lanes beyond the last entry have no width, by which they must not divide
+    row = entry // dr.maximum(width, 1)
+    cell = dr.gather(UInt32, first, item) + UInt32(
+        (top + row) * dr.gather(Int32, side, item) + left + entry - row * width
+    )
+    dr.scatter_add(grids.starts, UInt32(1), cell)
     starts = dr.prefix_sum(grids.starts)
-    items, listed = dr.zeros(UInt32, int(starts[cells])), dr.zeros(UInt32, cells + 1)
-
-    def list_item(cell: Values, is_active: Values) -> None:
-        position = dr.gather(UInt32, starts, cell, is_active) + dr.scatter_inc(listed, cell, is_active)
-        dr.scatter(items, numbers, position, is_active)
-
-    visit_cells(list_item)
+    items, listed = dr.zeros(UInt32, int(count.sum())), dr.zeros(UInt32, cells + 1)
+    position = dr.gather(UInt32, starts, cell) + dr.scatter_inc(listed, cell)
+    dr.scatter(items, dr.gather(UInt32, numbers, item), position)
     dr.eval(items)
     return replace(grids, starts=starts, items=items)
 
