@@ -11,6 +11,8 @@ from scipy.stats import qmc
 from benchmarks.validation.light_checks import FLAT_ALBEDO, LAMBERT
 from benchmarks.validation.raycast import cast_triangles
 from benchmarks.validation.records import Check, Measure
+from benchmarks.validation.scenes import LANDING, MAST
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.dynamics.rover import MER, settle
 from marsyard.sim.render import Objects, Scene, Sun
 from marsyard.sim.render.arrays import to_host, vectors_to_device
@@ -69,4 +71,4 @@ def compare_hidden_sky(quick: bool) -> Iterator[Measure]:
         yield Measure(claim, float(np.sqrt(np.mean(difference**2))), "", LIMITS[name], how)
 
 
-CHECKS = (Check("sky", "Light", compare_hidden_sky),)
+CHECKS = (Check("sky", "Light", compare_hidden_sky, conditions=(Conditions("*", (*MAST, *LANDING)),)),)
