@@ -168,10 +168,7 @@ def test_rows_on_images_have_the_conditions_of_their_check() -> None:
         row.claim
         for name, check in document.create_rows(CHECKS, document.read_stored()).items()
         for row in check.rows
-        # reflectance: flat ground; sky: points near bodies; opposition: only cameras that are no preset have no conditions
-        if check.section in sections
-        and name not in ("reflectance", "opposition", "sky")
-        and not row.conditions.quantities
+        if check.section in sections and name not in without_site and not row.conditions.quantities
     ]
     assert without == []
 
