@@ -86,7 +86,7 @@ class Outcome(StrEnum):
 
     @classmethod
     def of(cls, crossing: Crossing, *, is_complete: bool) -> Outcome:
-        """Return the outcome of a change; `is_complete`: whether the cases tell about all changes of this kind."""
+        """Return the outcome of a change; `is_complete`: whether the cases cover all changes of this kind."""
         if not math.isnan(crossing.change):
             return cls.FOUND
         return cls.NONE if is_complete else cls.REFUSED

@@ -14,7 +14,7 @@ import numpy as np
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
 from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream
-from marsyard.sim.terrain.landforms.kernels import interleave_samples
+from marsyard.sim.terrain.landforms.kernels.shapes import interleave_samples
 from marsyard.sim.terrain.landforms.relief import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters

@@ -10,7 +10,8 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Grid, TerrainGround, resample
-from marsyard.sim.terrain.landforms.kernels import cast_lee, expose_strata
+from marsyard.sim.terrain.landforms.kernels.bedrock import expose_strata
+from marsyard.sim.terrain.landforms.kernels.shapes import cast_lee
 from marsyard.sim.terrain.landforms.relief import Dunes
 
 _ROWS_PER_STRATUM = 32  #: Rows of the table of a stratum of mean thickness.

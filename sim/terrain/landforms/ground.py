@@ -10,7 +10,7 @@ from jaxtyping import Complex64, Float32, Float64, Inexact
 from numpy.random import Generator
 
 from marsyard.sim.streams import hash_words
-from marsyard.sim.terrain.landforms.kernels import add_refined
+from marsyard.sim.terrain.landforms.kernels.shapes import add_refined
 
 SMALLEST_SIDE = 16  #: Minimum side of the grid of a landform, samples.
 #: Waves per wavelength of a Gaussian low-pass filter (gain exp(-1/2) at this wavelength) at which its gain is 3e-8.

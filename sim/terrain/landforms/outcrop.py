@@ -10,7 +10,7 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, resample
-from marsyard.sim.terrain.landforms.kernels import add_slabs
+from marsyard.sim.terrain.landforms.kernels.bedrock import add_slabs
 
 #: Sizes of the slabs of the two generations of joints, relative to the parameter, and their relative heights (assumed).
 _SIZES, _HEIGHTS = (1.0, 0.4), (1.0, 0.35)

@@ -13,9 +13,9 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, refine, resample
-from marsyard.sim.terrain.landforms.kernels import (
+from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
+from marsyard.sim.terrain.landforms.kernels.shapes import (
     Bedforms,
-    add_cracks,
     add_dunes,
     cut_channels,
     raise_cones,

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import Grid, Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels import cut_channels, scale_roughness, stamp_streaks
+from marsyard.sim.terrain.landforms.kernels.shapes import cut_channels, scale_roughness, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_channels
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
 

@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell, TerrainGround
 from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
-from marsyard.sim.terrain.landforms.kernels import (
+from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
+from marsyard.sim.terrain.landforms.kernels.shapes import (
     EJECTA_OPACITY,
     RAY_CONTRAST,
     Bedforms,
-    add_cracks,
     add_dunes,
     stamp_craters,
 )

@@ -6,7 +6,7 @@ from jaxtyping import Float32
 
 from marsyard.sim.terrain import TerrainParameters
 from marsyard.sim.terrain.landforms import Outcrop, TerrainGround
-from marsyard.sim.terrain.landforms.kernels import add_slabs
+from marsyard.sim.terrain.landforms.kernels.bedrock import add_slabs
 
 
 def _apply(**changes: float) -> TerrainGround:

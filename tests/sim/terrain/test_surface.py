@@ -9,7 +9,7 @@ from scipy.ndimage import map_coordinates
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels import EJECTA_OPACITY, stamp_craters
+from marsyard.sim.terrain.landforms.kernels.shapes import EJECTA_OPACITY, stamp_craters
 from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, add_craters, draw_craters
 
 

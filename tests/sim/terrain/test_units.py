@@ -18,7 +18,7 @@ from marsyard.sim.terrain import (
     synthesise,
 )
 from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels import FILL_MARGIN, scale_roughness, stamp_craters, stamp_streaks
+from marsyard.sim.terrain.landforms.kernels.shapes import FILL_MARGIN, scale_roughness, stamp_craters, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import DARK_EJECTA, FULL_CONTRAST_M, draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms

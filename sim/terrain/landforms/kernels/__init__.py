@@ -1,0 +1,1 @@
+"""Compiled functions that add shapes to a grid of heights and albedos."""
