@@ -22,9 +22,7 @@ MESH: dict[str, Any] = {"mesh_finest_m": 0.2, "mesh_half_width_m": 60.0}
 SUN = Sun(direction(0.5 * np.pi, np.radians(35.0)))
 
 
-def _sample(
-    pebbles: SitePebbles, footprint_m: float, side: int = 700, spacing_m: float = 0.0071
-) -> tuple[np.ndarray, ...]:
+def _sample(pebbles: SitePebbles, footprint_m: float) -> tuple[np.ndarray, ...]:
     """Return normals, log albedo and shadow on a square grid of positions; rows are north."""
     side = 700
     grid = 0.0071 * np.arange(side)
