@@ -151,15 +151,12 @@ class Scene:
     def restrict_to_cones(self, cones: Sequence[Cone]) -> Scene:
         """Return the scene without objects and ground shadows that are invisible in images within these cones."""
         sun, min_height = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
-        is_visible, hides_sky = np.zeros((2, len(self.objects)), dtype=np.bool_)
+        is_visible = np.zeros(len(self.objects), dtype=np.bool_)
         # rocks hide the sky from visible ground up to this distance
-        reach = np.array([1.0, 1.0, 1.0, MOUND_RANGE])
+        reach = np.array([1.0, 1.0, 1.0, MOUND_RANGE if self.among_objects else 1.0])
         for cone in cones:
-            is_visible |= potentially_visible(self.objects.spheres, sun, min_height, cone)
-            if self.among_objects:
-                hides_sky |= potentially_visible(self.objects.spheres * reach, sun, min_height, cone)
+            is_visible |= potentially_visible(self.objects.spheres * reach, sun, min_height, cone)
         scene = replace(self, objects=self.objects.select(is_visible), visible_m=ground_in_cones(cones, min_height))
-        scene.__dict__["obstructions"] = list_obstructions(self.objects.select(hides_sky))
         return self._keep_results(scene, "mesh_offsets", "height_range_m", "max_slopes")
 
     @property
@@ -214,7 +211,11 @@ class Scene:
     @cached_property
     def obstructions(self) -> Obstructions | None:
         """Bodies that hide the sky from the ground around them; None from afar, where their effect is not visible."""
-        return list_obstructions(self.objects) if self.among_objects else None
+        if not self.among_objects or len(self.objects) == 0:
+            return None
+        shelter = self.objects.shelter
+        mounds = Mounds.of_boxes(*self.objects.bounds_on_ground())
+        return Obstructions(mounds, None if shelter is None else Shelter.of(shelter))
 
     @cached_property
     def materials(self) -> Materials:
@@ -257,14 +258,6 @@ class Scene:
             clouds,
             self.obstructions,
         )
-
-
-def list_obstructions(objects: Objects) -> Obstructions | None:
-    """List the bodies that hide the sky; None without objects."""
-    if len(objects) == 0:
-        return None
-    mounds = Mounds.of_boxes(*objects.bounds_on_ground())
-    return Obstructions(mounds, None if objects.shelter is None else Shelter.of(objects.shelter))
 
 
 def graded_offsets(half_width_m: float, finest_m: float, count: int) -> FloatArray[np.ndarray, "count"]:
