@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64, Int32, Int64
 
 from marsyard.sim.render.arrays import Values, vectors_to_device
 from marsyard.sim.render.device import Array3f64
-from marsyard.sim.render.triangles import Hierarchy, body_spheres, morton_codes
+from marsyard.sim.render.triangles import Hierarchy, body_bounds, bounding_spheres, morton_codes
 
 #: Identifiers of users' meshes start here; identifiers of rocks are smaller.
 FIRST_MESH_NUMBER = 2**30
@@ -29,6 +29,7 @@ class Objects:
     - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field; a
       user's mesh has a number from 2^30; rover and hills have negative numbers
     - shelter: corners of a convex body that hides the sky from the ground below it (`skylight.Shelter`), or None
+    - unseen_mounds: mounds (see `mounds`) of bodies without triangles: they only hide the sky
     """
 
     triangles: Float64[np.ndarray, "triangles 3 3"]
@@ -38,6 +39,7 @@ class Objects:
     albedo: Float64[np.ndarray, "bodies"]
     names: Int64[np.ndarray, "bodies"]
     shelter: Float64[np.ndarray, "8 3"] | None = None
+    unseen_mounds: Float64[np.ndarray, "mounds 4"] = field(default_factory=lambda: np.empty((0, 4)))
 
     @classmethod
     def of_mesh(
@@ -72,10 +74,10 @@ class Objects:
         shelters = [part.shelter for part in parts if part.shelter is not None]
         if len(shelters) > 1:
             raise ValueError(f"{len(shelters)} sets of objects have a shelter; at most one is possible")
-        names = ("triangles", "normals", "albedo", "names", "spheres")
+        names = ("triangles", "normals", "albedo", "names", "unseen_mounds", "bounds", "spheres")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        joined = cls._of_bodies(counts=np.concatenate([np.diff(part.first_triangle) for part in parts]), **arrays)
-        return joined.with_shelter(shelters[0]) if shelters else joined
+        counts = np.concatenate([np.diff(part.first_triangle) for part in parts])
+        return cls._of_bodies(counts=counts, shelter=shelters[0] if shelters else None, **arrays)
 
     @classmethod
     def _of_bodies(
@@ -85,16 +87,18 @@ class Objects:
         counts: Int64[np.ndarray, "bodies"],
         albedo: Float64[np.ndarray, "bodies"],
         names: Int64[np.ndarray, "bodies"],
-        spheres: Float64[np.ndarray, "bodies 4"] | None = None,
+        shelter: Float64[np.ndarray, "8 3"] | None = None,
+        unseen_mounds: Float64[np.ndarray, "mounds 4"] | None = None,
+        **computed: Float64[np.ndarray, "bodies columns"],
     ) -> Objects:
-        """Create bodies with `counts` triangles each; without `spheres`, bounding spheres are computed when needed."""
+        """Create bodies with `counts` triangles each; `computed` are results (`bounds`, `spheres`) to keep."""
         if len(triangles) > MAX_TRIANGLES:
             raise ValueError(f"{len(triangles)} triangles; at most {MAX_TRIANGLES} can be drawn at once")
         body_of_triangle = np.repeat(np.arange(counts.size, dtype=np.int32), counts)
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        objects = cls(triangles, normals, body_of_triangle, first, albedo, names)
-        if spheres is not None:
-            objects.__dict__["spheres"] = spheres
+        mounds = np.empty((0, 4)) if unseen_mounds is None else unseen_mounds
+        objects = cls(triangles, normals, body_of_triangle, first, albedo, names, shelter, mounds)
+        objects.__dict__.update(computed)
         return objects
 
     @classmethod
@@ -107,29 +111,36 @@ class Objects:
         return len(self.albedo)
 
     @cached_property
+    def bounds(self) -> Float64[np.ndarray, "bodies 6"]:
+        """Minimum x, y, z, then maximum x, y, z of each body."""
+        return body_bounds(self.triangles, self.first_triangle)
+
+    @cached_property
     def spheres(self) -> Float64[np.ndarray, "bodies 4"]:
         """Bounding sphere of each body, centred at the centre of its bounding box: centre and radius."""
-        return body_spheres(self.triangles, self.first_triangle)
+        return bounding_spheres(self.triangles, self.first_triangle, self.bounds)
 
     def with_shelter(self, corners: Float64[np.ndarray, "8 3"]) -> Objects:
-        """Return the objects with a shelter; bounding spheres are kept."""
-        objects = replace(self, shelter=corners)
-        objects.__dict__["spheres"] = self.spheres
-        return objects
+        """Return the objects with a shelter."""
+        return replace(self, shelter=corners)
 
     @property
     def is_rock(self) -> Bool[np.ndarray, "bodies"]:
         """Whether each body is a rock of a rock field."""
         return np.asarray((self.names >= 0) & (self.names < FIRST_MESH_NUMBER))
 
-    def bounds_on_ground(self) -> tuple[Float64[np.ndarray, "selected 3"], Float64[np.ndarray, "selected 3"]]:
-        """Return the minimum and maximum x, y, z of the bodies that stand on the ground: rocks and meshes of users."""
-        if len(self) == 0:
-            return np.empty((0, 3)), np.empty((0, 3))
-        corners, first = self.triangles.reshape(-1, 3), 3 * self.first_triangle[:-1]
-        is_on_ground = self.names >= 0
-        low, high = (extreme.reduceat(corners, first)[is_on_ground] for extreme in (np.minimum, np.maximum))
-        return low, high
+    @property
+    def mounds(self) -> Float64[np.ndarray, "mounds 4"]:
+        """Mounds that hide the sky: x, y of the centre, radius, and z of the top.
+
+        They are those of the bodies that stand on the ground (rocks and meshes of users), and `unseen_mounds`.
+        """
+        return np.concatenate([self._mounds_of(np.ones(len(self), dtype=np.bool_)), self.unseen_mounds])
+
+    def _mounds_of(self, is_selected: Bool[np.ndarray, "bodies"]) -> Float64[np.ndarray, "mounds 4"]:
+        bounds = self.bounds[is_selected & (self.names >= 0)]
+        low, high = bounds[:, :3], bounds[:, 3:]
+        return np.column_stack([0.5 * (low + high)[:, :2], 0.25 * (high - low)[:, :2].sum(axis=1), high[:, 2]])
 
     def in_cone(
         self,
@@ -154,18 +165,23 @@ class Objects:
         normals = np.cross(b - a, c - a)
         return normals, np.einsum("na,na->n", normals, a), np.linalg.norm(normals, axis=1)
 
-    def select(self, is_selected: Bool[np.ndarray, "bodies"]) -> Objects:
-        """Return the selected bodies, renumbered."""
+    def select(
+        self, is_selected: Bool[np.ndarray, "bodies"], hides_sky: Bool[np.ndarray, "bodies"] | None = None
+    ) -> Objects:
+        """Return the selected bodies, renumbered, and the mounds of the other bodies in `hides_sky`."""
         triangles = self._triangles_of(is_selected)
-        selected = self._of_bodies(
+        unseen = np.zeros(len(self), dtype=np.bool_) if hides_sky is None else hides_sky & ~is_selected
+        return self._of_bodies(
             np.take(self.triangles, triangles, axis=0),
             np.take(self.normals, triangles, axis=0),
             np.diff(self.first_triangle)[is_selected],
             self.albedo[is_selected],
             self.names[is_selected],
-            self.spheres[is_selected],
+            self.shelter,
+            np.concatenate([self.unseen_mounds, self._mounds_of(unseen)]),
+            bounds=self.bounds[is_selected],
+            spheres=self.spheres[is_selected],
         )
-        return selected if self.shelter is None else selected.with_shelter(self.shelter)
 
     def _triangles_of(self, is_selected: Bool[np.ndarray, "bodies"]) -> Int64[np.ndarray, "selected"]:
         return np.flatnonzero(np.repeat(is_selected, np.diff(self.first_triangle)))

@@ -151,12 +151,15 @@ class Scene:
     def restrict_to_cones(self, cones: Sequence[Cone]) -> Scene:
         """Return the scene without objects and ground shadows that are invisible in images within these cones."""
         sun, min_height = np.asarray(self.sun.direction, dtype=np.float64), self.height_range_m[0]
-        is_visible = np.zeros(len(self.objects), dtype=np.bool_)
+        spheres, (is_visible, hides_sky) = self.objects.spheres, np.zeros((2, len(self.objects)), dtype=np.bool_)
         # rocks hide the sky from visible ground up to this distance
-        reach = np.array([1.0, 1.0, 1.0, MOUND_RANGE if self.among_objects else 1.0])
+        sky_spheres = spheres * (1.0, 1.0, 1.0, MOUND_RANGE)
         for cone in cones:
-            is_visible |= potentially_visible(self.objects.spheres * reach, sun, min_height, cone)
-        scene = replace(self, objects=self.objects.select(is_visible), visible_m=ground_in_cones(cones, min_height))
+            is_visible |= potentially_visible(spheres, sun, min_height, cone)
+            if self.among_objects:
+                hides_sky |= spheres_in_cone(sky_spheres, *cone)
+        objects = self.objects.select(is_visible, hides_sky)
+        scene = replace(self, objects=objects, visible_m=ground_in_cones(cones, min_height))
         return self._keep_results(scene, "mesh_offsets", "height_range_m", "max_slopes")
 
     @property
@@ -211,11 +214,10 @@ class Scene:
     @cached_property
     def obstructions(self) -> Obstructions | None:
         """Bodies that hide the sky from the ground around them; None from afar, where their effect is not visible."""
-        if not self.among_objects or len(self.objects) == 0:
+        mounds, shelter = self.objects.mounds, self.objects.shelter
+        if not self.among_objects or (len(mounds) == 0 and shelter is None):
             return None
-        shelter = self.objects.shelter
-        mounds = Mounds.of_boxes(*self.objects.bounds_on_ground())
-        return Obstructions(mounds, None if shelter is None else Shelter.of(shelter))
+        return Obstructions(Mounds.of(mounds), None if shelter is None else Shelter.of(shelter))
 
     @cached_property
     def materials(self) -> Materials:

@@ -76,22 +76,20 @@ class Mounds:
     top: Values
 
     @classmethod
-    def of_boxes(
-        cls, low: FloatArray[np.ndarray, "bodies 3"], high: FloatArray[np.ndarray, "bodies 3"]
-    ) -> Mounds | None:
-        """List bodies with these bounds in a grid; None without bodies."""
-        if len(low) == 0:
+    def of(cls, mounds: FloatArray[np.ndarray, "mounds 4"]) -> Mounds | None:
+        """List mounds, with x, y of the centre, radius and z of the top, in a grid; None without mounds."""
+        if len(mounds) == 0:
             return None
-        centre, radius = 0.5 * (low + high)[:, :2], 0.25 * (high - low)[:, :2].sum(axis=1)
+        centre, radius, top = mounds[:, :2], mounds[:, 2], mounds[:, 3]
         reach = MOUND_RANGE * radius[:, None]
         bounds = np.zeros((1, 6))
         bounds[0, :2], bounds[0, 3:5] = (centre - reach).min(axis=0), (centre + reach).max(axis=0)
-        side = np.clip(np.ceil(np.sqrt([len(low) / _MOUNDS_PER_CELL])), 1, _MAX_CELLS).astype(np.int64)
+        side = np.clip(np.ceil(np.sqrt([len(mounds) / _MOUNDS_PER_CELL])), 1, _MAX_CELLS).astype(np.int64)
         first, last = (vectors_to_device(Array2f64, centre + sign * reach) for sign in (-1, 1))
-        numbers = dr.arange(UInt32, len(low))
-        grid = list_in_grids(first, last, dr.zeros(UInt32, len(low)), bounds, side, numbers)
+        numbers = dr.arange(UInt32, len(mounds))
+        grid = list_in_grids(first, last, dr.zeros(UInt32, len(mounds)), bounds, side, numbers)
         centres = vectors_to_device(Array2f64, centre)
-        return cls(grid, centres, to_device(Float, radius), to_device(Float64, high[:, 2]))
+        return cls(grid, centres, to_device(Float, radius), to_device(Float64, top))
 
     def hide_sky(self, position: Values, active: Values) -> Values:
         """Compute the vectors of the sky that mounds hide from positions on the ground.

@@ -163,22 +163,30 @@ def nearest_triangles(
     return to_host(nearest_hit(tree, ray, Float64(dr.inf), Bool(True)).number).astype(np.int64)
 
 
-def body_spheres(
+def body_bounds(
     triangles: Triangles, first_triangle: Int64[np.ndarray, "bodies+1"]
-) -> FloatArray[np.ndarray, "bodies 4"]:
-    """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre.
+) -> FloatArray[np.ndarray, "bodies 6"]:
+    """Minimum x, y, z, then maximum x, y, z of each body.
 
     `first_triangle` contains the first triangle of each body, and the number of triangles at the end.
     """
-    first, counts = first_triangle[:-1], np.diff(first_triangle)
-    if len(first) == 0:
-        return np.empty((0, 4))
+    if len(first_triangle) == 1:
+        return np.empty((0, 6))
     a, b, c = (triangles[:, corner] for corner in range(3))
-    low, high = (ufunc.reduceat(ufunc(ufunc(a, b), c), first) for ufunc in (np.minimum, np.maximum))
-    centres = 0.5 * (low + high)
-    centre_of_triangle = np.repeat(centres, counts, axis=0)
-    squares = np.max([np.square(corner - centre_of_triangle).sum(axis=1) for corner in (a, b, c)], axis=0)
-    return np.column_stack([centres, np.sqrt(np.maximum.reduceat(squares, first))])
+    extremes = (ufunc.reduceat(ufunc(ufunc(a, b), c), first_triangle[:-1]) for ufunc in (np.minimum, np.maximum))
+    return np.concatenate(list(extremes), axis=1)
+
+
+def bounding_spheres(
+    triangles: Triangles, first_triangle: Int64[np.ndarray, "bodies+1"], bounds: FloatArray[np.ndarray, "bodies 6"]
+) -> FloatArray[np.ndarray, "bodies 4"]:
+    """Bounding sphere of each body: centre of its bounding box, and maximum distance of its corners from the centre."""
+    if len(bounds) == 0:
+        return np.empty((0, 4))
+    centres = 0.5 * (bounds[:, :3] + bounds[:, 3:])
+    centre_of_triangle = np.repeat(centres, np.diff(first_triangle), axis=0)
+    squares = np.max([np.square(triangles[:, k] - centre_of_triangle).sum(axis=1) for k in range(3)], axis=0)
+    return np.column_stack([centres, np.sqrt(np.maximum.reduceat(squares, first_triangle[:-1]))])
 
 
 def first_hits(

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 from scipy.stats import qmc
 
 from benchmarks.validation.raycast import cast_triangles
+from marsyard.scenarios.views import nadir_pose
 from marsyard.sim.camera import Cahv
 from marsyard.sim.dynamics.rover import MER, settle
 from marsyard.sim.frames import direction, rigid
@@ -18,7 +20,7 @@ from marsyard.sim.render.device import Array3f, Array3f64, Bool
 from marsyard.sim.render.rover import rover_objects
 from marsyard.sim.render.skylight import Mounds, Shelter, SkyLight
 from marsyard.sim.sensor.mast import MER_MAST
-from tests.sim.scenes import LAMBERT, flat_ground, make_ground
+from tests.sim.scenes import DOWN, LAMBERT, flat_ground, make_ground
 
 SUN = Sun(direction(0.4, np.radians(40.0)))
 
@@ -77,8 +79,8 @@ def test_sky_hidden_by_a_convex_body_equals_ray_casting() -> None:
 
 
 def test_sky_hidden_by_a_half_sphere_equals_integration() -> None:
-    low, high = np.array([[1.5, -0.5, -0.3]]), np.array([[2.5, 0.5, 0.5]])
-    mounds = Mounds.of_boxes(low, high)
+    # x, y, radius and top
+    mounds = Mounds.of(np.array([[2.0, 0.0, 0.5, 0.5]]))
     assert mounds is not None
     directions = _draw_sphere(17)
     directions = directions[directions[:, 2] > 0.0]
@@ -92,6 +94,41 @@ def test_sky_hidden_by_a_half_sphere_equals_integration() -> None:
         expected = 2.0 * np.mean(directions * is_hit[:, None], axis=0)
         assert vector == pytest.approx(expected, abs=4e-3)
     assert hidden[3] == pytest.approx(0.0)
+
+
+def test_rock_outside_of_the_image_hides_its_sky_also_next_to_a_rover(renderer: Renderer) -> None:
+    """A rock without triangles in the restricted scene darkens the visible ground as it does in the full scene."""
+    surface, middle = make_ground(np.zeros((256, 256)), 0.05), 6.4
+    rover = rover_objects(MER, settle(MER, flat_ground(64, 0.2), middle, middle, 0.0), MER_MAST, 0.0, 0.0)
+    rock = trimesh.creation.icosphere(subdivisions=2, radius=0.4)
+    rock.apply_translation([middle + 2.35, middle, 0.0])
+    faces = rock.faces.astype(np.int32)
+    names = np.zeros(len(faces), dtype=np.int32)
+    objects = Objects.of_mesh(np.array(rock.vertices), np.array(rock.vertex_normals), faces, names, albedo=0.2)
+    photometry = Photometry(lunar_fraction=0.0, surge_amplitude=0.0, sky_fraction=0.45, sky=DustySky(0.9, 0.94, 0.65))
+    # the shadows of rock and rover fall to the east, the image is north-west of the rock's centre
+    sun = Sun(direction(1.5 * np.pi, np.radians(60.0)))
+    scene = Scene(
+        surface,
+        (middle, middle),
+        sun,
+        photometry,
+        objects,
+        mesh_finest_m=0.02,
+        mesh_half_width_m=30.0,
+        among_objects=True,
+    )
+    rays = PixelRays.from_camera(Cahv.from_field_of_view(np.radians(5.0), (48, 48), **DOWN))
+    pose = nadir_pose(surface, middle + 1.6, middle + 0.3, 3.0)
+    restricted = scene.restrict_to_cones([rays.cone(pose)])
+    assert len(restricted.objects) == 0
+    views = [
+        renderer.render(item.with_objects(Objects.join([item.objects, rover])), rays, pose).radiance
+        for item in (scene, restricted, restricted.with_objects(Objects.none()))
+    ]
+    np.testing.assert_array_equal(views[1], views[0])
+    # without the mound the ground is visibly brighter
+    assert views[2].mean() > 1.005 * views[0].mean()
 
 
 def test_rover_darkens_its_shadow_and_slopes_remain_visible_in_it(renderer: Renderer) -> None:
