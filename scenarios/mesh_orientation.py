@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from marsyard.sim.render.triangles import nearest_triangles
+from marsyard.sim.render.triangles import first_hits
 
 Vertices = Float64[np.ndarray, "vertices 3"]
 Faces = Int64[np.ndarray, "faces 3"]
@@ -168,6 +168,6 @@ def _contains(triangles: Float64[np.ndarray, "faces 3 3"], points: Float64[np.nd
 
     A ray from a point inside leaves the body through the first triangle that it hits.
     """
-    numbers = nearest_triangles(triangles, points, _DIRECTION)
+    _, numbers = first_hits(triangles, points, _DIRECTION[None])
     a, b, c = np.moveaxis(triangles[numbers], 1, 0)
     return bool(np.all(numbers >= 0) and np.all(np.cross(b - a, c - a) @ _DIRECTION > 0.0))

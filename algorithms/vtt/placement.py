@@ -80,14 +80,14 @@ def measure_surface(measurements: RoverMeasurements, target_rover: Vector3) -> P
     return pair.points(_DEPTHS[0] * depth, _DEPTHS[1] * depth)
 
 
-def surface_heights(
-    surface: Points3, position: Vector3, normal: Vector3, radius_m: float
-) -> Float64[np.ndarray, "points"]:
-    """Compute the heights along `normal` above `position` of the surface points within a radius of the axis."""
+def cylinder_coordinates(
+    surface: Points3, position: Vector3, normal: Vector3
+) -> tuple[Float64[np.ndarray, "points"], Float64[np.ndarray, "points"]]:
+    """Compute heights along `normal` above `position`, and distances from this axis, of surface points."""
     offsets = surface - position
     heights = offsets @ normal
-    distances = np.linalg.norm(offsets - heights[:, None] * normal, axis=1)
-    return np.asarray(heights[distances <= radius_m])
+    squares = np.einsum("na,na->n", offsets, offsets) - heights**2
+    return heights, np.sqrt(np.maximum(squares, 0.0))
 
 
 def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3, instrument: Instrument) -> float:
@@ -95,11 +95,11 @@ def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3, instrum
 
     A positive overlap is a collision; negative values are the remaining clearance. NaN without points at the contact.
     """
-    contact = surface_heights(surface, position, normal, instrument.contact_m)
+    heights, distances = cylinder_coordinates(surface, position, normal)
+    contact = heights[distances <= instrument.contact_m]
     if not contact.size:
         return float("nan")
-    tools = surface_heights(surface, position, normal, instrument.tools_m)
-    return float(tools.max() - np.median(contact) - instrument.clearance_m)
+    return float(heights[distances <= instrument.tools_m].max() - np.median(contact) - instrument.clearance_m)
 
 
 def fit_plane(points: Points3, viewpoint: Vector3) -> tuple[Vector3, Vector3]:
@@ -126,9 +126,7 @@ def place_instrument(
     is_measured = False
     for offset in _offsets(across, instrument.max_reselection_m):
         centre = target + offset
-        offsets = nearby - centre
-        in_plane = np.linalg.norm(offsets - (offsets @ across)[:, None] * across, axis=1)
-        contact = nearby[in_plane <= instrument.contact_m]
+        contact = nearby[cylinder_coordinates(nearby, centre, across)[1] <= instrument.contact_m]
         if len(contact) < _MIN_POINTS:
             continue
         is_measured = True

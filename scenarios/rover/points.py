@@ -39,7 +39,12 @@ def sight_axes(line: Vector) -> Float64[np.ndarray, "3 3"]:
 
 def ray_distances(triangles: Triangles, origin: Vector, directions: Rays) -> Float64[np.ndarray, "rays"]:
     """Compute the distance along rays from one origin to the nearest triangle; infinite without an intersection."""
-    return np.asarray(first_hits(triangles, origin, directions)[0])
+    return np.asarray(first_hits(triangles, origin[None], directions)[0])
+
+
+def are_hidden(triangles: Triangles, points: Points, direction: Vector) -> Bool[np.ndarray, "points"]:
+    """Return for each point whether a ray in a direction, such as that of the sun, hits a triangle."""
+    return np.asarray(np.isfinite(first_hits(triangles, points, direction[None])[0]))
 
 
 def enclosing_spheres(triangles: Triangles) -> Float64[np.ndarray, "triangles 4"]:
@@ -71,7 +76,7 @@ def patch_normal(triangles: Triangles, viewpoint: Vector, point: Vector, half_an
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     spheres = enclosing_spheres(triangles)
     candidates = triangles[spheres_near_line(spheres, viewpoint, point, np.sqrt(2.0) * half_angle_rad)]
-    _, indices = first_hits(candidates, viewpoint, rays)
+    _, indices = first_hits(candidates, viewpoint[None], rays)
     corners = candidates[indices[indices >= 0]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -131,9 +136,7 @@ def find_self_occlusion(triangles: Triangles, points: Points, viewpoint: Vector)
 def find_self_shadow(triangles: Triangles, points: Points, sun_direction: Vector) -> Bool[np.ndarray, "points"]:
     """Return for each point of a rock whether the rock shadows it."""
     # an offset towards the sun avoids intersections with a point's own triangle
-    origins = points + 2.0 * _MIN_GAP_M * sun_direction
-    distances = [ray_distances(triangles, origin, sun_direction[None])[0] for origin in origins]
-    return np.array([np.isfinite(distance) for distance in distances], dtype=bool)
+    return are_hidden(triangles, points + 2.0 * _MIN_GAP_M * sun_direction, sun_direction)
 
 
 def sample_template(viewpoint: Vector, point: Vector, half_angle_rad: float) -> Points:
@@ -177,6 +180,4 @@ def rover_shades_patch(
     centre = patch_m.mean(axis=0)
     radius = float(np.linalg.norm(patch_m - centre, axis=1).max())
     body = build_shadow_caster(rover, stance, mast, angles_rad, centre, radius, sun_direction)
-    if body is None:
-        return False
-    return any(np.isfinite(ray_distances(body.triangles, point, sun_direction[None])[0]) for point in patch_m)
+    return body is not None and bool(are_hidden(body.triangles, patch_m, sun_direction).any())

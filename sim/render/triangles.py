@@ -20,6 +20,8 @@ from marsyard.sim.render.ground import Ray
 Triangles = FloatArray[np.ndarray, "triangles 3 3"]
 #: Relative margin of bounds and of triangles in single precision, larger than rounding errors.
 SLACK = 1e-6
+#: Number of rays up to which testing all triangles takes less time than building their hierarchy.
+FEW_RAYS = 256
 
 
 @dataclass(eq=False)
@@ -152,17 +154,6 @@ def nearest_hit(tree: Hierarchy, ray: Ray, farthest: Values, active: Values) -> 
     return dr.select(is_hit, TriangleHit(t, Int32(number), u, v), no_hit(dr.inf))
 
 
-def nearest_triangles(
-    triangles: Triangles, origins: FloatArray[np.ndarray, "rays 3"], direction: FloatArray[np.ndarray, "3"]
-) -> Int64[np.ndarray, "rays"]:
-    """Find the nearest triangle that the ray from each origin hits; number -1 if there is none."""
-    corners = vectors_to_device(Array3f64, triangles.reshape(-1, 3))
-    order = np.argsort(morton_codes(triangles), kind="stable")
-    tree = Hierarchy.build(corners, order, triangles.mean(axis=(0, 1)))
-    ray = Ray(vectors_to_device(Array3f64, origins), Array3f64(*direction.tolist()))
-    return to_host(nearest_hit(tree, ray, Float64(dr.inf), Bool(True)).number).astype(np.int64)
-
-
 def body_bounds(
     triangles: Triangles, first_triangle: Int64[np.ndarray, "bodies+1"]
 ) -> FloatArray[np.ndarray, "bodies 6"]:
@@ -190,18 +181,30 @@ def bounding_spheres(
 
 
 def first_hits(
-    triangles: Triangles, origin: FloatArray[np.ndarray, "3"], directions: FloatArray[np.ndarray, "rays 3"]
+    triangles: Triangles, origins: FloatArray[np.ndarray, "#rays 3"], directions: FloatArray[np.ndarray, "#rays 3"]
 ) -> tuple[FloatArray[np.ndarray, "rays"], Int64[np.ndarray, "rays"]]:
-    """Distance to the first triangle on each ray from an origin, and its number; infinite and -1 if there is none.
+    """Distance to the first triangle on each ray, and its number; infinite and -1 if there is none.
 
-    All triangles are tested: for few rays, or triangles that are used only once.
+    One origin, or one direction, may be that of all rays.
     """
+    origins, directions = np.broadcast_arrays(origins, directions)
     if len(triangles) == 0:
-        return np.full(len(directions), np.inf), np.full(len(directions), -1)
+        return np.full(len(origins), np.inf), np.full(len(origins), -1)
     corners = vectors_to_device(Array3f64, triangles.reshape(-1, 3))
-    ray = Ray(Array3f64(*origin.tolist()), vectors_to_device(Array3f64, directions))
-    distances, numbers = _search_all(corners, UInt32(len(triangles)), ray)
+    ray = Ray(vectors_to_device(Array3f64, origins), vectors_to_device(Array3f64, directions))
+    if len(origins) <= FEW_RAYS:
+        distances, numbers = _search_all(corners, UInt32(len(triangles)), ray)
+    else:
+        order = np.argsort(morton_codes(triangles), kind="stable")
+        distances, numbers = _search_tree(Hierarchy.build(corners, order, triangles.mean(axis=(0, 1))), ray)
     return to_host(distances), to_host(numbers).astype(np.int64)
+
+
+@compiled
+def _search_tree(tree: Hierarchy, ray: Ray) -> tuple[Values, Values]:
+    """Find the distance and the number of the nearest triangle on each ray in the hierarchy of the triangles."""
+    hit = nearest_hit(tree, ray, Float64(dr.inf), Bool(True))
+    return hit.t, hit.number
 
 
 @compiled

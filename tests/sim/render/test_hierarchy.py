@@ -12,7 +12,7 @@ from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
 from marsyard.sim.render.ground import Ray
 from marsyard.sim.render.spline import Terrain, evaluate
-from marsyard.sim.render.triangles import first_hits, nearest_hit, nearest_triangles
+from marsyard.sim.render.triangles import FEW_RAYS, first_hits, nearest_hit
 from marsyard.sim.terrain import Surface
 
 EYE = np.array([0.3, -0.2, 1.1])
@@ -59,16 +59,20 @@ def test_nearest_triangle_equals_exhaustive_search() -> None:
 def test_few_rays_and_parallel_rays_equal_exhaustive_search() -> None:
     objects = _make_triangles(4.0)
     rays = _draw_rays(np.random.default_rng(9), 50)
-    distances, numbers = first_hits(objects.triangles, EYE, rays)
+    distances, numbers = first_hits(objects.triangles, EYE[None], rays)
     expected = cast_triangles(objects, np.broadcast_to(EYE, rays.shape), rays, nearest=0.0)
     np.testing.assert_allclose(distances, expected, rtol=1e-9)
     np.testing.assert_array_equal(numbers >= 0, np.isfinite(expected))
-    assert first_hits(objects.triangles[:0], EYE, rays)[1].tolist() == [-1] * 50
+    assert first_hits(objects.triangles[:0], EYE[None], rays)[1].tolist() == [-1] * 50
     origins = np.random.default_rng(10).uniform(-12.0, 12.0, (500, 3))
     parallel = np.broadcast_to(rays[0], origins.shape)
-    is_hit = np.isfinite(cast_triangles(objects, origins, parallel, nearest=0.0))
-    assert 0.1 < is_hit.mean() < 0.95
-    np.testing.assert_array_equal(nearest_triangles(objects.triangles, origins, rays[0]) >= 0, is_hit)
+    expected = cast_triangles(objects, origins, parallel, nearest=0.0)
+    assert 0.1 < np.isfinite(expected).mean() < 0.95
+    # many rays are searched in a hierarchy, few are tested against all triangles: both find the same triangles
+    distances, numbers = first_hits(objects.triangles, origins, rays[:1])
+    np.testing.assert_allclose(distances, expected, rtol=1e-9)
+    few = first_hits(objects.triangles, origins[:FEW_RAYS], rays[:1])[1]
+    np.testing.assert_array_equal(numbers[:FEW_RAYS], few)
 
 
 def test_hierarchy_contains_the_listed_triangles_only() -> None:
@@ -89,7 +93,7 @@ def test_hierarchy_contains_the_listed_triangles_only() -> None:
     rays = _draw_rays(np.random.default_rng(12), 800)
     ray = Ray(Array3f64(*(EYE + offset).tolist()), vectors_to_device(Array3f64, rays))
     hit = nearest_hit(tree, ray, Float64(np.inf), Bool(True))
-    expected, number = first_hits(objects.triangles[listed], EYE, rays)
+    expected, number = first_hits(objects.triangles[listed], EYE[None], rays)
     np.testing.assert_allclose(to_host(hit.t), expected, rtol=1e-6)
     np.testing.assert_array_equal(to_host(hit.number), np.where(number >= 0, listed[number], -1))
 
