@@ -28,8 +28,9 @@ from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.robust import choose_cases, start_robust
 from marsyard.cli.app import app
+from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.robustness import Kind, Outcome
+from marsyard.reports.robustness import Outcome
 from marsyard.reports.variants import RobustStudy, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
