@@ -3,8 +3,6 @@
 Used for algorithms in this process and in external programs (`marsyard.algorithms.exchange`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

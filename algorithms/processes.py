@@ -1,7 +1,5 @@
 """Processes and their limits: child processes and memory from Linux's /proc (empty or zero elsewhere), and clocks."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re

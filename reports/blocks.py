@@ -4,8 +4,6 @@ A section is a function from rows to blocks (`marsyard.reports.section.create_se
 example. The argument `key` of these functions is the identifier of the figure on the page.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -4,8 +4,6 @@ For each pair of the most influential conditions, a logistic regression on splin
 is validated by its predictions for terrains that were not used for the fit, and drawn only if they are good.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

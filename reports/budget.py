@@ -1,7 +1,5 @@
 """Results of an error budget (`marsyard.campaigns.studies.budget`): sentences, and a section of the report."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict

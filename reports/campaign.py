@@ -1,7 +1,5 @@
 """Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

@@ -5,8 +5,6 @@ Answers (availability), scatter (error ellipse), drivers (conditions that may af
 window or bad pixels, for example).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass

@@ -1,7 +1,5 @@
 """Decision of requirements from stored rows: the cases of each population, and the verdict that they result in."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

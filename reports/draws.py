@@ -1,7 +1,5 @@
 """Figure of the sampled parameters before a run: marginal distributions and all pairs (`marsyard show --figure`)."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

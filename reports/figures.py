@@ -1,7 +1,5 @@
 """Figures of a campaign's rows: scatter and distribution of errors, errors and rates against conditions, outcomes."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Register of the constants that were fitted to data (`fitted.toml`): a comparison with the same data is a fit."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass

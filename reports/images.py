@@ -1,7 +1,5 @@
 """View of images with marks: a system fills panels with images, points, lines and labels, which are drawn here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -5,8 +5,6 @@ the ordinary bounds, every later look uses `SequentialTest`. The probability tha
 at most 1 - confidence, for any number of confirmations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """General plots: cumulative distributions, rates, stacked bars, and panels of points."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any

@@ -3,8 +3,6 @@
 Each system of `marsyard.scenarios.systems` defines the import path of its presentation in `System.report`.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Results of a study of rare violations (`marsyard.campaigns.studies.rare`): sentences, and a section of the report."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Boolean masks of populations (subsets of a campaign's cases), rates with confidence intervals, and their texts."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

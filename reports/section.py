@@ -1,7 +1,5 @@
 """Building blocks of report sections: tables, figures with captions, blocks, and SVG in the page's style."""
 
-from __future__ import annotations
-
 import functools
 import io
 import re

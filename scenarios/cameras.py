@@ -1,7 +1,5 @@
 """Cameras of cases: the optics of the true camera, and the errors of the calibrated camera of an algorithm."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated, cast

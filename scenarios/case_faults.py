@@ -4,8 +4,6 @@ The parameters of each scenario derive a table of their own from `SizedFaults`, 
 instruments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Declarations of columns that several scenarios compute: world, faults, images, algorithms and velocities."""
 
-from __future__ import annotations
-
 from marsyard.scenarios.columns import Column, Kind, condition, error, flag, instrument_error, outcome, text
 
 SITE = (text("site", "site of the terrain"), Column("terrain", Kind.PROVENANCE, "number of the terrain in the bank"))

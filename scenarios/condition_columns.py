@@ -1,7 +1,5 @@
 """Columns of conditions common to several scenarios: sun, contrast, attitude, and provenance of the images."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 

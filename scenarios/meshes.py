@@ -4,8 +4,6 @@ A mesh appears once per period of the terrain: in images with its shadow, and in
 truth). Triangles are oriented when the file is read, because the winding of files is often inverted or mixed.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

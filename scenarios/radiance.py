@@ -1,7 +1,5 @@
 """Light of an image: the sun and the brightness of its light, and haze in dusty air."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float32
 

@@ -5,8 +5,6 @@ may be in metres or another length unit. Its heights must be in metres, and gaps
 must have heights and cell sizes in metres.
 """
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Iterator

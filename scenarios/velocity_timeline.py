@@ -1,7 +1,5 @@
 """Parts of the timelines that descents and the field test share: body, paths, images and velocities."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

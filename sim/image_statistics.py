@@ -1,7 +1,5 @@
 """Statistics of terrain images, of pairs, and of images on maps, to compare rendered with real ones; uncalibrated."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Each task declares the requests of its programs: `VELOCITY_REQUESTS`, `SITE_REQU
 `marsyard.algorithms.exchange.streams.StreamForm.requests` for streams.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial

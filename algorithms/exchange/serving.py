@@ -5,8 +5,6 @@ A persistent program (`serve:`) is started once per worker process, answers many
 the case's folder, and its complete output is the answer.
 """
 
-from __future__ import annotations
-
 import atexit
 import json
 import shutil

@@ -15,8 +15,6 @@ path of minimum cost that is clear and mapped up to the lookahead distance, for 
 disc, which contains the rover's footprint at any heading.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum

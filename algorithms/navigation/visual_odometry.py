@@ -7,8 +7,6 @@ estimate is rejected if it has too few features, is inaccurate, or contradicts t
 remains in use. Features, windows and limits of the flight software are not published in detail; they are assumed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -6,8 +6,6 @@ algorithm was frozen, can confirm it. `marsyard run --confirm` derives the seed 
 (`marsyard.campaigns.store.confirmations`).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field

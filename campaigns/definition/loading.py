@@ -1,7 +1,5 @@
 """Load a campaign: read its file, apply the command-line options, and report all problems together."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence

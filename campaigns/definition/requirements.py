@@ -1,7 +1,5 @@
 """Requirements files: campaign files refer to their requirements by id; stored campaigns are evaluated against them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cache

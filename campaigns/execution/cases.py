@@ -1,7 +1,5 @@
 """Run single cases of a campaign in worker processes, and create their rows (one table row of results per case)."""
 
-from __future__ import annotations
-
 import re
 import time
 import traceback

@@ -10,8 +10,6 @@ as crashed. Workers may join and leave at any time. If the scheduler is restarte
 connects again and cancels all unfinished batches; the executor submits them again.
 """
 
-from __future__ import annotations
-
 import multiprocessing.process
 import threading
 import time

@@ -4,8 +4,6 @@ A worker reports on its status board (shared memory) only which item it runs. Co
 parent measures all times itself.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re

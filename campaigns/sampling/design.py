@@ -11,8 +11,6 @@ of the grid (its number within the block, modulo the size of the grid), and its 
 grid point. A stratified design is computed for all its cases, from one random stream per dispersion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Final, Literal, NamedTuple

@@ -5,8 +5,6 @@ uniform number to a value. The uniform numbers can be independent, correlated or
 distribution can be formulas of other parameters of the campaign; `Dispersion.insert_values` evaluates the formulas.
 """
 
-from __future__ import annotations
-
 import ast
 import math
 import operator

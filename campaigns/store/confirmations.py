@@ -9,8 +9,6 @@ version control, next to the algorithm; entries are never changed or removed. Ki
 - `result`: statuses of the requirements at a look, and the evidence that later looks need
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json

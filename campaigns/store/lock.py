@@ -5,8 +5,6 @@ that other machines do not see. Therefore, the process that uses a folder also u
 Another process takes the folder only if that time does not change for some seconds.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os

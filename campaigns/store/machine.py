@@ -1,7 +1,5 @@
 """Machine and program of a session: Python, platform, processor, and git commit of the sources."""
 
-from __future__ import annotations
-
 import platform
 import re
 import shutil

@@ -3,8 +3,6 @@
 Arrays are stored in `products.npz`, other data in `products.json`.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """Record `campaign.json` of a campaign's folder (definition, program, machine, progress)."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping, Sequence

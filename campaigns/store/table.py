@@ -4,8 +4,6 @@ A layout is the tuple of column names of a stored row (`marsyard.campaigns.store
 different columns. The module also selects the showcase of a report and the cases with the largest errors.
 """
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import itertools

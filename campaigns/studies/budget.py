@@ -4,8 +4,6 @@ Each base case runs with all sources of error, without any, without each one, an
 dispersions and random streams.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ cases are those nearest to a violation, and a random sample of the others; each 
 study is stored in the folder `robust` of the run, whose report evaluates it (`marsyard.reports.variants`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

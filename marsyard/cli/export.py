@@ -1,7 +1,5 @@
 """Commands `marsyard export`, `score`, `dataset`: export data of cases, and score answers computed elsewhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

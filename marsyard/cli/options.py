@@ -1,7 +1,5 @@
 """Options and arguments of several commands of `marsyard`."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from pathlib import Path

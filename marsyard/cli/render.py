@@ -1,7 +1,5 @@
 """Commands `marsyard render` and `gallery`: images of sites."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

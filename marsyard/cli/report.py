@@ -1,7 +1,5 @@
 """Commands `marsyard report`, `confirmations`, `compare`, `dashboard`, `nightly`: evaluate, publish, schedule runs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

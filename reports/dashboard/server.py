@@ -1,7 +1,5 @@
 """HTTP server of a dashboard's folder: it serves files only, to a limited number of connections of limited duration."""
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 import sys

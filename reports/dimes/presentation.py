@@ -3,8 +3,6 @@
 A DIMES case has three images. A velocity stream is an algorithm that answers after each of any number of images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

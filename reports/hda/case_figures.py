@@ -7,8 +7,6 @@ site, a purple plus the reported site. The true maps in Fig. 5 and the true moti
 products raise ValueError.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 

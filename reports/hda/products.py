@@ -1,7 +1,5 @@
 """Products of a landing case, read from files and checked: images, tracks, motion, matches, maps and ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 Figures of a case: errors over time, the map with the track, and the landmarks of the last image.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Presentation of images over a map: recorded next to rendered images, and the matched landmarks of a case."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """Presentation of measured cases (real images): agreement with measured poses, matches, and the algorithm's figures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any

@@ -1,7 +1,5 @@
 """Perspective view of a case: ground, true and estimated path, cameras and points."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Bool

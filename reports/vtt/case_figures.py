@@ -7,8 +7,6 @@ template), and the right subframe around the stereo match. The title contains th
 figure contains a top view of the path, and an enlarged view of the target's estimated positions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

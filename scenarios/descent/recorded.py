@@ -1,7 +1,5 @@
 """Recorded flight from a file, instead of the simulated dynamics: `[parameters.flight]` of a descent campaign."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from decimal import Decimal
 from enum import Enum

@@ -1,7 +1,5 @@
 """Description of a custom algorithm's class or function; its module is imported in a process of its own."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass

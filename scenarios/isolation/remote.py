@@ -4,8 +4,6 @@ The process is started once per worker, constructs the algorithm once, and recei
 after an exception, an exceeded limit or an unreadable answer; the next case starts a new one.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import sys

@@ -1,7 +1,5 @@
 """Faults of the landing scenario."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Errors of inertial navigation at the start of localisation."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -6,8 +6,6 @@ orbiter to the surface point of the pixel. This is exact orthorectification: it 
 point into an orbital image, without an interpolation between the image's pixels.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Annotated
 

@@ -7,8 +7,6 @@ into the later image, from the position of the earlier camera to infinity. The r
 from the nearest point of this curve. For two images from one position, the curve is a single point.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Read `ingest.toml` and `images.csv`, inputs of `marsyard ingest` (docs/real-images.md)."""
 
-from __future__ import annotations
-
 import itertools
 import tomllib
 from collections.abc import Mapping

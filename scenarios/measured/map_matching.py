@@ -7,8 +7,6 @@ if it agrees with the common pose. The yield is the fraction of correct matches 
 that were searched.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

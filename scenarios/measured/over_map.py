@@ -1,7 +1,5 @@
 """Comparison of recorded images with a map, and of rendered images of the same kind with theirs."""
 
-from __future__ import annotations
-
 from enum import Enum
 from typing import Annotated
 

@@ -10,8 +10,6 @@ Poses are interpolated as in a recorded flight (`marsyard.sim.dynamics.recorded`
 motion as they measure a simulated motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal

@@ -7,8 +7,6 @@ frames (`marsyard.sim.camera.label_frames`). The image's size is that of the lab
 to the product or detached; Curiosity's begin with ODL_VERSION_ID.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping, Sequence

@@ -15,8 +15,6 @@ one is subtracted before the conversion to floating point.
 Quaternions rotate from the body's axes to the world's. Except for SPICE the files do not define these axes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from collections.abc import Iterable, Sequence

@@ -11,8 +11,6 @@ Weston, Strapdown Inertial Navigation Technology, ch. 12). The effect of the err
 errors are the same as in the descent.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Parameters of a helicopter with its autopilot, of the air, and of the two parts of its flight (landing paper, V)."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated
 

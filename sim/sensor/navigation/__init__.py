@@ -17,8 +17,6 @@ next solution.
 The landing paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 
