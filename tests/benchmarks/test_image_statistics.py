@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from marsyard.sim.image_statistics import (
+from benchmarks.validation.image_statistics import (
     SIDE,
     compute_ground_statistics,
     compute_image_statistics,
