@@ -84,11 +84,6 @@ class Pds3Product:
     pose: tuple[LabelFrame, RigidTransform] | None
     time_s: float | None
 
-    @property
-    def site_from_rover(self) -> RigidTransform | None:
-        """The rover's pose in the site frame (x north, y east, z down), metres; None if unknown."""
-        return self.pose[1] if self.pose is not None and self.pose[0].name == SITE else None
-
 
 def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
     """Read every camera model of a PDS3 product (.IMG) or detached label (.LBL), in order; the image is not read.

@@ -136,14 +136,6 @@ def test_system_of_another_package_has_no_domain(make_run: MakeRun) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "kind"),
-    [("", RowKind.VERIFICATION), ("spirit-descent", RowKind.FIT), ("dimes-templates", RowKind.VALIDATION)],
-)
-def test_kind_follows_from_the_register(data: str, kind: RowKind) -> None:
-    assert validation_rows.kind_of(data) is kind
-
-
-@pytest.mark.parametrize(
     ("changes", "is_met"),
     [({}, True), ({"measured": 2.1}, False), ({"measured": float("nan")}, False), ({"limit": None}, None),
      ({"sense": "at least"}, False)],
