@@ -1,16 +1,13 @@
-"""Limits and isolation of an algorithm in a process of its own, as parameters, and the device of its worker."""
+"""Limits and isolation of an algorithm in a process of its own: the parameters `executable` of a campaign."""
 
 from __future__ import annotations
 
-import os
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from marsyard.algorithms.exchange.sandbox import find_problem
 
-#: Environment variable: number of a worker process, counted from 0.
-WORKER_NUMBER = "MARSYARD_WORKER_NUMBER"
 #: Device without an accelerator.
 CPU = "cpu"
 
@@ -55,9 +52,3 @@ class ExecutableLimits(BaseModel):
         if self.sandbox and not self.isolated:
             raise ValueError("isolated is false; allowed in the sandbox: true")
         return self
-
-    @property
-    def device(self) -> str:
-        """Device of this worker process."""
-        number = int(os.environ.get(WORKER_NUMBER, "0"))
-        return self.devices[number % len(self.devices)]

@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 
 def describe_factory(factory: Any) -> dict[str, Any]:
-    """Return the kind, members, version and options of a class or function, as JSON values; see `Description`."""
+    """Return kind, members, version and options of a class or function, as JSON values (`AlgorithmDescription`)."""
     version = getattr(factory, "version", None)
     return {
         "kind": type(factory).__name__,
