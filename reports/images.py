@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from marsyard.reports.section import INK, hide_frame, in_page_style
+from marsyard.reports.figure_style import INK, hide_frame, in_page_style
 
 Image = Float[np.ndarray, "_ _"]
 Pixels = Float[np.ndarray, "... 2"]

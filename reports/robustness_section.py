@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from marsyard.campaigns.studies.results import ROBUST
+from marsyard.reports.figure_style import MARKERS, MUTED, SERIES, in_page_style, new_axes
 from marsyard.reports.robustness import ALL_DISPERSIONS, Kind, Outcome, Robustness, sort_key
-from marsyard.reports.section import MARKERS, MUTED, SERIES, Block, Grid, Section, in_page_style, new_axes, svg_figure
+from marsyard.reports.section import Block, Grid, Section, svg_figure
 from marsyard.reports.variants import VariantVerdict
 from marsyard.reports.verdicts import Status
 from marsyard.reports.wording import NOTHING, count, note_text, number, percent

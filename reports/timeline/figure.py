@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from marsyard.reports.section import MARKERS, MUTED, in_page_style
+from marsyard.reports.figure_style import MARKERS, MUTED, in_page_style
 from marsyard.reports.timeline.mesh import camera_outlines, colour
 from marsyard.scenarios.timeline import SurfacePatch, Timeline
 

@@ -20,9 +20,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from scipy import ndimage
 
+from marsyard.reports.figure_style import GRID, INK, MUTED, SERIES, in_page_style
 from marsyard.reports.images import Image, Mark, Panel, box, draw_panels, square
 from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
-from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style
 
 Point = Float[np.ndarray, "2"]
 #: Orange and blue of Okabe and Ito; the true position is a white cross with a dark outline. The target's square is
