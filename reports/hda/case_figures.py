@@ -306,8 +306,7 @@ def _draw_terrain(
     """
     rows, columns = maps.elevation_m.shape
     step = max(1, round(max(rows, columns) / _MAX_DRAWN_CELLS))
-    x = maps.corner_m[0] + maps.cell_m * np.arange(columns)
-    y = maps.corner_m[1] - maps.cell_m * np.arange(rows)
+    grid = np.moveaxis(maps.positions(np.moveaxis(np.indices((rows, columns)), 0, -1)), -1, 0)
     heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
     sides = maps.cell_m * np.array([columns, rows])
     height_range_m = float(np.nanmax(heights) - np.nanmin(heights))
@@ -319,14 +318,14 @@ def _draw_terrain(
     shaded = LightSource(315.0, 45.0).shade_rgb(np.asarray(colours), np.nan_to_num(heights), **style)
     subset = np.s_[::step, ::step]
     axes.plot_surface(
-        *(grid[subset] for grid in np.meshgrid(x, y)), heights[subset], facecolors=shaded[subset], rcount=200,
+        *(coordinate[subset] for coordinate in grid), heights[subset], facecolors=shaded[subset], rcount=200,
         ccount=200, shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
     )  # fmt: skip
     offset_m = 0.02 * float(sides.max()) / exaggeration
     for site, cell in (("apriori", maps.apriori), ("site", maps.site)):
         height = _value_at_cell(heights[..., None], cell)
         if height is not None and np.isfinite(height).all():
-            position = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
+            position = maps.positions(cell)
             axes.plot([position[0]], [position[1]], [float(height[0]) + offset_m], **_SITE_MARKERS[site], zorder=5)
     axes.set_box_aspect((sides[0], sides[1], max(exaggeration * height_range_m, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)

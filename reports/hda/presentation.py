@@ -102,8 +102,7 @@ def _stage_rows(products: Products) -> tuple[list[str], list[TableRow]]:
         safe, hazard = float(np.mean(maps.safety < 0.5)), float(np.mean(maps.safety > 1.5))
         classes = (("safe", safe), ("hazard", hazard), ("unknown", 1.0 - safe - hazard))
         results["Safe landing map"] = ", ".join(f"{name} {100.0 * fraction:.1f} %" for name, fraction in classes)
-        # row and column; y increases towards row 0
-        x, y = maps.corner_m + maps.cell_m * maps.site[::-1] * np.array([1.0, -1.0])
+        x, y = maps.positions(maps.site)
         has_site = bool(np.isfinite(maps.site).all())
         results["Site"] = f"x {number(x)} m, y {number(y)} m (axes of Fig. 4)" if has_site else "no safe site"
     return ["Stage", "Result"], [TableRow([name, text or "not reached"], bool(text)) for name, text in results.items()]

@@ -10,6 +10,7 @@ from pydantic import Field, Tag, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import DimesOptions
+from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.case_faults import Haze, SizedFaults
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.heat_shield import SHIELD_FALL_M_S
@@ -180,8 +181,8 @@ class LandingParameters(Parameters):
     burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS velocity error of the burn per axis")] = 1.0
 
 
-class DescentCameraParameters(Parameters):
-    """The descent camera: focal length 14.67 mm, pixels 12 um, field of view 45 deg.
+class DescentCameraParameters(CalibrationParameters):
+    """The descent camera and the errors of its calibration: focal length 14.67 mm, pixels 12 um, field of view 45 deg.
 
     The distortion is that of an Opportunity navcam (its PDS label).
 
@@ -199,15 +200,6 @@ class DescentCameraParameters(Parameters):
     alignment_error_deg: Annotated[
         float, CALIBRATION, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")
     ] = 0.02
-    focal_error: Annotated[float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of the focal length")] = (
-        0.0002
-    )
-    centre_error_px: Annotated[
-        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the calibrated centre, full-frame")
-    ] = 0.5
-    distortion_error_px: Annotated[
-        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the distortion in the corners")
-    ] = 0.3
 
 
 class InertialParameters(Parameters):
