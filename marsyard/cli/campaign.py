@@ -101,7 +101,7 @@ def run_shard(campaign: Campaign, shard_text: str, directory: Path, executor: Ex
     from marsyard.cli.progress import RunLog
 
     shard = Shard.parse(shard_text)
-    with show_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
+    with show_progress(directory) as progress, RunLog(directory, progress) as log:
         run_campaign(campaign, directory, executor, log, shard)
     typer.echo(f"shard {shard}: the rows are in {directory}; to combine all shards: marsyard merge DIR... --out DIR")
 
