@@ -123,7 +123,6 @@ def test_terminal_report_and_json_state_the_domain_and_missed_checks(run: Path) 
     assert missed in page
     assert 'id="validity"' in page
     report = read_report((run / "report.json").read_text())
-    assert report is not None
     assert [domain.outside for domain in report.validity.domains] == [24, 40]
     assert [item.kind for item in report.validity.missed] == [RowKind.VALIDATION]
 
