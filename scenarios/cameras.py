@@ -30,10 +30,7 @@ def camera_optics(camera: CameraModel) -> Optics:
 
 
 class CalibrationParameters(Parameters):
-    """Errors of the calibrated camera that an algorithm receives.
-
-    The values of the descent camera are assumed for all cameras.
-    """
+    """Errors of the calibrated camera of an algorithm; those of the descent camera are assumed for all."""
 
     focal_error: Annotated[float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of focal length")] = 0.0002
     centre_error_px: Annotated[float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the centre per axis")] = 0.5
