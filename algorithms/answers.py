@@ -3,8 +3,6 @@
 Used for algorithms in this process and in external programs (`marsyard.algorithms.exchange`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -136,10 +134,7 @@ def _type_name(value: object) -> str:
 
 
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """Validate an estimate; a missing time span becomes the last image interval.
-
-    Raises the same error as `check_velocity`.
-    """
+    """Validate an estimate as `check_velocity`; a missing time span becomes the last image interval."""
     estimate = check_velocity(answer, tags_s)
     if estimate.span_s is not None or len(tags_s) < 2:
         return estimate

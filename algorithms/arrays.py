@@ -1,7 +1,5 @@
 """Array types used by all algorithms in type annotations: vectors, lists of points, and images."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float, UInt16
 

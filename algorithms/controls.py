@@ -5,8 +5,6 @@ the protocols `VelocityEstimator`, `SiteEstimator`, `TargetTracker` and `Positio
 those of the designation of a target: without them the tracker does not know what it is to follow.
 """
 
-from __future__ import annotations
-
 import time
 from typing import NoReturn
 

@@ -1,6 +1,4 @@
-"""Processes and their limits: child processes and memory from Linux's /proc (empty or zero elsewhere), and clocks."""
-
-from __future__ import annotations
+"""Processes: their children and memory from Linux's /proc (empty or zero elsewhere), clocks, and a worker's device."""
 
 import ctypes
 import os
@@ -12,6 +10,8 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
+#: Environment variable: number of a worker process, counted from 0.
+WORKER_NUMBER = "MARSYARD_WORKER_NUMBER"
 #: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 #: Loaded here, because nothing should be loaded between a fork and the execution of another program.
@@ -109,3 +109,8 @@ def _read_kilobytes(process: int, file: str, fields: str) -> float:
     except OSError:
         return 0.0
     return float(sum(int(size) for size in re.findall(rf"^{fields}:\s+(\d+) kB", text, re.MULTILINE)))
+
+
+def worker_device(devices: Sequence[str]) -> str:
+    """Return the device of this worker process; the workers receive the devices in turn."""
+    return devices[int(os.environ.get(WORKER_NUMBER, "0")) % len(devices)]

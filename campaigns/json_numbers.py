@@ -1,7 +1,5 @@
 """Numbers that can be missing or infinite in JSON: null."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any
 

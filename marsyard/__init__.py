@@ -4,8 +4,6 @@ This package exports the names of `marsyard.api` and imports that module on firs
 """
 
 # ruff: noqa: F405  (defined by the star import)
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

@@ -1,7 +1,5 @@
 """The command `marsyard`, also as ``python -m marsyard``."""
 
-from __future__ import annotations
-
 import sys
 
 

@@ -6,8 +6,6 @@ range (`range.npy`, m), normals (`normal.npy`, world axes), masks (`rocks.png`; 
 byte-identical shards. Existing shards are complete and are not written again; an interrupted command can be repeated.
 """
 
-from __future__ import annotations
-
 import io
 import itertools
 import json

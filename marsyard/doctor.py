@@ -4,8 +4,6 @@ GL drivers and libraries can crash a process and are therefore tested in separat
 imports only the GL probe from Marsyard, so that the command also runs if other imports fail.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import importlib.metadata

@@ -5,8 +5,6 @@ crashes its process. `marsyard doctor` and the installer run it; it does not imp
 JSON on standard output.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Gallery: images of each site by suitable cameras, on one page and a contact sheet (`marsyard gallery`)."""
 
-from __future__ import annotations
-
 import base64
 import os
 from collections.abc import Sequence

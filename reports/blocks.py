@@ -4,8 +4,6 @@ A section is a function from rows to blocks (`marsyard.reports.section.create_se
 example. The argument `key` of these functions is the identifier of the figure on the page.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -162,7 +160,7 @@ class OutcomesBySize:
 
     - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
       a confidence interval for the last outcome of `styles`
-    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.section.BARS`), in order
+    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.figure_style.BARS`), in order
     - cases: heading of the number of rows
     - wording: function that returns fault type and size in words; an unknown size is empty
     - extra_columns: further columns of the table, each with its heading, its key in `report.json`, a function that

@@ -4,8 +4,6 @@ For each pair of the most influential conditions, a logistic regression on splin
 is validated by its predictions for terrains that were not used for the fit, and drawn only if they are good.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -19,20 +17,11 @@ from matplotlib.figure import Figure
 from marsyard.reports import rates
 from marsyard.reports.column_selection import distinct_columns
 from marsyard.reports.column_values import numbers
-from marsyard.reports.common_sections import rank_drivers
 from marsyard.reports.conditions import CONDITIONS
 from marsyard.reports.decision import requirement_masks
-from marsyard.reports.section import (
-    INK,
-    REQUIREMENT,
-    Block,
-    Grid,
-    Section,
-    Subject,
-    in_page_style,
-    new_axes,
-    svg_figure,
-)
+from marsyard.reports.driver_section import rank_drivers
+from marsyard.reports.figure_style import INK, REQUIREMENT, in_page_style, new_axes
+from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import label, number
 

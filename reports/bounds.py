@@ -6,8 +6,6 @@ its number of cases is the number of terrains whose first case belongs to the po
 least as often as its first case, so this is conservative.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results of an error budget (`marsyard.campaigns.studies.budget`): sentences, and a section of the report."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -12,18 +10,8 @@ from matplotlib.figure import Figure
 from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.studies.contributions import Budget
 from marsyard.campaigns.studies.results import BUDGET, BudgetResult
-from marsyard.reports.section import (
-    GRID,
-    INK,
-    SERIES,
-    Block,
-    Grid,
-    Section,
-    Subject,
-    in_page_style,
-    new_axes,
-    svg_figure,
-)
+from marsyard.reports.figure_style import GRID, INK, SERIES, in_page_style, new_axes
+from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
 from marsyard.reports.wording import count, format_fraction, label, number
 from marsyard.scenarios.columns import split_unit
 

@@ -1,7 +1,5 @@
 """Write the report of a campaign: `report.html`, its data `report.json`, the traceability matrix and JUnit results."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex
@@ -23,6 +21,9 @@ from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.column_values import numbers
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
+from marsyard.reports.consistency import consistency_section
+from marsyard.reports.convergence import convergence_section
+from marsyard.reports.driver_section import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.gallery import CASES_PER_GROUP, gallery_views
 from marsyard.reports.overall import OverallVerdict, multiplicity_text
@@ -48,8 +49,8 @@ from marsyard.sim.cache import hide_folders
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
     common_sections.answers_section, comparison_section, common_sections.scatter_section,
-    common_sections.drivers_section, boundary_section, common_sections.convergence_section,
-    common_sections.consistency_section, common_sections.faults_section, validity_section,
+    drivers_section, boundary_section, convergence_section,
+    consistency_section, common_sections.faults_section, validity_section,
 )  # fmt: skip
 
 #: Sections of a study (`marsyard rare`, `marsyard search`, `marsyard budget`).

@@ -1,7 +1,5 @@
 """Selection of columns for sections: metric, its signed components, conditions that affect it, and categories."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

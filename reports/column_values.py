@@ -1,7 +1,5 @@
 """Values of a column of rows."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from jaxtyping import Float

@@ -7,8 +7,6 @@ otherwise they are compared per terrain if they share terrains, else with terrai
 terrain form a cluster. All p-values are corrected by Holm's method.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 A condition is a column such as the sun elevation; a bin is one of its values, or an interval of values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Figure of the sampled parameters before a run: marginal distributions and all pairs (`marsyard show --figure`)."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence
@@ -17,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports.section import GRID, INK, MAX_VECTOR_POINTS, MUTED, RASTER_DPI, SERIES, in_page_style
+from marsyard.reports.figure_style import GRID, INK, MAX_VECTOR_POINTS, MUTED, RASTER_DPI, SERIES, in_page_style
 from marsyard.reports.statistics.drivers import rank_correlation
 from marsyard.reports.wording import count
 from marsyard.scenarios.columns import split_unit

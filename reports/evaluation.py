@@ -3,8 +3,6 @@
 A study is a run of `marsyard rare`, `search`, `budget` or `robust`; its verdict does not follow from success rates.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

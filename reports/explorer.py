@@ -1,7 +1,5 @@
 """Explorer of a report: data of the two interactive scatter plots, and their script."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Figures of a campaign's rows: scatter and distribution of errors, errors and rates against conditions, outcomes."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Mapping
@@ -16,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports import section
+from marsyard.reports import figure_style
 from marsyard.reports.column_selection import axis_columns, category_column
 from marsyard.reports.column_values import numbers
+from marsyard.reports.figure_style import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.plots import axis_edge, note_beyond
 from marsyard.reports.rates import ENGINE_FAILURES
-from marsyard.reports.section import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.statistics.samples import error_ellipse
 from marsyard.reports.tables import answered_outcomes, outcome_counts
 from marsyard.reports.wording import format_fraction, label, magnitude_label, plain_value
@@ -197,7 +195,7 @@ def error_scatter_against(frame: pd.DataFrame, metric: str, condition: str, boun
     if bound is not None and bound <= top:
         axes.axhline(bound, color=REQUIREMENT, linewidth=1.4, linestyle="--", zorder=3)
     strokes: dict[str, Any] = {"color": INK, "markersize": 9, "clip_on": False}
-    strokes["rasterized"] = bool(unanswered.sum() > section.MAX_VECTOR_POINTS)
+    strokes["rasterized"] = bool(unanswered.sum() > figure_style.MAX_VECTOR_POINTS)
     axes.plot(x[unanswered], np.full(unanswered.sum(), top), "|", **strokes)
     axes.set(xlabel=label(condition), ylabel=textwrap.fill(magnitude_label(metric), 32), ylim=(0.0, top))
     axes.xaxis.set_major_locator(MaxNLocator(5))
@@ -257,7 +255,7 @@ def _finite_magnitudes(
 def _draw_points(
     axes: Axes, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], category: CaseCategory, *, hollow: bool = False
 ) -> None:
-    is_dense = x.size > section.MAX_VECTOR_POINTS
+    is_dense = x.size > figure_style.MAX_VECTOR_POINTS
     axes.plot(
         x, y, linestyle="", marker=category.marker, markersize=3.0 if is_dense else 5.5,
         alpha=0.55 if is_dense else 0.85, markeredgewidth=1.0 if hollow else 0.0,

@@ -1,7 +1,5 @@
 """Register of the constants that were fitted to data (`fitted.toml`): a comparison with the same data is a fit."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -9,12 +7,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-from pydantic.fields import FieldInfo
-
-from marsyard.scenarios.imports import import_object
-
-_PACKAGE = Path(__file__).resolve().parents[1]
 REGISTER = Path(__file__).with_name("fitted.toml")
 
 
@@ -55,28 +47,6 @@ class Constant:
     def concerns(self, system: str, sites: Collection[str]) -> bool:
         """Whether the results of a system over these sites depend on it."""
         return system in self.systems and (not self.sites or not set(self.sites).isdisjoint(sites))
-
-    def value_in_force(self) -> Any:
-        """Read the value from the code or the file. Raises LookupError or ImportError if the place does not exist."""
-        source, _, path = self.where.partition(":")
-        if source.endswith(".toml"):
-            return _descend(tomllib.loads((_PACKAGE / source).read_text(encoding="utf-8")), path.split("."))
-        name, *fields = path.split(".")
-        return _descend(import_object(f"{source}:{name}"), fields)
-
-
-def _descend(value: Any, names: list[str]) -> Any:
-    """Return the value at a path of keys, indices, and fields of pydantic classes (their defaults)."""
-    for name in names:
-        if isinstance(value, Mapping):
-            value = value[name]
-        elif isinstance(value, list):
-            value = value[int(name)]
-        else:
-            is_model = isinstance(value, type) and issubclass(value, BaseModel)
-            fields: Mapping[str, FieldInfo] = value.model_fields if is_model else {}
-            value = fields[name].default
-    return value
 
 
 @cache

@@ -3,8 +3,6 @@
 Only cases with stored products are shown. `marsyard report --gallery` first reruns further cases to store theirs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """View of images with marks: a system fills panels with images, points, lines and labels, which are drawn here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
-from marsyard.reports.section import INK, hide_frame, in_page_style
+from marsyard.reports.figure_style import INK, hide_frame, in_page_style
 
 Image = Float[np.ndarray, "_ _"]
 Pixels = Float[np.ndarray, "... 2"]

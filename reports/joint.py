@@ -5,8 +5,6 @@ the ordinary bounds, every later look uses `SequentialTest`. The probability tha
 at most 1 - confidence, for any number of confirmations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -67,10 +65,7 @@ class JointEvidence:
         return joined
 
     def find_block(self, cases: int) -> str:
-        """Describe an unfinished confirmation, which blocks PASS; empty if all are finished.
-
-        cases: number of cases of the run
-        """
+        """Describe an unfinished confirmation, which blocks PASS of a run with `cases` cases; empty without one."""
         if self.own is not None and cases < self.own.cases:
             return (
                 f"The record announces {count(self.own.cases, 'case')} of confirmation {self.own.number}; this folder "

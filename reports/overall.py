@@ -1,7 +1,5 @@
 """Verdict of a campaign with several requirements: overall verdict, exit status, cases to append, false PASSes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

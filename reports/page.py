@@ -3,8 +3,6 @@
 The explorer is the interactive scatter plot of the page. A driver is a condition that may affect the metric.
 """
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

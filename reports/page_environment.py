@@ -1,7 +1,5 @@
 """Environment of the templates of all pages: report, dashboard, and gallery of sites."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 from pathlib import Path

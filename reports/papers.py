@@ -1,7 +1,5 @@
 """Comparison of a campaign with the numbers of a paper, which are read from a TOML file."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from functools import cache

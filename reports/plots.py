@@ -1,7 +1,5 @@
 """General plots: cumulative distributions, rates, stacked bars, and panels of points."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
 
+from marsyard.reports.figure_style import BARS, INK, MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.rates import CaseFraction, PooledRate
-from marsyard.reports.section import BARS, INK, MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.wording import count as count_text
 
 #: Maximum end of an error axis divided by the requirement's bound; larger errors are counted, not drawn to scale.

@@ -3,8 +3,6 @@
 Each system of `marsyard.scenarios.systems` defines the import path of its presentation in `System.report`.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -145,10 +143,7 @@ _SPACE_CAPTION = (
 
 
 def create_case_view(products: Products, *, complete: bool) -> CaseView:
-    """Create the view of a case, without figures if no system recognizes its products.
-
-    complete: whether the view is for files, which contain all figures
-    """
+    """Create the view of a case, `complete` for files; without figures if no system recognizes its products."""
     kind, timeline = find_case_kind(products), Timeline.from_products(products)
     view = CaseView([]) if kind is None else kind.view(products, complete)
     space = [] if timeline is None else [CaseFigure("space", draw_timeline(timeline), _SPACE_CAPTION, wide=False)]
@@ -157,10 +152,7 @@ def create_case_view(products: Products, *, complete: bool) -> CaseView:
 
 
 def write_case_figures(directory: Path, products: Products) -> list[Path]:
-    """Write a case's figures as PNG on white into a folder; returns their paths.
-
-    Raises OSError if they cannot be written.
-    """
+    """Write a case's figures as PNG on white into a folder; return their paths. Raises OSError on failure."""
     view = create_case_view(products, complete=True)
     figures = {directory / f"{item.name}.png": item.figure for item in view.figures}
     for path, figure in figures.items():

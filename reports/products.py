@@ -1,7 +1,5 @@
 """Reading of a case's products (arrays and texts that it stores for its figures) by type and shape; its preview."""
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Results of a study of rare violations (`marsyard.campaigns.studies.rare`): sentences, and a section of the report."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -15,7 +13,7 @@ from marsyard.campaigns.studies.interval import ProbabilityInterval
 from marsyard.campaigns.studies.rare_decision import Basis, ContinuityCheck, Decision
 from marsyard.campaigns.studies.results import RARE, Replicate
 from marsyard.campaigns.studies.subset import LEVEL_FRACTION
-from marsyard.reports import section
+from marsyard.reports import figure_style, section
 from marsyard.reports.wording import count, format_fraction
 
 #: Maximum number of replicates in the figure.
@@ -142,13 +140,13 @@ def _continuity_note(continuity: ContinuityCheck | None) -> str:
     )
 
 
-@section.in_page_style
+@figure_style.in_page_style
 def _draw_levels(replicates: Sequence[Replicate], max_probability: float) -> Figure:
     """Draw the probability of a margin at or below the threshold of each level, a line for each replicate.
 
     A replicate that reached a violation also has the point of margin 0: its estimated probability of a violation.
     """
-    figure, axes = section.new_axes(6.0, 3.4)
+    figure, axes = figure_style.new_axes(6.0, 3.4)
     for index, replicate in enumerate(replicates[:_MAX_REPLICATES]):
         margins = [value for value in replicate.thresholds if math.isfinite(value)]
         # each level contains this fraction of the cases of the previous level
@@ -156,11 +154,11 @@ def _draw_levels(replicates: Sequence[Replicate], max_probability: float) -> Fig
         if replicate.reached:
             margins, probabilities = [*margins, 0.0], [*probabilities, replicate.probability]
         style: dict[str, Any] = {
-            "color": section.SERIES[index % len(section.SERIES)],
-            "marker": section.MARKERS[index % len(section.MARKERS)],
+            "color": figure_style.SERIES[index % len(figure_style.SERIES)],
+            "marker": figure_style.MARKERS[index % len(figure_style.MARKERS)],
         }
         axes.plot(margins, probabilities, markersize=4, linewidth=1.0, **style)
-    axes.axhline(max_probability, color=section.REQUIREMENT, linestyle="--", linewidth=1.0)
+    axes.axhline(max_probability, color=figure_style.REQUIREMENT, linestyle="--", linewidth=1.0)
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(lambda value, _: probability_text(value))
     axes.set(xlabel="margin (unit of the requirement's bound)", ylabel="probability of a margin at or below")

@@ -1,7 +1,5 @@
 """Typed record of `report.json`: created by the report, and read by the dashboard."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass

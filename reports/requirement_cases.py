@@ -4,8 +4,6 @@ The margin of a case is that of `marsyard.campaigns.definition.margins`: negativ
 population. A driver is a condition that may affect the metric.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence

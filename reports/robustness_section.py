@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 
 from marsyard.campaigns.studies.results import ROBUST
 from marsyard.reports.dispersion_changes import Kind
+from marsyard.reports.figure_style import MARKERS, MUTED, SERIES, in_page_style, new_axes
 from marsyard.reports.robustness import ALL_DISPERSIONS, Outcome, Robustness, sort_key
-from marsyard.reports.section import MARKERS, MUTED, SERIES, Block, Grid, Section, in_page_style, new_axes, svg_figure
+from marsyard.reports.section import Block, Grid, Section, svg_figure
 from marsyard.reports.variants import VariantVerdict
 from marsyard.reports.verdicts import Status
 from marsyard.reports.wording import NOTHING, count, note_text, number, percent

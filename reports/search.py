@@ -3,8 +3,6 @@
 A reduced violation is a violating case in which as few parameters as possible differ from those of the campaign file.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Signature of a report: it shows that this user's installation wrote it from the present rows of a campaign."""
 
-from __future__ import annotations
-
 import hmac
 from pathlib import Path
 

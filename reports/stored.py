@@ -1,7 +1,5 @@
 """Reader of a campaign's folder for reports: rows, record, and products of stored cases."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Cells of terminal tables are `Text` objects, so that brackets in names are not read as markup.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

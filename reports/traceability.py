@@ -1,7 +1,5 @@
 """Algorithms of a campaign, traceability matrix of requirements (`verification.csv`), and verdicts as JUnit XML."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -4,12 +4,9 @@
 where only the package is installed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
-from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +14,6 @@ from typing import Any, Literal
 from pydantic import TypeAdapter
 
 from marsyard.campaigns.json_numbers import Number
-from marsyard.reports.fits import fitted_data
 
 VALIDATION_FILE = Path(__file__).with_name("validation.json")
 Range = tuple[float, float]
@@ -132,19 +128,6 @@ def read_checks(path: Path = VALIDATION_FILE) -> Mapping[str, ValidationCheck]:
 def rows_of_system(system: str) -> list[ValidationRow]:
     """List the packaged rows that concern the verdicts of a system."""
     return [row for check in read_checks().values() for row in check.rows if row.concerns(system)]
-
-
-def kind_of(data: str) -> RowKind:
-    """Return the kind of a comparison with these data; empty for an independent calculation."""
-    if not data:
-        return RowKind.VERIFICATION
-    return RowKind.FIT if data in fitted_data() else RowKind.VALIDATION
-
-
-def find_conditions(conditions: Collection[Conditions], claim: str) -> Conditions:
-    """Return the first conditions whose pattern matches a claim; conditions without quantities if there are none."""
-    found = next((item for item in conditions if fnmatchcase(claim, item.rows)), Conditions())
-    return replace(found, rows="*")
 
 
 def format_range(value: tuple[str, ...] | Range) -> str:

@@ -5,8 +5,6 @@ the run, so that its failures have this weight (`marsyard.reports.statistics.wei
 parameter, the margin of each case is interpolated.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """Formatted texts of reports: numbers, fractions, requirements, names of columns with units, and notes."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Run the algorithms of a case separately: a failure or changed inputs of one algorithm do not affect the others."""
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Base classes of scenarios: scenarios with typed parameters, and scenarios on the terrains of a bank."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, Generic, Protocol, TypeVar

@@ -4,8 +4,6 @@ The first algorithm of a campaign is under test: its columns have no prefix. The
 their label as a prefix (`homography.velocity_error_m_s`), with separate `outcome`, `answered` and `error`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar

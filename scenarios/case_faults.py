@@ -4,8 +4,6 @@ The parameters of each scenario derive a table of their own from `SizedFaults`, 
 instruments.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 
@@ -27,12 +25,8 @@ Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 class SizedFaults(Parameters):
     """Sizes of the faults by name; size 0 means no fault."""
 
-    dust_discs: Annotated[
-        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on the camera window")
-    ] = 0
-    bad_pixels: Annotated[
-        NonNegative, DETECTOR, Field(le=0.5, description="fraction of dead pixels, and fraction of hot pixels")
-    ] = 0.0
+    dust_discs: Annotated[int, OPTICS, Field(ge=0, le=1000, description="number of specks on the camera window")] = 0
+    bad_pixels: Annotated[NonNegative, DETECTOR, Field(le=0.5, description="fraction of dead, and of hot pixels")] = 0.0
 
     @property
     def columns(self) -> dict[str, Scalar]:

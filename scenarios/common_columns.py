@@ -1,13 +1,11 @@
 """Declarations of columns that several scenarios compute: world, faults, images, algorithms and velocities."""
 
-from __future__ import annotations
-
 from marsyard.scenarios.columns import Column, Kind, condition, error, flag, instrument_error, outcome, text
 
 SITE = (text("site", "site of the terrain"), Column("terrain", Kind.PROVENANCE, "number of the terrain in the bank"))
 
 SUN = (
-    condition("sun_azimuth_deg", "azimuth of the sun, clockwise from north"),
+    condition("sun_azimuth_deg", "azimuth, clockwise from north"),
     condition("sun_elevation_deg", "elevation of the sun above the horizon"),
 )
 

@@ -1,20 +1,21 @@
 """Columns of conditions common to several scenarios: sun, contrast, attitude, and provenance of the images."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 
+import cv2
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import Float, Float64, UInt16
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.dynamics import State
-from marsyard.sim.image_statistics import local_contrast
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters
+
+#: Side of the image of which the local contrast is computed, pixels, as in DIMES; and side of its blocks.
+SIDE, BLOCK = 256, 16
 
 
 def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
@@ -32,6 +33,20 @@ def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: Detect
     """
     p10, median, p90 = local_contrast(np.maximum(image - detector.offset_dn, 0.0))
     return {"image_contrast": median, "image_patchiness": p90 / p10 if p10 > 0.0 else np.nan}
+
+
+def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
+    """Compute the 10th, 50th and 90th percentiles over all blocks of (standard deviation / mean of a block).
+
+    The image is resized to `SIDE` x `SIDE` pixels first. The result is NaN if all blocks are black.
+    """
+    small = cv2.resize(np.asarray(image, dtype=np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+    blocks = small.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK)
+    deviation, mean = blocks.std(axis=(1, 3)), blocks.mean(axis=(1, 3))
+    if not np.any(mean > 0.0):
+        return (np.nan, np.nan, np.nan)
+    p10, p50, p90 = np.percentile(deviation[mean > 0.0] / mean[mean > 0.0], [10.0, 50.0, 90.0])
+    return float(p10), float(p50), float(p90)
 
 
 def off_nadir_deg(state: State) -> float:

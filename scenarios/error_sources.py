@@ -1,7 +1,5 @@
 """Sources of error of a scenario's cases; an error budget removes them one by one (`marsyard budget`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Distant hills, and occlusion of the ground at grazing view by rocks below the rendering resolution."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Images with the truth of each pixel, to train and test learned methods (`marsyard dataset`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable

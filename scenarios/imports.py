@@ -1,7 +1,5 @@
 """Import objects by ``module:name``, and find the sources of their packages."""
 
-from __future__ import annotations
-
 import importlib
 import importlib.util
 import sys

@@ -1,7 +1,5 @@
 """Read-only copies of the inputs of an algorithm, and hashes that show whether the inputs were changed."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Estimators of landing sites: their task, and the columns of their stages, in simulated flights and real images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

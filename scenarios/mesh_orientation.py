@@ -3,8 +3,6 @@
 Images, range and landing site truth use only triangles that face the observer: inverted triangles would be invisible.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ Such a value is repeated exactly and has cliffs at its border, as natural ground
 terraces of quantised heights) continues at its border in small steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ refusal; ``export:FOLDER::bits-per-pixel=B`` writes images after lossy compressi
 answers in a table.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import shutil

@@ -1,15 +1,38 @@
-"""Light of an image: the sun and the brightness of its light, and haze in dusty air."""
+"""Light of an image: ground and sun of a site, the brightness of the sunlight, and haze in dusty air."""
 
-from __future__ import annotations
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32
 
+from marsyard.scenarios.views import SiteGround
 from marsyard.sim.frames import direction
 from marsyard.sim.render import Frame, Sun
 from marsyard.sim.render.reflectance import add_air_light
 from marsyard.sim.sensor import DetectorParameters
-from marsyard.sim.terrain import Environment
+from marsyard.sim.terrain import Environment, Surface
+
+
+@dataclass(frozen=True)
+class SiteWorld:
+    """Ground of a site with its reflectance and atmosphere, and its sun.
+
+    brightness: sunlight at the ground divided by the reference sunlight of the detector's responsivity
+    """
+
+    ground: SiteGround
+    sun: Sun
+    brightness: float = 1.0
+
+    @property
+    def air(self) -> Environment:
+        """Atmosphere of the site."""
+        return self.ground.site.environment
+
+    @property
+    def surface(self) -> Surface:
+        """Surface of the ground; it is periodic."""
+        return self.ground.surface
 
 
 def add_haze(frame: Frame, air: Environment, sun: Sun, extinction_m: float) -> Float32[np.ndarray, "rows columns"]:

@@ -4,8 +4,6 @@ Worker processes and later replays load the object from the file. An object of a
 import path and state; a class or function of a notebook is stored with its code.
 """
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import inspect

@@ -1,7 +1,5 @@
 """Streams in cases: the measurements of a case are passed one by one to an estimator, and its answers are collected."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 

@@ -26,9 +26,10 @@ from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms import exchange
+from marsyard.algorithms.processes import worker_device
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.isolation.host import construct, reset
-from marsyard.scenarios.isolation.remote import Description, RemoteAlgorithm, describe
+from marsyard.scenarios.isolation.remote import AlgorithmDescription, RemoteAlgorithm, describe_in_process
 from marsyard.scenarios.offline_algorithms import AnswerFormat, answers_file, create_offline, is_offline, read_answers
 from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
 from marsyard.scenarios.systems import systems
@@ -139,7 +140,7 @@ class Task(Generic[Algorithm, Options]):
         path = custom_path(spec, self.shipped)
         if limits.isolated:
             return RemoteAlgorithm(path, limits, {item.__qualname__: item for item in self.answers})
-        algorithm = construct(_import(path), limits.device)
+        algorithm = construct(_import(path), worker_device(limits.devices))
         reset(algorithm)
         return algorithm
 
@@ -182,11 +183,11 @@ def custom_path(spec: str, shipped: Collection[str] = ()) -> str:
     raise ValueError(f"unknown algorithm '{spec}'{hint}; allowed: {', '.join(allowed)}, or {custom}")
 
 
-def describe_custom(spec: str, shipped: Collection[str] = ()) -> Description:
+def describe_custom(spec: str, shipped: Collection[str] = ()) -> AlgorithmDescription:
     """Describe a custom algorithm, imported in a process of its own. Raises ValueError if it cannot be imported."""
     path = custom_path(spec, shipped)
     try:
-        return describe(path)
+        return describe_in_process(path)
     except ImportError as error:
         raise ValueError(_import_problem(spec, path, error)) from error
 
@@ -261,9 +262,7 @@ class AlgorithmSelection(Parameters):
     task: ClassVar[Task[Any, Any]]
 
     algorithm: str
-    compared: Annotated[
-        tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
-    ] = ()
+    compared: Annotated[tuple[str, ...], Field(description="further algorithms, compared on the same cases")] = ()
     executable: Annotated[exchange.ExecutableLimits, Field(description="limits and isolation of custom algorithms")] = (
         exchange.ExecutableLimits()
     )

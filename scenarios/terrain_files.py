@@ -5,8 +5,6 @@ may be in metres or another length unit. Its heights must be in metres, and gaps
 must have heights and cell sizes in metres.
 """
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Iterator
@@ -264,10 +262,7 @@ class NoInverseError(Exception):
 
 
 def map_scale(file: Any) -> MapScale | None:
-    """Compute the scale of a rasterio dataset's projection at its centre; None if its terms are unknown.
-
-    Raises NoInverseError for a projection without inverse.
-    """
+    """Compute a projection's scale at a dataset's centre; None if unknown. Raises NoInverseError without inverse."""
     from rasterio._err import CPLE_BaseError  # GDAL's errors, which are no RasterioError
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError

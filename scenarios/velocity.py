@@ -4,8 +4,6 @@ The answer of a velocity estimator is a mean velocity over a span: the interval 
 answer is the true mean velocity over the same span.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Parts of the timelines that descents and the field test share: body, paths, images and velocities."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,10 +55,7 @@ class VelocityCase:
     increments: ImuIncrements | None = None
 
     def timeline(self, estimate: VelocityEstimate | None, start: State | None) -> Timeline:
-        """Create the timeline with an estimate.
-
-        start: true state at the start of the estimate's time span; None for no estimated path
-        """
+        """Create the timeline; `start` is the true state at the start of the estimated path, or None without one."""
         motion = self.motion
         paths = {"true": Path.from_motion(motion)}
         if estimate is not None and estimate.velocity_m_s is not None and start is not None:

@@ -1,7 +1,5 @@
 """Disk cache of arrays: location, size limit, eviction, atomic writing and checksums."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -7,8 +7,6 @@ An error budget removes the sources of a scenario one by one. A source consists 
 A mark on a whole table replaces the marks inside. A table that may be absent is itself the parameter.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

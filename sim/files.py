@@ -1,7 +1,5 @@
 """Safe reading of user files: regular files only; the expanded size of archives is checked before they are read."""
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

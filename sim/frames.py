@@ -11,8 +11,6 @@ Transforms are SciPy's `RigidTransform` and `Rotation`. Their names contain the 
 (``quaternion_xyzw``, SciPy's order, or ``quaternion_wxyz``, the order of PDS labels).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform, Rotation

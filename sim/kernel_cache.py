@@ -5,8 +5,6 @@ cached function would then return outdated results. Therefore a change of any ke
 names its files by a hash of the compiled instructions, so one folder suffices.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import platform

@@ -1,7 +1,5 @@
 """Base class and field types of all user parameters."""
 
-from __future__ import annotations
-
 import tomllib
 import types
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ A study of rare violations moves through the noise of cases in small steps: `Str
 several cases, so that the normal and uniform numbers change continuously with the weights, and keep their distribution.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ corrected as in DIMES. The baselines match one large square of the overlap regio
 the two velocities is that of DIMES, with the same threshold. Only the measurement of the shift differs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final

@@ -1,7 +1,5 @@
 """Binning of descent images for DIMES and its baselines, and the cameras of binned images above the ground plane."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -3,8 +3,6 @@
 Figures are those of Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -3,8 +3,6 @@
 The method is section II of Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import final
 

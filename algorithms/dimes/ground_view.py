@@ -1,7 +1,5 @@
 """Ground points in a binned image: projection, frame, and lattices of ground points."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Bool, Float
 

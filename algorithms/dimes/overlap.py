@@ -4,8 +4,6 @@ Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero
 anti-solar point, which the opposition surge brightens; it moves with the lander and is masked.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -12,8 +12,6 @@ do not affect velocities, even over terrain of 2 % contrast. At +23 deg C the ra
 contrast few tracks are valid and no velocity is reported; over terrain of 15 % contrast errors double to 0.07 m/s.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float

@@ -3,8 +3,6 @@
 Sections are those of Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum

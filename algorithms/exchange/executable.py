@@ -4,8 +4,6 @@ Each task declares the requests of its programs: `VELOCITY_REQUESTS`, `SITE_REQU
 `marsyard.algorithms.exchange.streams.StreamForm.requests` for streams.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -91,10 +89,7 @@ class ExecutableAlgorithm:
 
 
 class ExecutableTargetTracker(ExecutableAlgorithm):
-    """Target tracker that runs an external program.
-
-    - state: state of the tracker according to its last answer
-    """
+    """Target tracker that runs an external program. `state` is that of its last answer."""
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         super().__init__(command, limits, TRACKER_REQUESTS)

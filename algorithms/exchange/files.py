@@ -5,8 +5,6 @@ stores the shortest decimal text that reads back as the same float64. Attitudes 
 quaternions are normalised when they are read.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Forms of the answers of each task in JSON: their outcomes and numbers, for programs and tables of answers."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

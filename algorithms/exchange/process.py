@@ -24,7 +24,7 @@ from typing import IO
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.sandbox import sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.processes import AwakeClock, descendants, end_with_parent, kill, resident_bytes
+from marsyard.algorithms.processes import AwakeClock, descendants, end_with_parent, kill, resident_bytes, worker_device
 
 #: Interval of the checks of time, memory and output, and of the files' size, seconds.
 _POLL_S, _FILES_POLL_S = 0.02, 0.5
@@ -122,7 +122,7 @@ class RunningProgram:
         self.limits = limits
         self.folder = folder or temporary_folder()
         self._stdout, self._stderr = bytearray(), bytearray()
-        environment = {**os.environ, "TMPDIR": str(self.folder), DEVICE_VARIABLE: limits.device}
+        environment = {**os.environ, "TMPDIR": str(self.folder), DEVICE_VARIABLE: worker_device(limits.devices)}
         if limits.sandbox:
             readable = [*readable, *map(Path, limits.visible)]
             words = sandbox_words(words, environment, self.folder, working_folder or Path.cwd(), readable)

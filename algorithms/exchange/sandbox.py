@@ -5,8 +5,6 @@ process, no network, no environment variables of the user, and no other files: n
 its seed, nor the cache of terrains.
 """
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

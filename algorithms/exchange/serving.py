@@ -5,8 +5,6 @@ A persistent program (`serve:`) is started once per worker process, answers many
 the case's folder, and its complete output is the answer.
 """
 
-from __future__ import annotations
-
 import atexit
 import json
 import shutil
@@ -46,10 +44,7 @@ def parse_object(output: Output) -> Mapping[str, Any]:
 
 @dataclass
 class Server:
-    """Running program that has written its greeting line.
-
-    - request_count: Number of requests sent, which is the `id` of the last request
-    """
+    """Running program that has written its greeting line; `request_count` is the `id` of the last request."""
 
     child: RunningProgram
     request_count: int = 0

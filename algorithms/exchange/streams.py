@@ -1,7 +1,5 @@
 """Streams (`marsyard.algorithms.interface.ImageStream`) as programs: requests, and a server for Python streams."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Callable, Iterable, Mapping

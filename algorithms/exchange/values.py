@@ -4,8 +4,6 @@ Arrays are lists. A rotation is a unit quaternion, scalar last; a pose is a posi
 A number that is not finite (no reading) is null, and a missing value has no key.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import fields, is_dataclass

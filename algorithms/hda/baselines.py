@@ -3,8 +3,6 @@
 All other stages are those of `HdaEstimator`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import final
 

@@ -1,7 +1,5 @@
 """Elevation map of a landing site from points of the ground (section II.D), and filling of its small holes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The estimator uses it with the option `check_footprints`; without it, the safe l
 (`marsyard.algorithms.hda.hazards`), as published.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

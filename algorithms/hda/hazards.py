@@ -5,8 +5,6 @@ With the option `check_footprints`, the estimator replaces section III's safe la
 Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

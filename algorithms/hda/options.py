@@ -1,7 +1,5 @@
 """Options of the hazard detection, with the reasons for their defaults."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum

@@ -3,8 +3,6 @@
 The published algorithm compares the images as they are. Both steps belong to `hda-plus`.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

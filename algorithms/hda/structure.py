@@ -3,8 +3,6 @@
 Sections and equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -20,10 +18,7 @@ from marsyard.algorithms.hda.preparation import prepare_views
 
 
 class MatchStatus(IntEnum):
-    """Result of a structure match: accepted, or the failed check.
-
-    The checks are correlation, depth bounds and forward-backward consistency.
-    """
+    """Result of a structure match: accepted, or failed correlation, depth bounds, or forward-backward consistency."""
 
     ACCEPTED = 0
     DISSIMILAR = 1

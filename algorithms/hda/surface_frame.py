@@ -5,8 +5,6 @@ image columns, y is the cross product of z and x. The options select the source 
 frame in the world comes from the on-board pose.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

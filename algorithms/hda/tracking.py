@@ -3,8 +3,6 @@
 Sections and equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ Section II.A is that of Johnson et al., "Field Testing of the MER DIMES". The tr
 Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -12,8 +12,6 @@ rows before R, and T the sum over all delivered rows. Within its delivered row a
 average in each direction. For known T this is a linear recursion in P. T follows from P_M = T, which is linear in T.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import scipy  # scipy.signal is slow to import: it is loaded at its first use
 from jaxtyping import Float

@@ -1,7 +1,5 @@
 """Interest operators for the selection of templates and features: structure tensor and Harris interest."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Float

@@ -7,8 +7,6 @@ linear map removes this bias. A curved surface seen from another position is als
 map removes the bias due to this distortion.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, Literal
 

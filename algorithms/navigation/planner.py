@@ -15,8 +15,6 @@ path of minimum cost that is clear and mapped up to the lookahead distance, for 
 disc, which contains the rover's footprint at any heading.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
@@ -37,8 +35,8 @@ _TURNS_DEG = (0.0, 20.0, -20.0, 40.0, -40.0, 60.0, -60.0, 80.0, -80.0, 100.0, -1
 #: Number of candidate curvatures and of candidate lengths of the first arc, and its maximum length as a fraction of the
 #: distance to the goal.
 _GRID_COUNT, _MAX_FIRST_FRACTION = 9, 0.75
-#: Distance between checked points of a path, metres, and number of points of a returned path.
-_CHECK_STEP_M, _PATH_POINTS = 0.1, 60
+#: Distance between checked points of a path, metres.
+_CHECK_STEP_M = 0.1
 
 
 @dataclass(frozen=True)
@@ -94,15 +92,10 @@ class NavigationOutcome(Enum):
 
 @dataclass(frozen=True)
 class NavigationPlan:
-    """Result of `navigate`: the next step to drive.
-
-    - commands: Drive commands of one step along the path, in order; empty unless the outcome is PATH
-    - path_m: The complete path (east, north) in the estimated world frame; empty without a path
-    """
+    """Result of `navigate`: drive commands of one step along the path, in order; empty unless the outcome is PATH."""
 
     outcome: NavigationOutcome
     commands: tuple[DriveCommand, ...]
-    path_m: Float[np.ndarray, "n 2"]
 
 
 def navigate(
@@ -123,20 +116,17 @@ def navigate(
     position = world_from_rover.translation[:2]
     world_from_forward = _rotation_matrix(np.arctan2(forward[1], forward[0]))
     goal = np.asarray((goal_m - position) @ world_from_forward)
-    no_path = np.empty((0, 2))
     if float(np.hypot(*goal)) < AT_GOAL_M:
-        return NavigationPlan(NavigationOutcome.AT_GOAL, (), no_path)
+        return NavigationPlan(NavigationOutcome.AT_GOAL, ())
     goodness = terrain.goodness(options.limits)
     if np.isnan(goodness.at(position[None])[0]):
-        return NavigationPlan(NavigationOutcome.NOT_MAPPED, (), no_path)
+        return NavigationPlan(NavigationOutcome.NOT_MAPPED, ())
     for path in _generate_paths(goal, options):
         lookahead_distances = np.arange(0.0, min(path.length_m, options.lookahead_m), _CHECK_STEP_M)
         lookahead_points = position + path.points(lookahead_distances) @ world_from_forward.T
         if _is_clear(lookahead_points, goodness, options):
-            path_distances = np.linspace(0.0, path.length_m, _PATH_POINTS)
-            path_points = np.asarray(position + path.points(path_distances) @ world_from_forward.T)
-            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards), path_points)
-    return NavigationPlan(NavigationOutcome.NO_PATH, (), no_path)
+            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards))
+    return NavigationPlan(NavigationOutcome.NO_PATH, ())
 
 
 @dataclass(frozen=True)

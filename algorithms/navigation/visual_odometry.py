@@ -7,8 +7,6 @@ estimate is rejected if it has too few features, is inaccurate, or contradicts t
 remains in use. Features, windows and limits of the flight software are not published in detail; they are assumed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 
@@ -92,10 +90,7 @@ def estimate_motion(
     predicted: RigidTransform,
     options: VisualOdometryOptions | None = None,
 ) -> MotionEstimate:
-    """Estimate the rover's motion between two stereo pairs.
-
-    `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
-    """
+    """Estimate the motion between two stereo pairs; `predicted` is the second rover frame in the first."""
     options = VisualOdometryOptions() if options is None else options
     first_pair, second_pair = RectifiedPair.from_measurement(first), RectifiedPair.from_measurement(second)
     pixels = _detect_features(first_pair, options)

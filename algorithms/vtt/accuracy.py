@@ -6,8 +6,6 @@ Errors are in metres, and in centimetres in the rows of Table I. They are 3-sigm
 Sections, equations and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from decimal import ROUND_HALF_UP, Decimal
 

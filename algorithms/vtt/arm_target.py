@@ -1,7 +1,5 @@
 """Hand-off of the tracked target to the arm, at the goal of an approach (tracking paper, sections 3, 7.4)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

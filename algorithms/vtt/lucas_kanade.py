@@ -3,8 +3,6 @@
 Eq. 11 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8

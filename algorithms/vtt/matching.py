@@ -3,8 +3,6 @@
 Sections and equations are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -101,10 +99,7 @@ def extract_patch(
 
 
 def search_window(image: MastImage, pixel: Vector2, side: int) -> tuple[Counts, tuple[int, int]]:
-    """Extract a square of `side` pixels around a full-frame pixel, clipped to the image.
-
-    Also returns the full-frame pixel (u, v) of its upper left corner.
-    """
+    """Extract a square of `side` pixels around a pixel, clipped to the image, and its upper left corner (u, v)."""
     start = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
     end = np.maximum(start + side, 0)
     start = np.maximum(start, 0)

@@ -7,8 +7,6 @@ collisions of the arm's tools with the terrain, and selects another target nearb
 The section is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

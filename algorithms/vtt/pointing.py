@@ -6,8 +6,6 @@ at the image centre, with the calibrated camera models (including lens distortio
 Sections are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 

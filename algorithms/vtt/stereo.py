@@ -3,15 +3,13 @@
 Sections are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
 
-from marsyard.algorithms.arrays import Patch, Points2, Raster, Vector2, Vector3
+from marsyard.algorithms.arrays import Patch, Points2, Vector2, Vector3
 from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, normalized_correlation
 from marsyard.algorithms.vtt.matching import Refinement, refine_match
 from marsyard.algorithms.vtt.options import VttOptions
@@ -26,14 +24,10 @@ class StereoMatch:
     - pixel: (u, v) in the right full frame
     - score: Normalised correlation of the warped template. A slanted face is stretched in the right image. At slants of
       63 to 76 deg the correlation at the correct position is 0.66 to 0.70 without the warp, and above 0.9 with it.
-    - band: The searched part of the right image, counts
-    - band_corner: (u, v) of the band's upper left pixel in the full frame
     """
 
     pixel: Vector2
     score: float
-    band: Raster
-    band_corner: tuple[int, int]
 
 
 #: Origin and unit direction of a line of sight.
@@ -94,12 +88,7 @@ def point_stereo(
     best = Refinement(corner, peak.value, peak.value)
     if options.subpixel:
         best = refine_match(template, image, corner, biquadratic_offset(surface, peak), peak, options)
-    return StereoMatch(
-        pixel=best.corner[::-1] + half + image.corner,
-        score=best.warped_score,
-        band=band,
-        band_corner=(int(start[0]) + image.corner[0], int(start[1]) + image.corner[1]),
-    )
+    return StereoMatch(pixel=best.corner[::-1] + half + image.corner, score=best.warped_score)
 
 
 def triangulate(left: CameraModel, right: CameraModel, left_pixel: Vector2, right_pixel: Vector2) -> Vector3 | None:

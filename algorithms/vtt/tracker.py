@@ -137,7 +137,7 @@ class VttDetails:
     - azimuth_change_rad: Change of the direction in the world since the last match, positive to the right
     - position_world: Triangulated target in the estimated world frame, metres; None without triangulation
     - step_m: Estimated rover displacement since the last match
-    - evidence, allowed: Input of the loss criteria and their tolerances; None at the seed and for incomplete updates
+    - evidence: Input of the loss criteria; None at the seed and for incomplete updates
     """
 
     seeded: bool
@@ -154,7 +154,6 @@ class VttDetails:
     position_world: Vector3 | None = None
     step_m: float = 0.0
     evidence: MatchEvidence | None = None
-    allowed: Tolerances | None = None
 
 
 @dataclass(frozen=True)
@@ -413,7 +412,6 @@ def check_losses(
         step_m=distances.step_m,
         azimuth_change_rad=float(np.arctan2(np.sin(azimuth_change), np.cos(azimuth_change))),
         evidence=evidence,
-        allowed=allowed,
     )
     losses = find_losses(evidence, allowed, options)
     return TrackResult(losses, details) if losses else replace(result, details=details)

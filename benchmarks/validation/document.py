@@ -8,22 +8,22 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, replace
+from fnmatch import fnmatchcase
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from benchmarks.validation.records import Check, Measure
 from benchmarks.validation.scenes import renderer
+from marsyard.reports.fits import fitted_data
 from marsyard.reports.validation_rows import (
     VALIDATION_FILE,
     Conditions,
     RowKind,
     ValidationCheck,
     ValidationRow,
-    find_conditions,
-    kind_of,
     to_json,
 )
 from marsyard.sim.kernel_cache import processor_features
@@ -100,6 +100,19 @@ def _create_row(row: dict[str, Any], conditions: Conditions) -> ValidationRow:
     """Combine a stored measurement with its conditions."""
     numbers = {name: None if row[name] is None else float(row[name]) for name in ("measured", "limit")}
     return ValidationRow(**row | numbers, conditions=conditions, kind=kind_of(conditions.data))
+
+
+def kind_of(data: str) -> RowKind:
+    """Return the kind of a comparison with these data; empty for an independent calculation."""
+    if not data:
+        return RowKind.VERIFICATION
+    return RowKind.FIT if data in fitted_data() else RowKind.VALIDATION
+
+
+def find_conditions(conditions: Collection[Conditions], claim: str) -> Conditions:
+    """Return the first conditions whose pattern matches a claim; conditions without quantities if there are none."""
+    found = next((item for item in conditions if fnmatchcase(claim, item.rows)), Conditions())
+    return replace(found, rows="*")
 
 
 def write_pages(checks: Sequence[Check], stored: dict[str, dict]) -> None:

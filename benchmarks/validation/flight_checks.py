@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 import marsyard
-from benchmarks.validation.records import Check, Measure
-from marsyard.algorithms.dimes.details import TRACK_COLUMNS
-from marsyard.reports.validation_rows import Conditions
-from marsyard.sim.image_statistics import (
+from benchmarks.validation.image_statistics import (
     ImageStatistics,
     PairStatistics,
     compute_image_statistics,
     compute_pair_statistics,
 )
+from benchmarks.validation.records import Check, Measure
+from marsyard.algorithms.dimes.details import TRACK_COLUMNS
+from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.sensor import preset
 from marsyard.site_images import ImageRequest, render_images
 

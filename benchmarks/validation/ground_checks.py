@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, measure_within
+from benchmarks.validation.image_statistics import BLOCK, GroundStatistics, compute_ground_statistics
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.validation_rows import Conditions
-from marsyard.sim.image_statistics import BLOCK, GroundStatistics, compute_ground_statistics
 from marsyard.sim.terrain import sites
 from marsyard.site_images import ImageRequest, RenderedImage, render_images, truth_layers
 

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, copy_image
+from benchmarks.validation.image_statistics import MapStatistics, compute_map_statistics
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.localisation.instruments import true_camera
@@ -20,7 +21,6 @@ from marsyard.scenarios.localisation.parameters import LocalisationScenarioParam
 from marsyard.scenarios.localisation.scenario import LocalisedDescent
 from marsyard.scenarios.localisation.sites import localisation_site
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.image_statistics import MapStatistics, compute_map_statistics
 from marsyard.sim.streams import Streams
 
 #: Size of a map pixel to which map and images are reduced, m; half the field of view of the rectified images, degrees.

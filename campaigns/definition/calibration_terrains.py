@@ -1,7 +1,5 @@
 """Terrains that a confirmation shares with its calibration runs."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from marsyard.campaigns.definition.campaign import Campaign, replace_values

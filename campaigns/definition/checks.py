@@ -1,7 +1,5 @@
 """Check a campaign against its scenario before any case runs: dispersions, requirements and calibrated options."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -6,8 +6,6 @@ algorithm was frozen, can confirm it. `marsyard run --confirm` derives the seed 
 (`marsyard.campaigns.store.confirmations`).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -181,10 +179,7 @@ class Evidence:
 
 
 def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:
-    """Determine the kind of evidence of a run that was not started as a confirmation.
-
-    confirmations: entries of the record of confirmations
-    """
+    """Determine the evidence of a run that is no confirmation, from the record of `confirmations`."""
     definition = campaign.definition
     name, seed = definition.name, definition.seed
     for entry in confirmations:

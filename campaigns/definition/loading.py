@@ -1,7 +1,5 @@
 """Load a campaign: read its file, apply the command-line options, and report all problems together."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -30,10 +28,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def find_campaign(name_or_path: str) -> Path:
-    """Return the file of a campaign, from its name in the catalogue or from the path of a TOML file.
-
-    Raises DefinitionError if there is no such file.
-    """
+    """Return a campaign's file, from its name in the catalogue or its path. Raises DefinitionError if there is none."""
     path = Path(name_or_path)
     if path.suffix == ".toml" or len(path.parts) > 1:
         if not path.is_file():

@@ -9,8 +9,6 @@
   requirement: their margin is minus infinity.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

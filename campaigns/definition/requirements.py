@@ -1,7 +1,5 @@
 """Requirements files: campaign files refer to their requirements by id; stored campaigns are evaluated against them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import cache
@@ -36,10 +34,7 @@ class _RequirementsFile(Parameters):
 
 
 def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
-    """Read the requirements of a file.
-
-    Raises DefinitionError if it is unreadable or invalid; every problem has its key.
-    """
+    """Read the requirements of a file. Raises DefinitionError, in which every problem has its key, if it is invalid."""
     requirements = read_table(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
     repeated_ids = sorted({name for name in ids if ids.count(name) > 1})

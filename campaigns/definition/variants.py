@@ -1,7 +1,5 @@
 """Variants of the models of a system: alternatives to assumed or calibrated values (`variants.toml` of its folder)."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from pydantic import Field

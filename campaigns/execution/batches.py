@@ -1,7 +1,5 @@
 """Batches of items for worker processes, sized by the measured time per item."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterable

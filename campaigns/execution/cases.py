@@ -1,7 +1,5 @@
 """Run single cases of a campaign in worker processes, and create their rows (one table row of results per case)."""
 
-from __future__ import annotations
-
 import re
 import time
 import traceback
@@ -36,10 +34,7 @@ _MAX_TEXT = 8000
 
 @dataclass(frozen=True)
 class CompletedCase:
-    """Row of a case and, if they are stored, its products.
-
-    `note` describes why products could not be stored, and how the case changed its worker process.
-    """
+    """Row of a case, its products if stored, and a note on products or changes of the worker process."""
 
     row: Row
     products: PackedProducts | None = None
@@ -236,10 +231,7 @@ def _build_finished_row(
 
 
 def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Convert the columns of a scenario, including NumPy scalars, to plain Python values.
-
-    Raises ValueError or TypeError if a column cannot be stored.
-    """
+    """Convert columns, also NumPy scalars, to Python values. Raises ValueError or TypeError if one cannot be stored."""
     reserved_names = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
     if reserved_names:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(reserved_names)}")

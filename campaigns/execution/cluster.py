@@ -10,8 +10,6 @@ as crashed. Workers may join and leave at any time. If the scheduler is restarte
 connects again and cancels all unfinished batches; the executor submits them again.
 """
 
-from __future__ import annotations
-
 import multiprocessing.process
 import threading
 import time
@@ -216,10 +214,7 @@ class _BatchQueue:
             raise CampaignError(f"the cluster has had no workers for {_NO_WORKERS_S / 60:.0f} minutes")
 
     def _collect(self, future: Any, batch: Sequence[int]) -> list[TaskResult[Any]]:
-        """Return the results of a batch; empty if it was lost and is queued again.
-
-        Raises CampaignError if the cluster cannot run batches.
-        """
+        """Return a batch's results; none if it was lost and queued again. Raises CampaignError if none can run."""
         try:
             if future.status == "cancelled":
                 raise CancelledError

@@ -1,7 +1,5 @@
 """Select the executor of a campaign: processes on this machine, or a cluster."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ A worker reports on its status board (shared memory) only which item it runs. Co
 parent measures all times itself.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re
@@ -21,8 +19,7 @@ from typing import Any
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from marsyard.algorithms.exchange.limits import WORKER_NUMBER
-from marsyard.algorithms.processes import descendants, used_memory
+from marsyard.algorithms.processes import WORKER_NUMBER, descendants, used_memory
 from marsyard.algorithms.processes import kill as kill_processes
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError
 from marsyard.campaigns.execution import worker_process

@@ -5,8 +5,6 @@ runs in a fresh worker. The global random generators of Python, NumPy and OpenCV
 The worker also compares the files that it needs (`list_open_files`) after each case.
 """
 
-from __future__ import annotations
-
 import _signal  # type: ignore[import-not-found]
 import decimal
 import gc

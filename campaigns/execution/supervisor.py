@@ -5,8 +5,6 @@ runs no code of cases. It becomes the parent of orphaned descendants, and ends a
 parent sends signals only to the supervisor.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

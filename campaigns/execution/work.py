@@ -3,8 +3,6 @@
 A task is a function of an integer, its item: the number of a case, of a shared input or of a check.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ twenty times per second, and terminates a worker whose case exceeds a limit
 (`marsyard.campaigns.execution.monitoring`).
 """
 
-from __future__ import annotations
-
 import fcntl
 import math
 import os

@@ -3,8 +3,6 @@
 A system names small campaigns whose cases call all its kernels; one case of each is run.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Check custom algorithms and parts of the simulation in worker processes (`marsyard conformance`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial

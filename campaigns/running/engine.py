@@ -1,7 +1,5 @@
 """Campaign engine: run a campaign in a folder, resume it, or append cases; store rows and products."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Estimate of the time and disk space of a campaign before it runs, from a few trial cases."""
 
-from __future__ import annotations
-
 import json
 import statistics
 import time

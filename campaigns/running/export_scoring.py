@@ -4,8 +4,6 @@ The export and the scoring are campaigns. The rows of the export campaign contai
 separate folder. The scoring campaign runs the same cases again, with a table of answers instead of an algorithm.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

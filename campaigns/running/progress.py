@@ -1,7 +1,5 @@
 """Progress reports of a campaign or study: the interface of the objects that receive them."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 

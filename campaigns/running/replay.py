@@ -1,7 +1,5 @@
 """Load stored campaigns, and run single cases again (replay)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

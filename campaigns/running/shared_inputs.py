@@ -4,8 +4,6 @@ A shared input is built once into a cache on disk; a scenario numbers its shared
 uses is built by this case in memory, so that the cache does not grow with the cases.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -12,8 +12,6 @@ the end of a group does not change the numbers of the other members.
   Assoc. 53, 814-861; ranks do not depend on the marginals).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Self

@@ -11,8 +11,6 @@ of the grid (its number within the block, modulo the size of the grid), and its 
 grid point. A stratified design is computed for all its cases, from one random stream per dispersion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Final, Literal, NamedTuple
@@ -38,10 +36,7 @@ ADAPTIVE: Final = "adaptive"
 
 
 class Design(Parameters):
-    """Sampling design of a campaign.
-
-    With `nominal`, the first case has the campaign's parameters without sampling.
-    """
+    """Sampling design of a campaign. If `nominal`, the first case has the campaign's parameters without sampling."""
 
     kind: Kind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False

@@ -5,8 +5,6 @@ uniform number to a value. The uniform numbers can be independent, correlated or
 distribution can be formulas of other parameters of the campaign; `Dispersion.insert_values` evaluates the formulas.
 """
 
-from __future__ import annotations
-
 import ast
 import math
 import operator
@@ -312,10 +310,7 @@ STANDARD_NORMAL = UnivariateDistribution(lambda function, x: float(_NORMAL_FUNCT
 
 @lru_cache(maxsize=1)
 def scipy_distributions() -> Mapping[str, bool]:
-    """Return the univariate distributions of `scipy.stats` by name, and whether each is discrete.
-
-    `uniform` is excluded, since `Uniform` has other parameters.
-    """
+    """Return the univariate distributions of `scipy.stats` (not `uniform`), and whether each is discrete."""
     from scipy import stats
 
     kinds = ((name, getattr(stats, name)) for name in dir(stats) if name != "uniform")

@@ -1,8 +1,6 @@
 # ruff: noqa: D102  (the base class `Dispersion` describes the methods)
 """Dispersions of a campaign file: built-in distributions, and distributions of `scipy.stats` by name."""
 
-from __future__ import annotations
-
 import bisect
 import itertools
 import math

@@ -5,8 +5,6 @@ standard normal variable: its inverse distribution at Phi(z), after the correlat
 a case (noise of the instruments, for example) have no coordinates; a point selects them by a number.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass

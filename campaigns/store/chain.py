@@ -5,8 +5,6 @@ head and of this row. The first head is a hash of the texts that identify the ca
 time, signed with the key of the user (`marsyard.campaigns.store.key`). A row that replaces another one has a new entry.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sqlite3

@@ -9,8 +9,6 @@ version control, next to the algorithm; entries are never changed or removed. Ki
 - `result`: statuses of the requirements at a look, and the evidence that later looks need
 """
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import json
@@ -85,10 +83,7 @@ def classify_run(campaign: Campaign) -> Evidence:
 
 
 def read_confirmations(path: Path) -> list[Confirmation]:
-    """Read the confirmations in the order of their start; none if the file does not exist.
-
-    Raises StoreError like `read_record`.
-    """
+    """Read the confirmations in the order of their start; none without the file. Raises StoreError as `read_record`."""
     return list(read_record(path).confirmations)
 
 
@@ -132,10 +127,7 @@ def _add_former_entry(entries: dict[object, Confirmation], stored: Mapping[str, 
 
 
 def _add_entry(entries: dict[object, Confirmation], kind: str, stored: Mapping[str, Any], head: str) -> None:
-    """Add an entry of the chain; `head` is the hash with this entry.
-
-    Raises ValueError if the entry contradicts those before it.
-    """
+    """Add an entry, after which the chain has the hash `head`. Raises ValueError if it contradicts those before it."""
     if kind == "chain":
         return
     key = (str(stored["claim"]), int(stored["number"]))

@@ -5,8 +5,6 @@ branches is a beginning of the present file. A record that was deleted, replaced
 therefore recognised.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 import shutil

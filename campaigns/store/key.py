@@ -1,7 +1,5 @@
 """Key of this user, with which Marsyard signs what it wrote itself: origins, rows, tables and reports."""
 
-from __future__ import annotations
-
 import hashlib
 import hmac
 import os

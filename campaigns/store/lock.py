@@ -5,8 +5,6 @@ that other machines do not see. Therefore, the process that uses a folder also u
 Another process takes the folder only if that time does not change for some seconds.
 """
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
@@ -32,10 +30,7 @@ _LOCKED = (errno.EWOULDBLOCK, errno.EACCES)
 
 @contextmanager
 def folder_lock(directory: Path) -> Iterator[None]:
-    """Lock a campaign's folder, and remove temporary files of dead processes.
-
-    Raises StoreError if another process uses the folder, or the folder is not writable.
-    """
+    """Lock a folder, and remove files of dead processes. Raises StoreError if it is locked or not writable."""
     path = directory / _LOCK_FILE
     with report_write_errors(directory):
         file = path.open("a+", encoding="utf-8")

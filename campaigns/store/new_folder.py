@@ -1,7 +1,5 @@
 """Folder of a new campaign."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from marsyard.campaigns.errors import StoreError, report_write_errors

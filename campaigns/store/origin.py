@@ -5,8 +5,6 @@ the record contains a hash with the key of this user, or after `adopt` (option `
 this user created must also be signed by this user.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

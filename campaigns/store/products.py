@@ -3,8 +3,6 @@
 Arrays are stored in `products.npz`, other data in `products.json`.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -136,10 +134,7 @@ def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def load_products(directory: Path) -> dict[str, Any]:
-    """Load the products in a folder; tuples become lists.
-
-    Raises StoreError if there are none.
-    """
+    """Load the products in a folder; tuples become lists. Raises StoreError if there are none."""
     with report_damage(directory, StoreError, "contains no products of a case"):
         files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
         return unpack_products(PackedProducts(*files))

@@ -1,7 +1,5 @@
 """Temporary files and folders that replace their targets when they are complete, and removal of abandoned ones."""
 
-from __future__ import annotations
-
 import errno
 import glob
 import hashlib

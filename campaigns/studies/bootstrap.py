@@ -6,8 +6,6 @@ Tibshirani, An Introduction to the Bootstrap, 1993, section 12.5) is accurate to
 Student's interval, which is longer on the side of the small values (`docs/validation.md` contains the coverage).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -4,8 +4,6 @@ Each base case runs with all sources of error, without any, without each one, an
 dispersions and random streams.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,7 +32,6 @@ from marsyard.campaigns.studies.runner import (
     PointRunner,
     StudySession,
     check_margin,
-    continue_study,
     find_requirement,
     start_study,
 )
@@ -68,7 +65,7 @@ def start_budget(
     """Run the study in a new folder.
 
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
-    stored, and `continue_budget` continues.
+    stored, and `runner.continue_study` continues.
     """
     check_margin(find_requirement(campaign, parameters.requirement))
     sources, _ = active_sources(campaign)
@@ -81,15 +78,8 @@ def start_budget(
     # Saltelli's design has d + 2 cases per base sample for d variables: the dispersions and the random streams
     n_cases = parameters.cases * len(list_variants(sources)) if sources else 0
     n_cases += parameters.sobol * (len(campaign.drawn_paths) + 3) if parameters.sobol else 0
-    session = StudySession(BUDGET, parameters, _BudgetStudy, executor, observer)
+    session = StudySession(BUDGET, parameters, BudgetStudy, executor, observer)
     return start_study(campaign, n_cases, directory, session)
-
-
-def continue_budget(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> BudgetResult:
-    """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
-    parameters = BUDGET.read_parameters(directory)
-    session = StudySession(BUDGET, parameters, _BudgetStudy, executor, observer)
-    return continue_study(directory, session)
 
 
 def active_sources(campaign: Campaign) -> tuple[tuple[ScenarioSource, ...], tuple[str, ...]]:
@@ -121,7 +111,7 @@ def list_variants(sources: Sequence[ScenarioSource]) -> list[Variant]:
     ]
 
 
-class _BudgetStudy:
+class BudgetStudy:
     """A running error budget."""
 
     def __init__(self, campaign: Campaign, parameters: BudgetParameters, runner: PointRunner) -> None:

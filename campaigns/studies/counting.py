@@ -4,8 +4,6 @@ The bounds are those of Clopper and Pearson (1934). They assume nothing about th
 violations without intermediate margins.
 """
 
-from __future__ import annotations
-
 import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ a mixture of the nominal density and of normal densities of unit variance at the
 (Melchers 1989, Structural Safety 6, 3-10). A tenth of the cases come from the nominal density: weights are below ten.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Intervals of a small probability from independent simulations (replicates) and from importance sampling."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -15,8 +15,6 @@ give the noise of the instruments. `NEW_STREAM` is the stream that the case crea
 `studies.rare_decision` derives the verdict from all cases.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

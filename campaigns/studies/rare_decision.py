@@ -13,8 +13,6 @@ than the estimate p predicts. This check can refute an estimate, but it cannot p
 (docs/rare-violations.md).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Parameters and results of the four kinds of studies, which the record of a study contains (`study_record`)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

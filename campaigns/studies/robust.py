@@ -5,8 +5,6 @@ cases are those nearest to a violation, and a random sample of the others; each 
 study is stored in the folder `robust` of the run, whose report evaluates it (`marsyard.reports.variants`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -30,14 +28,7 @@ from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
 from marsyard.campaigns.studies.results import ROBUST, RobustParameters, RobustResult, RobustVariant
-from marsyard.campaigns.studies.runner import (
-    Candidate,
-    PointRunner,
-    StudySession,
-    check_identity,
-    continue_study,
-    start_study,
-)
+from marsyard.campaigns.studies.runner import Candidate, PointRunner, StudySession, check_identity, start_study
 from marsyard.campaigns.studies.study_record import STUDY_KEY
 from marsyard.sim.streams import Streams
 
@@ -64,7 +55,7 @@ def start_robust(
     - variants: named variants; those with the values of the campaign are omitted
     - cases: number of cases; those of the run if it has fewer
     Raises CampaignError for an unsuitable run, parameter or folder. On KeyboardInterrupt all finished rows are stored,
-    and `continue_robust` continues.
+    and `runner.continue_study` continues.
     """
     if cases < MIN_CASES:
         raise CampaignError(f"--cases {cases}: at least {MIN_CASES}, so that the effective number of cases is 30")
@@ -79,15 +70,9 @@ def start_robust(
     rows = read_rows(run / TABLE_FILE)[int(definition.design.nominal) :]
     chosen, weights = choose_cases(rows, definition.requirements, cases, _generator(definition))
     parameters = RobustParameters((*steps, *named), tuple(chosen.tolist()), tuple(weights.tolist()))
-    session = StudySession(ROBUST, parameters, _RobustStudy, executor, observer)
+    session = StudySession(ROBUST, parameters, RobustStudy, executor, observer)
     n_cases = len(parameters.variants) * len(parameters.cases)
     return start_study(campaign, n_cases, directory, session, streams=definition.total_cases)
-
-
-def continue_robust(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> RobustResult:
-    """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
-    parameters = ROBUST.read_parameters(directory)
-    return continue_study(directory, StudySession(ROBUST, parameters, _RobustStudy, executor, observer))
 
 
 def choose_cases(
@@ -164,7 +149,7 @@ def _generator(definition: CampaignDefinition) -> np.random.Generator:
     return Streams(definition.seed, definition.name, 0).generator("robust: cases")
 
 
-class _RobustStudy:
+class RobustStudy:
     """A running study."""
 
     def __init__(self, campaign: Campaign, parameters: RobustParameters, runner: PointRunner) -> None:

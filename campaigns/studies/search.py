@@ -10,8 +10,6 @@
    the other violations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +35,6 @@ from marsyard.campaigns.studies.runner import (
     CaseLimitError,
     PointRunner,
     StudySession,
-    continue_study,
     find_requirement,
     start_study,
 )
@@ -78,18 +75,11 @@ def start_search(
     """Run the study in a new folder.
 
     Raises CampaignError for an unsuitable campaign, requirement or folder. On KeyboardInterrupt all finished rows are
-    stored, and `continue_search` continues.
+    stored, and `runner.continue_study` continues.
     """
     find_requirement(campaign, parameters.requirement)
     session = StudySession(SEARCH, parameters, SearchStudy, executor, observer)
     return start_study(campaign, max_cases, directory, session)
-
-
-def continue_search(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> SearchResult:
-    """Continue an interrupted study. Raises CampaignError if there is none, or the program has changed."""
-    parameters = SEARCH.read_parameters(directory)
-    session = StudySession(SEARCH, parameters, SearchStudy, executor, observer)
-    return continue_study(directory, session)
 
 
 class SearchStudy:

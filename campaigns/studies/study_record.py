@@ -1,7 +1,5 @@
 """Part of a study in the record of its folder (`campaign.json`): its parameters and result, as data classes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -14,8 +14,6 @@ The chains find a violation only if the margin falls to it through the levels. A
 is found at its own rate per case, as by counting.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass

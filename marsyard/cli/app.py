@@ -3,8 +3,6 @@
 Commands import their dependencies when they run, so that ``--help`` is fast.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Command `marsyard assure`: write an assurance package of stored campaigns, or verify one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

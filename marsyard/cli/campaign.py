@@ -30,27 +30,20 @@ class RunOptions:
     cluster: options.ClusterOption = None
     case_time: options.CaseTimeOption = None
     out: options.OutOption = None
-    dry_run: Annotated[bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")] = (
-        False
-    )
-    until_decided: Annotated[
-        bool, Option("--until-decided", help="Stop as soon as the verdicts are decided; --cases is the maximum.")
-    ] = False
+    dry_run: Annotated[bool, Option("--dry-run", help="Estimate time and disk space from a few trial cases.")] = False
+    until_decided: Annotated[bool, Option("--until-decided", help="Stop when verdicts are decided.")] = False
     override: options.SetOption = None
     algorithm: options.AlgorithmOption = None
     confirm: Annotated[
         bool,
         Option(
-            "--confirm",
-            help="Evaluate a frozen algorithm on unseen cases: draw a new seed, and record the run before it starts.",
+            "--confirm", help="Evaluate a frozen algorithm on unseen cases: with a new seed, recorded before the run."
         ),
     ] = False
     confirmations: options.ConfirmationsOption = options.CONFIRMATIONS
     shard: Annotated[
         str | None,
-        Option(
-            metavar="K/N", help="Run only shard K of N, on one of N machines; `marsyard merge` combines the shards."
-        ),
+        Option(metavar="K/N", help="Run only shard K of N, on one of N machines; `marsyard merge` combines them."),
     ] = None
 
 
@@ -101,7 +94,7 @@ def run_shard(campaign: Campaign, shard_text: str, directory: Path, executor: Ex
     from marsyard.cli.progress import RunLog
 
     shard = Shard.parse(shard_text)
-    with show_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
+    with show_progress(directory) as progress, RunLog(directory, progress) as log:
         run_campaign(campaign, directory, executor, log, shard)
     typer.echo(f"shard {shard}: the rows are in {directory}; to combine all shards: marsyard merge DIR... --out DIR")
 

@@ -1,7 +1,5 @@
 """Command `marsyard conformance`: check that a custom algorithm or component follows its interface."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Annotated

@@ -1,7 +1,5 @@
 """Exit status of the program, and errors of the user as one message."""
 
-from __future__ import annotations
-
 import errno
 import functools
 from collections.abc import Callable

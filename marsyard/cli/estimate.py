@@ -1,7 +1,5 @@
 """Time, disk space and limits of the evidence of a campaign, printed before it runs."""
 
-from __future__ import annotations
-
 import os
 
 import typer

@@ -38,14 +38,14 @@ def run_and_evaluate(directory: Path, work: Callable[[ProgressObserver], None]) 
     from marsyard.cli.outcome import evaluate_and_report
     from marsyard.cli.progress import RunLog
 
-    with show_progress(directory, f"marsyard resume {directory}") as progress, RunLog(directory, progress) as log:
+    with show_progress(directory) as progress, RunLog(directory, progress) as log:
         work(log)
     raise typer.Exit(evaluate_and_report(directory, create_console()))
 
 
 @contextmanager
-def show_progress(directory: Path, next_command: str) -> Iterator[ProgressObserver]:
-    """Show the progress of a campaign; an interruption prints `next_command` and exits with status 130."""
+def show_progress(directory: Path, next_command: str = "") -> Iterator[ProgressObserver]:
+    """Show the progress of a campaign; an interruption prints the command that continues it, and exits with 130."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.record import read
     from marsyard.cli.progress import campaign_progress
@@ -57,7 +57,7 @@ def show_progress(directory: Path, next_command: str) -> Iterator[ProgressObserv
         try:
             stored = read(directory)
             rows = f"the rows so far are in {directory} ({stored['cases_finished']} of {stored['cases']})"
-            typer.echo(f"interrupted; {rows}. To continue: {next_command}", err=True)
+            typer.echo(f"interrupted; {rows}. To continue: {next_command or f'marsyard resume {directory}'}", err=True)
         except CampaignError:
             pass
         raise typer.Exit(Exit.INTERRUPTED) from None

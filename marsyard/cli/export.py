@@ -1,7 +1,5 @@
 """Commands `marsyard export`, `score`, `dataset`: export data of cases, and score answers computed elsewhere."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -66,9 +64,7 @@ def score(
     directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
     answers: Annotated[
         Path,
-        Argument(
-            metavar="ANSWERS", help="CSV file with the answers of the external algorithm (docs/custom-algorithms.md)."
-        ),
+        Argument(metavar="ANSWERS", help="CSV file with answers of an external algorithm (docs/custom-algorithms.md)."),
     ],
     truth: TruthOption = None,
     out: options.OutOption = None,

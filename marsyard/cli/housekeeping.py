@@ -1,7 +1,5 @@
 """Commands `marsyard clean` and `compile`: remove caches (terrains, compiled kernels) from disk; compile kernels."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """One night of `marsyard nightly`: run the campaigns and checks of the plan, and write the page and the dashboard."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

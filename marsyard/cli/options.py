@@ -1,7 +1,5 @@
 """Options and arguments of several commands of `marsyard`."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -13,11 +11,7 @@ CampaignArgument = Annotated[
     str, Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
 ]
 SiteArgument = Annotated[
-    str,
-    Argument(
-        metavar="SITE",
-        help="A site from `marsyard terrain list`, or a digital terrain model (DTM): .tif, .img, .cub or .npz.",
-    ),
+    str, Argument(metavar="SITE", help="A site of `marsyard terrain list`, or a DTM: .tif, .img, .cub or .npz.")
 ]
 MaxHolesOption = Annotated[
     float | None,
@@ -43,20 +37,11 @@ JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
 BitsOption = Annotated[
     float | None,
-    Option(
-        metavar="BITS",
-        min=0.1,
-        max=16.0,
-        help="Compress the images with lossy JPEG 2000 to this bit rate, bits per pixel.",
-    ),
+    Option(metavar="BITS", min=0.1, max=16.0, help="Compress images by lossy JPEG 2000 to this bit rate per pixel."),
 ]
 SetOption = Annotated[
     list[str] | None,
-    Option(
-        "--set",
-        metavar="KEY=VALUE",
-        help="Override a value, such as render.backend=egl; the parameter is then fixed and not dispersed.",
-    ),
+    Option("--set", metavar="KEY=VALUE", help="Set a value, such as render.backend=egl; it is not dispersed."),
 ]
 AlgorithmOption = Annotated[
     list[str] | None,

@@ -1,7 +1,5 @@
 """Evaluation of a campaign for the commands: verdicts on the terminal, report, CSV and PDF, and images of cases."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import subprocess

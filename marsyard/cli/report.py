@@ -1,7 +1,5 @@
 """Commands `marsyard report`, `confirmations`, `compare`, `dashboard`, `nightly`: evaluate, publish, schedule runs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path
@@ -28,9 +26,7 @@ def report(
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
     gallery: Annotated[
         bool,
-        Option(
-            "--gallery", help="First run some cases again to store their images: largest errors, no answer, and random."
-        ),
+        Option("--gallery", help="First run some cases again for their images: largest errors, no answer, random."),
     ] = False,
     trust: options.TrustOption = False,
 ) -> None:

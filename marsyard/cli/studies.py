@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer import Option
@@ -19,7 +19,7 @@ from marsyard.cli.execution import default_directory, make_executor, show_progre
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.campaigns.execution.executors import ExecutorConfig
-    from marsyard.campaigns.studies.results import BudgetResult, RareResult, SearchResult
+    from marsyard.campaigns.studies.results import SearchResult
 
 MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
 
@@ -61,15 +61,9 @@ def prepare_study(arguments: StudyOptions, kind: str) -> tuple[Campaign, Executo
 class RareOptions(StudyOptions):
     """Arguments and options of `marsyard rare`."""
 
-    max_probability: Annotated[
-        float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
-    ] = 1e-4
+    max_probability: Annotated[float, Option(metavar="P", help="Maximum probability of a violation per case.")] = 1e-4
     method: Annotated[
-        str,
-        Option(
-            metavar="METHOD",
-            help="`subset`: subset simulation. `importance`: the same, followed by importance sampling.",
-        ),
+        str, Option(metavar="METHOD", help="`subset`: subset simulation. `importance`: also with importance sampling.")
     ] = "subset"
     samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
     replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6
@@ -81,12 +75,8 @@ class RareOptions(StudyOptions):
             "count for --max-cases.",
         ),
     ] = 600
-    importance_cases: Annotated[
-        int, Option(metavar="N", help="Cases of importance sampling, for --method importance.")
-    ] = 600
-    confidence: Annotated[
-        float, Option(metavar="C", help="Two-sided confidence: PASS and FAIL are each wrong at most with (1 - C) / 2.")
-    ] = 0.9
+    importance_cases: Annotated[int, Option(metavar="N", help="Cases of importance sampling (--method).")] = 600
+    confidence: Annotated[float, Option(metavar="C", help="Two-sided: PASS and FAIL are wrong with (1 - C) / 2.")] = 0.9
     max_cases: MaxCasesOption = 20_000
 
 
@@ -111,9 +101,9 @@ def rare(arguments: RareOptions) -> None:
         arguments.confidence,
     )
     campaign, executor, directory = prepare_study(arguments, "rare")
-    with show_progress(directory, f"marsyard resume {directory}") as progress:
+    with show_progress(directory) as progress:
         result = start_rare(campaign, parameters, arguments.max_cases, directory, executor, progress)
-    finish_rare(directory, result)
+    finish_study(directory, result.exit_code)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,20 +111,10 @@ class SearchOptions(StudyOptions):
     """Arguments and options of `marsyard search`."""
 
     cases: Annotated[
-        int,
-        Option(
-            "-n",
-            "--cases",
-            metavar="N",
-            help="Cases of the search; the reduction of each violation takes further cases.",
-        ),
+        int, Option("-n", "--cases", metavar="N", help="Cases of the search; each reduction takes further cases.")
     ] = 300
-    restarts: Annotated[
-        int, Option(metavar="N", help="Number of optimizer (CMA-ES) runs from different starting cases.")
-    ] = 3
-    failures: Annotated[
-        int, Option(metavar="N", help="Maximum number of violations whose causes are reduced to a few parameters.")
-    ] = 5
+    restarts: Annotated[int, Option(metavar="N", help="Optimizer (CMA-ES) runs from different starting cases.")] = 3
+    failures: Annotated[int, Option(metavar="N", help="Maximum number of violations that are reduced to causes.")] = 5
     max_cases: MaxCasesOption = 5_000
 
 
@@ -150,7 +130,7 @@ def search(arguments: SearchOptions) -> None:
 
     parameters = SearchParameters(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
     campaign, executor, directory = prepare_study(arguments, "search")
-    with show_progress(directory, f"marsyard resume {directory}") as progress:
+    with show_progress(directory) as progress:
         result = start_search(campaign, parameters, arguments.max_cases, directory, executor, progress)
     finish_search(directory, result)
 
@@ -159,9 +139,7 @@ def search(arguments: SearchOptions) -> None:
 class BudgetOptions(StudyOptions):
     """Arguments and options of `marsyard budget`."""
 
-    cases: Annotated[
-        int, Option("-n", "--cases", metavar="N", help="Base cases. Each runs 2 k + 2 times for k sources of error.")
-    ] = 100
+    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Base cases, for k sources in 2 k + 2 runs.")] = 100
     sobol: Annotated[
         int,
         Option(
@@ -185,9 +163,9 @@ def budget(arguments: BudgetOptions) -> None:
 
     parameters = BudgetParameters(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
     campaign, executor, directory = prepare_study(arguments, "budget")
-    with show_progress(directory, f"marsyard resume {directory}") as progress:
+    with show_progress(directory) as progress:
         result = start_budget(campaign, parameters, directory, executor, progress)
-    finish_budget(directory, result)
+    finish_study(directory, result.exit_code)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,18 +175,13 @@ class RobustOptions:
     directory: options.DirectoryArgument
     parameter: Annotated[
         list[str] | None,
-        Option(
-            metavar="PATH=VALUE",
-            help="Run cases with other values of a parameter that the campaign does not disperse, up to VALUE.",
-        ),
+        Option(metavar="PATH=VALUE", help="Run cases with other values of an undispersed parameter, up to VALUE."),
     ] = None
     variant: Annotated[
         list[str] | None,
         Option(metavar="NAME", help="Run cases with an alternative model of the system; `all`: with each of them."),
     ] = None
-    cases: Annotated[
-        int, Option("-n", "--cases", metavar="N", help="Cases of the run, at least 60, for each value and model.")
-    ] = 100
+    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Cases for each value and model, from 60.")] = 100
     jobs: options.JobsOption = None
     cluster: options.ClusterOption = None
 
@@ -235,7 +208,7 @@ def robust(arguments: RobustOptions) -> None:
     if farthest or arguments.variant:
         directory = default_directory(ROBUST_FOLDER, run / ROBUST_FOLDER)
         executor = make_executor(arguments.jobs, arguments.cluster)
-        with show_progress(directory, f"marsyard resume {directory}") as progress:
+        with show_progress(directory) as progress:
             start_robust(run, farthest, variants, arguments.cases, directory, executor, progress)
     finish_robust(run)
 
@@ -297,37 +270,33 @@ def continue_study_and_exit(
     additional: number of replicates to add, or of random cases if `is_random`
     """
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.studies import budget as budget_study
-    from marsyard.campaigns.studies import rare as rare_study
-    from marsyard.campaigns.studies import robust as robust_study
-    from marsyard.campaigns.studies import search as search_study
+    from marsyard.campaigns.studies.budget import BudgetStudy
+    from marsyard.campaigns.studies.rare import continue_rare
     from marsyard.campaigns.studies.results import BUDGET, ROBUST, SEARCH
-    from marsyard.campaigns.studies.study_record import read_study
+    from marsyard.campaigns.studies.robust import RobustStudy
+    from marsyard.campaigns.studies.runner import StudySession, continue_study
+    from marsyard.campaigns.studies.search import SearchStudy
+    from marsyard.campaigns.studies.study_record import StudyKind, read_study
 
-    study = read_study(directory) or {}
-    executor, next_command = make_executor(jobs, cluster), f"marsyard resume {directory}"
-    if study.get("kind") == SEARCH.name:
-        if additional:
-            raise CampaignError(f"{directory} contains a search, which cannot be extended; start a new one")
-        with show_progress(directory, next_command) as progress:
-            search_result = search_study.continue_search(directory, executor, progress)
-        finish_search(directory, search_result)
-    if study.get("kind") == BUDGET.name:
-        if additional:
-            raise CampaignError(f"{directory} contains an error budget, which cannot be extended; start a new one")
-        with show_progress(directory, next_command) as progress:
-            budget_result = budget_study.continue_budget(directory, executor, progress)
-        finish_budget(directory, budget_result)
-    if study.get("kind") == ROBUST.name:
-        if additional:
-            raise CampaignError(f"{directory} contains a study of other parameters, which cannot be extended")
-        with show_progress(directory, next_command) as progress:
-            robust_study.continue_robust(directory, executor, progress)
+    executor, name = make_executor(jobs, cluster), (read_study(directory) or {}).get("kind")
+    kinds: list[tuple[StudyKind[Any, Any], Any]]
+    kinds = [(SEARCH, SearchStudy), (BUDGET, BudgetStudy), (ROBUST, RobustStudy)]
+    others = {kind.name: (kind, study) for kind, study in kinds}
+    with show_progress(directory) as progress:
+        if name not in others:
+            replicates, random_cases = (0, additional) if is_random else (additional, 0)
+            result: Any = continue_rare(directory, executor, progress, replicates, random_cases)
+        else:
+            kind, study = others[name]
+            if additional:
+                raise CampaignError(f"{directory} contains {kind.title}, which cannot be extended; start a new one")
+            session = StudySession(kind, kind.read_parameters(directory), study, executor, progress)
+            result = continue_study(directory, session)
+    if name == SEARCH.name:
+        finish_search(directory, result)
+    if name == ROBUST.name:
         finish_robust(directory.resolve().parent.parent)
-    with show_progress(directory, next_command) as progress:
-        replicates, random_cases = (0, additional) if is_random else (additional, 0)
-        rare_result = rare_study.continue_rare(directory, executor, progress, replicates, random_cases)
-    finish_rare(directory, rare_result)
+    finish_study(directory, result.exit_code)
 
 
 def finish_search(directory: Path, result: SearchResult) -> NoReturn:
@@ -343,24 +312,11 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
         rerun = replay(directory, failure.case)
         if rerun.products is not None:
             save_packed(case_directory(directory, failure.case), rerun.products, rerun.row)
-    _write_and_print(directory, [f"campaign: {path}" for path in files])
-    raise typer.Exit(result.exit_code)
+    finish_study(directory, result.exit_code, [f"campaign: {path}" for path in files])
 
 
-def finish_rare(directory: Path, result: RareResult) -> NoReturn:
-    """Write the report of a study of rare violations, print its result, and exit with the status of its verdict."""
-    _write_and_print(directory)
-    raise typer.Exit(result.exit_code)
-
-
-def finish_budget(directory: Path, result: BudgetResult) -> NoReturn:
-    """Write the report of an error budget, print its result, and exit."""
-    _write_and_print(directory)
-    raise typer.Exit(result.exit_code)
-
-
-def _write_and_print(directory: Path, files: Sequence[str] = ()) -> None:
-    """Write the report of a study, and print its sentences, `files`, and the path of the report."""
+def finish_study(directory: Path, exit_code: int, files: Sequence[str] = ()) -> NoReturn:
+    """Write the report of a study, print its sentences, `files`, and the path of the report, and exit."""
     from marsyard.campaigns.errors import report_write_errors
     from marsyard.campaigns.store.record import read
     from marsyard.reports.campaign import study_sentences, write_report
@@ -370,3 +326,4 @@ def _write_and_print(directory: Path, files: Sequence[str] = ()) -> None:
     console = create_console()
     for line in (*study_sentences(read(directory)), *files, f"report: {page}"):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+    raise typer.Exit(exit_code)

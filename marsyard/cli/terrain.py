@@ -54,10 +54,7 @@ def stats(
     site: SiteArgument,
     scale: Annotated[
         str | None,
-        Option(
-            metavar="SCALE",
-            help="`descent` (kilometres) or `ground` (a hundred metres); by default `descent`, if the site has it.",
-        ),
+        Option(metavar="SCALE", help="`descent` (kilometres) or `ground` (100 metres); by default the first."),
     ] = None,
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,
@@ -73,7 +70,7 @@ def stats(
     from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
-    from marsyard.sim.terrain.sites import PAPER
+    from marsyard.sim.terrain.published_sites import PAPER
     from marsyard.sim.terrain.surface import terrain_statistics
 
     try:
@@ -120,7 +117,7 @@ def _print_statistics(
 ) -> None:
     from rich.table import Table
 
-    from marsyard.sim.terrain.sites import PAPER
+    from marsyard.sim.terrain.published_sites import PAPER
     from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
     side_m, paper = parameters.samples * parameters.spacing_m, PAPER.get(site)

@@ -1,7 +1,5 @@
 """Run campaigns until their verdicts are decided (`--until-decided`)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

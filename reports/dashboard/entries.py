@@ -1,7 +1,5 @@
 """Contents of the dashboard: stored campaigns, read from their records and reports, and a row for each requirement."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """HTTP server of a dashboard's folder: it serves files only, to a limited number of connections of limited duration."""
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 import sys
@@ -34,10 +32,7 @@ _HEADERS = {
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Handler of requests for files in the dashboard's folder, without folder listings and log messages.
-
-    `names` are the allowed host names of the server.
-    """
+    """Handler of requests for files in the folder; the server has these host `names`, no listings and no log."""
 
     def __init__(self, *args: Any, names: Collection[str], **kwargs: Any) -> None:
         self._names = names

@@ -5,8 +5,6 @@ installation wrote them, or are written again. The other pages of a campaign rep
 is evaluated or drawn twice. Pages of unchanged campaigns are not written again.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ windows, which the paper does not show. Bottom row: the images as delivered, wit
 (green). Dashed squares mark tracks that failed a validity check.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

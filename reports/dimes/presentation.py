@@ -3,8 +3,6 @@
 A DIMES case has three images. A velocity stream is an algorithm that answers after each of any number of images.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -16,10 +14,10 @@ from matplotlib.figure import Figure
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.reports.dimes import case_figures as figures
 from marsyard.reports.dimes.sections import ignition_section, landing_section, sensitivity_section
+from marsyard.reports.figure_style import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.images import Panel, fill_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products, check_shape, numeric_product, read_arrays, to_float, to_matrix
-from marsyard.reports.section import INK, MARKERS, MUTED, SERIES, in_page_style
 from marsyard.reports.wording import NOTHING, label, note_text, number, percent
 
 #: Columns of the tracks that the table shows in other columns, or not at all because they are too wide.

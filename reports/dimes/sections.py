@@ -3,8 +3,6 @@
 The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,20 +15,9 @@ from scipy import stats
 from marsyard.reports import rates
 from marsyard.reports.blocks import Quantity, Rows, distribution_block, quantile_block, rate_block
 from marsyard.reports.column_values import numbers
+from marsyard.reports.figure_style import MUTED, SERIES, in_page_style, new_axes
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import (
-    MUTED,
-    SERIES,
-    Block,
-    Grid,
-    Section,
-    Subject,
-    create_section,
-    has_values,
-    in_page_style,
-    new_axes,
-    svg_figure,
-)
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.tables import error_summaries, statistics_rows
 from marsyard.reports.wording import NOTHING, format_fraction, label, magnitude_label, note_text, number, percent

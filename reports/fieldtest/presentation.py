@@ -3,8 +3,6 @@
 The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,23 +17,12 @@ from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import explain
+from marsyard.reports.figure_style import MARKERS, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.fits import fit_note
 from marsyard.reports.papers import read_paper
 from marsyard.reports.presentation import Presentation
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import (
-    MARKERS,
-    REQUIREMENT,
-    SERIES,
-    Block,
-    Section,
-    Subject,
-    SvgFigure,
-    build_grid,
-    in_page_style,
-    new_axes,
-    svg_figure,
-)
+from marsyard.reports.section import Block, Section, Subject, SvgFigure, build_grid, svg_figure
 from marsyard.reports.wording import NOTHING, count, format_fraction, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 

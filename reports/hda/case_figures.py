@@ -7,8 +7,6 @@ site, a purple plus the reported site. The true maps in Fig. 5 and the true moti
 products raise ValueError.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -19,10 +17,20 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, LinearSegmentedColormap, ListedColormap, to_rgb
 from matplotlib.figure import Figure
 
-from marsyard.reports.hda import products as stages
+from marsyard.reports.figure_style import MUTED, in_page_style
+from marsyard.reports.hda.products import (
+    EstimatedMotion,
+    LandingMaps,
+    StoredGroundTruth,
+    read_ground_truth,
+    read_images,
+    read_landing_maps,
+    read_matches,
+    read_motion,
+    read_tracked_features,
+)
 from marsyard.reports.images import Mark, Panel, draw_panels, show_image
 from marsyard.reports.products import Products
-from marsyard.reports.section import MUTED, in_page_style
 
 Product = TypeVar("Product")
 
@@ -62,8 +70,8 @@ _LOST: dict[str, Any] = {
 
 def draw_tracks(products: Products) -> Figure:
     """Draw Fig. 1: features in the first image, their tracks in the second."""
-    images = _require(stages.read_images(products), "images")
-    tracks = _require(stages.read_tracked_features(products), "tracks")
+    images = _require(read_images(products), "images")
+    tracks = _require(read_tracked_features(products), "tracks")
     is_tracked = tracks.accepted
     features = [Mark(tracks.first[is_tracked], _TRACKED)]
     if not is_tracked.all():
@@ -82,7 +90,7 @@ def draw_tracks(products: Products) -> Figure:
 @in_page_style
 def draw_motion(products: Products) -> Figure:
     """Draw Fig. 2: three orthographic views of motion and structure."""
-    motion, maps = _require(stages.read_motion(products), "motion"), stages.read_landing_maps(products)
+    motion, maps = _require(read_motion(products), "motion"), read_landing_maps(products)
     # without a map the vertical is unknown; the first camera's optical axis replaces it
     upright_from_camera = np.diag([1.0, -1.0, -1.0]) if maps is None else maps.surface_from_camera
     figure = Figure(figsize=(9.0, 3.6), layout="constrained", facecolor="none")
@@ -96,8 +104,8 @@ def draw_motion(products: Products) -> Figure:
 
 def draw_epipolar(products: Products) -> Figure:
     """Draw Fig. 3: structure pixels in the first image, their segments and matches in the second."""
-    images = _require(stages.read_images(products), "images")
-    matches = _require(stages.read_matches(products), "matches")
+    images = _require(read_images(products), "images")
+    matches = _require(read_matches(products), "matches")
     # draw every `step`-th row and column of the grid, so that at most `_MAX_MATCHES` are drawn
     step, indices = 1, np.arange(len(matches.grid))
     v, u = (np.unique(matches.grid[:, index], return_inverse=True)[1] for index in (1, 0))
@@ -120,7 +128,7 @@ def draw_epipolar(products: Products) -> Figure:
 @in_page_style
 def draw_elevation(products: Products) -> Figure:
     """Draw Fig. 4: two views of the elevation map."""
-    maps = _require(stages.read_landing_maps(products), "maps")
+    maps = _require(read_landing_maps(products), "maps")
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
     for index, (azimuth, name) in enumerate(((-115.0, "Elevation map (m)"), (-25.0, "The same from another side"))):
         axes = figure.add_subplot(1, 2, index + 1, projection="3d", computed_zorder=False)
@@ -132,8 +140,8 @@ def draw_elevation(products: Products) -> Figure:
 @in_page_style
 def draw_maps(products: Products) -> Figure:
     """Draw Fig. 5 (A): elevation, roughness, slope and safe landing map; bottom row: truth in the same coordinates."""
-    maps = _require(stages.read_landing_maps(products), "maps")
-    truth = _require(stages.read_ground_truth(products), "truth")
+    maps = _require(read_landing_maps(products), "maps")
+    truth = _require(read_ground_truth(products), "truth")
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     map_row, truth_row = figure.subplots(2, 4)
     degrees, limits = np.degrees(maps.slope_rad), maps.limits
@@ -170,7 +178,7 @@ def draw_maps(products: Products) -> Figure:
     return figure
 
 
-def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, truth: stages.StoredGroundTruth) -> None:
+def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: LandingMaps, truth: StoredGroundTruth) -> None:
     colour_scale: dict[str, Any] = {"vmin": 0, "vmax": 2, "cmap": SAFETY_COLOURS}
     map_axes.imshow(maps.safety, interpolation="nearest", **colour_scale)
     # hazards (2) are also hatched, since colour must not be the only distinction
@@ -190,12 +198,12 @@ def _draw_safety(map_axes: Axes, truth_axes: Axes, maps: stages.LandingMaps, tru
     truth_axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.02), ncols=3, fontsize=7, columnspacing=1.0)
 
 
-def is_unknown_everywhere(maps: stages.LandingMaps) -> bool:
+def is_unknown_everywhere(maps: LandingMaps) -> bool:
     """Whether the safe landing map has neither a safe cell nor a hazard."""
     return not bool(np.any((maps.safety < 0.5) | (maps.safety > 1.5)))
 
 
-def drawn_sites(maps: stages.LandingMaps) -> dict[str, Float[np.ndarray, "2"]]:
+def drawn_sites(maps: LandingMaps) -> dict[str, Float[np.ndarray, "2"]]:
     """Return row and column of the sites inside the map, by key of `SITE_NAMES`."""
     rows, columns = maps.elevation_m.shape
     sites = {"apriori": maps.apriori, "site": maps.site}
@@ -205,8 +213,8 @@ def drawn_sites(maps: stages.LandingMaps) -> dict[str, Float[np.ndarray, "2"]]:
 @in_page_style
 def draw_site(products: Products) -> Figure:
     """Draw Fig. 7 and Fig. 5 (B): the first image; safe landing map and site on the image, and on the terrain."""
-    images = _require(stages.read_images(products), "images")
-    maps = _require(stages.read_landing_maps(products), "maps")
+    images = _require(read_images(products), "images")
+    maps = _require(read_landing_maps(products), "maps")
     figure = Figure(figsize=(11.0, 3.6), layout="constrained")
     image_axes, overlay_axes = figure.add_subplot(1, 3, 1), figure.add_subplot(1, 3, 2)
     for axes in (image_axes, overlay_axes):
@@ -234,12 +242,12 @@ def draw_site(products: Products) -> Figure:
 
 #: For each file name, in the paper's order: function that reads the products, and function that draws the figure.
 _FIGURES: Mapping[str, tuple[Callable[[Products], object], Callable[[Products], Figure]]] = {
-    "fig1-tracks": (stages.read_tracked_features, draw_tracks),
-    "fig2-motion": (stages.read_motion, draw_motion),
-    "fig3-epipolar": (stages.read_matches, draw_epipolar),
-    "fig4-elevation": (stages.read_landing_maps, draw_elevation),
-    "fig5-maps": (stages.read_landing_maps, draw_maps),
-    "fig7-site": (stages.read_landing_maps, draw_site),
+    "fig1-tracks": (read_tracked_features, draw_tracks),
+    "fig2-motion": (read_motion, draw_motion),
+    "fig3-epipolar": (read_matches, draw_epipolar),
+    "fig4-elevation": (read_landing_maps, draw_elevation),
+    "fig5-maps": (read_landing_maps, draw_maps),
+    "fig7-site": (read_landing_maps, draw_site),
 }
 FIGURES = {name: draw for name, (_, draw) in _FIGURES.items()}
 
@@ -256,7 +264,7 @@ def _require(product: Product | None, name: str) -> Product:
 
 
 def _draw_motion_view(
-    axes: Axes, motion: stages.EstimatedMotion, upright_from_camera: Float[np.ndarray, "3 3"], axis_pair: list[int]
+    axes: Axes, motion: EstimatedMotion, upright_from_camera: Float[np.ndarray, "3 3"], axis_pair: list[int]
 ) -> None:
     """Draw an orthographic view onto two axes of an upright frame at the first camera."""
     depth = float(np.median(motion.points[:, 2]))
@@ -290,7 +298,7 @@ def _draw_motion_view(
 
 
 def _draw_terrain(
-    axes: Any, maps: stages.LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float, name: str
+    axes: Any, maps: LandingMaps, colours: Float[np.ndarray, "rows columns 3"], azimuth_deg: float, name: str
 ) -> None:
     """Draw the elevation map as a shaded surface in these colours, with the sites on it; the axes are 3-D.
 
@@ -298,8 +306,7 @@ def _draw_terrain(
     """
     rows, columns = maps.elevation_m.shape
     step = max(1, round(max(rows, columns) / _MAX_DRAWN_CELLS))
-    x = maps.corner_m[0] + maps.cell_m * np.arange(columns)
-    y = maps.corner_m[1] - maps.cell_m * np.arange(rows)
+    grid = np.moveaxis(maps.positions(np.moveaxis(np.indices((rows, columns)), 0, -1)), -1, 0)
     heights = maps.elevation_m - np.nanmedian(maps.elevation_m)
     sides = maps.cell_m * np.array([columns, rows])
     height_range_m = float(np.nanmax(heights) - np.nanmin(heights))
@@ -311,14 +318,14 @@ def _draw_terrain(
     shaded = LightSource(315.0, 45.0).shade_rgb(np.asarray(colours), np.nan_to_num(heights), **style)
     subset = np.s_[::step, ::step]
     axes.plot_surface(
-        *(grid[subset] for grid in np.meshgrid(x, y)), heights[subset], facecolors=shaded[subset], rcount=200,
+        *(coordinate[subset] for coordinate in grid), heights[subset], facecolors=shaded[subset], rcount=200,
         ccount=200, shade=False, antialiased=False, linewidth=0.0, rasterized=True, zorder=1,
     )  # fmt: skip
     offset_m = 0.02 * float(sides.max()) / exaggeration
     for site, cell in (("apriori", maps.apriori), ("site", maps.site)):
         height = _value_at_cell(heights[..., None], cell)
         if height is not None and np.isfinite(height).all():
-            position = maps.corner_m + maps.cell_m * cell[::-1] * np.array([1.0, -1.0])
+            position = maps.positions(cell)
             axes.plot([position[0]], [position[1]], [float(height[0]) + offset_m], **_SITE_MARKERS[site], zorder=5)
     axes.set_box_aspect((sides[0], sides[1], max(exaggeration * height_range_m, 0.05 * sides.max())), zoom=1.3)
     axes.view_init(elev=38.0, azim=azimuth_deg)

@@ -3,8 +3,6 @@
 "The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,10 +16,11 @@ from matplotlib.figure import Figure
 from marsyard.reports import section
 from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
+from marsyard.reports.figure_style import MUTED, REQUIREMENT, in_page_style
 from marsyard.reports.hda.sections import PAPER, drop_empty_columns, landing_rows
 from marsyard.reports.plots import RateLine, draw_rates
 from marsyard.reports.rates import CONFIDENCE, PooledRate, flag_mask, pooled_rate, rate_text
-from marsyard.reports.section import MUTED, REQUIREMENT, Block, Grid, Section, Subject, build_grid, in_page_style
+from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, percent
 from marsyard.scenarios.landing.map_errors import CLASS_BOUNDS, CLASS_NAMES
 

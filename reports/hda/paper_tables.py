@@ -3,8 +3,6 @@
 The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

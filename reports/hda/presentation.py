@@ -3,8 +3,6 @@
 The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -13,11 +11,18 @@ import numpy as np
 
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.blocks import rate_block
-from marsyard.reports.hda import products as stages
 from marsyard.reports.hda import sections
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
 from marsyard.reports.hda.classes import create_class_blocks, limits_section
 from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
+from marsyard.reports.hda.products import (
+    is_hda_case,
+    read_images,
+    read_landing_maps,
+    read_matches,
+    read_motion,
+    read_tracked_features,
+)
 from marsyard.reports.images import draw_images
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products, is_true, to_float
@@ -55,7 +60,7 @@ def view(products: Products, complete: bool = False) -> CaseView:
     """Create the view of a landing case; it contains only the images if no stage of the paper has results."""
     names = [name for name in available_figures(products) if complete or name != _OMITTED_FIGURE]
     head, rows = _stage_rows(products)
-    image_pair = stages.read_images(products)
+    image_pair = read_images(products)
     if not names and image_pair is not None:
         figure = CaseFigure("images", draw_images(image_pair), "The two images that the algorithm received.")
         return CaseView([figure], head=head, rows=rows, legend=note_text("hda.plain_legend"))
@@ -65,7 +70,7 @@ def view(products: Products, complete: bool = False) -> CaseView:
 
 def _caption(name: str, products: Products) -> str:
     """Create the caption of a figure, with the marks and the state of the map that it contains."""
-    maps = stages.read_landing_maps(products)
+    maps = read_landing_maps(products)
     sentences = [_CAPTIONS[name]]
     if maps is not None and name in _UNKNOWN_TEXTS and is_unknown_everywhere(maps):
         sentences.append(_UNKNOWN_TEXTS[name])
@@ -76,8 +81,8 @@ def _caption(name: str, products: Products) -> str:
 
 def _stage_rows(products: Products) -> tuple[list[str], list[TableRow]]:
     """Create head and rows of the table of results by stage."""
-    tracks, motion = stages.read_tracked_features(products), stages.read_motion(products)
-    matches, maps = stages.read_matches(products), stages.read_landing_maps(products)
+    tracks, motion = read_tracked_features(products), read_motion(products)
+    matches, maps = read_matches(products), read_landing_maps(products)
     names = ("Features and tracks", "Motion", "Structure", "Elevation map", "Safe landing map", "Site")
     results = dict.fromkeys(names, "")
     if tracks is not None:
@@ -97,8 +102,7 @@ def _stage_rows(products: Products) -> tuple[list[str], list[TableRow]]:
         safe, hazard = float(np.mean(maps.safety < 0.5)), float(np.mean(maps.safety > 1.5))
         classes = (("safe", safe), ("hazard", hazard), ("unknown", 1.0 - safe - hazard))
         results["Safe landing map"] = ", ".join(f"{name} {100.0 * fraction:.1f} %" for name, fraction in classes)
-        # row and column; y increases towards row 0
-        x, y = maps.corner_m + maps.cell_m * maps.site[::-1] * np.array([1.0, -1.0])
+        x, y = maps.positions(maps.site)
         has_site = bool(np.isfinite(maps.site).all())
         results["Site"] = f"x {number(x)} m, y {number(y)} m (axes of Fig. 4)" if has_site else "no safe site"
     return ["Stage", "Result"], [TableRow([name, text or "not reached"], bool(text)) for name, text in results.items()]
@@ -143,7 +147,7 @@ def sites_section(subject: Subject) -> Section | None:
 
 
 HDA = Presentation(
-    cases=(CaseKind(stages.is_hda_case, view, _LEGEND),),
+    cases=(CaseKind(is_hda_case, view, _LEGEND),),
     sections=(
         sections.threshold_section, sections.faults_section, limits_section, sections.map_section, touchdown_section,
         sites_section, run_times_section,

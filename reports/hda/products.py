@@ -1,7 +1,5 @@
 """Products of a landing case, read from files and checked: images, tracks, motion, matches, maps and ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.reports.products import check_shape, numeric_product, read_arrays, to_matrix
 
 MapArray = Float[np.ndarray, "rows columns"]
@@ -52,37 +51,31 @@ class EpipolarMatches:
 
 
 @dataclass(frozen=True)
-class LandingMaps:
-    """The maps of a case on the cells of the elevation map; row 0 has the largest y.
+class LandingMaps(ElevationMap):
+    """Elevation map, hazards and selected site of the algorithm, in the surface frame.
 
     The surface frame is level, with its origin at the first camera (`marsyard.algorithms.hda.estimator`).
 
-    - elevation_m: height relative to the first camera
     - safety: 0 safe, 1 unknown, 2 hazard
     - pixels: pixel (u, v) of each cell's centre in the first image; extrapolated if the elevation is unknown
-    - corner_m: centre of the first cell (x, y) in the surface frame
     - site, apriori: row and column of the safe and of the a-priori site; NaN for no site
     - limits: limits of slope (radians) and roughness (metres), and the lander's diameter (metres)
     """
 
-    elevation_m: MapArray
     roughness_m: MapArray
     slope_rad: MapArray
     safety: MapArray
     pixels: Float[np.ndarray, "rows columns 2"]
-    corner_m: Float[np.ndarray, "2"]
     apriori: Float[np.ndarray, "2"]
     surface_from_camera: Float[np.ndarray, "3 3"]
     world_from_surface: Float[np.ndarray, "3 3"]
     limits: Float[np.ndarray, "3"]
-    cell_m: float
     site: Float[np.ndarray, "2"]
 
     def world_to_cell(self, offset_from_nadir_m: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Convert offsets (x, y) from the camera's nadir point along the world's axes to fractional (row, column)."""
-        # row vectors times the rotation: offset in the surface frame; y increases towards row 0
-        offset_m = offset_from_nadir_m @ self.world_from_surface[:2, :2]
-        return np.asarray(((offset_m - self.corner_m) / self.cell_m * np.array([1.0, -1.0]))[..., ::-1])
+        # row vectors times the rotation: offset in the surface frame
+        return self.cells(offset_from_nadir_m @ self.world_from_surface[:2, :2])
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,6 @@
 Figures of a case: errors over time, the map with the track, and the landmarks of the last image.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -27,21 +25,12 @@ from marsyard.reports.blocks import (
     scatter_block,
 )
 from marsyard.reports.column_values import numbers
+from marsyard.reports.figure_style import INK, MUTED, REQUIREMENT, SERIES, in_page_style
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products, check_shape, read_arrays, to_float, to_matrix
 from marsyard.reports.rates import CaseFraction, fraction_of
-from marsyard.reports.section import (
-    INK,
-    MUTED,
-    REQUIREMENT,
-    SERIES,
-    Section,
-    Subject,
-    create_section,
-    has_values,
-    in_page_style,
-)
+from marsyard.reports.section import Section, Subject, create_section, has_values
 from marsyard.reports.wording import number
 
 _AXES = ("east", "north", "up")

@@ -1,13 +1,11 @@
 """Presentation of images over a map: recorded next to rendered images, and the matched landmarks of a case."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from marsyard.reports import section
+from marsyard.reports import figure_style, section
 from marsyard.reports.column_values import numbers
 from marsyard.reports.images import Mark, Panel, draw_panels
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView
@@ -95,15 +93,15 @@ def _summarise(values: Float[np.ndarray, " n"]) -> str:
     return f"{number(float(np.median(finite)))} ({number(float(finite.min()))} to {number(float(finite.max()))})"
 
 
-@section.in_page_style
+@figure_style.in_page_style
 def yield_figure(frame: pd.DataFrame) -> Figure:
     """Draw the yield of each matcher over the height of recorded and rendered images."""
     figure = Figure(figsize=(9.0, 2.8), layout="constrained")
     for axes, name, index in zip(figure.subplots(1, len(MATCHERS), sharey=True), MATCHERS, range(4), strict=True):
-        for prefix, filling in (("", section.SERIES[index]), (RENDERED, "none")):
+        for prefix, filling in (("", figure_style.SERIES[index]), (RENDERED, "none")):
             height, fraction = _column(frame, prefix + "height_m"), _column(frame, f"{prefix}{name}_yield")
-            style = {"color": section.SERIES[index], "markerfacecolor": filling, "markersize": 5.0}
-            axes.plot(height, fraction, section.MARKERS[index], **style)
+            style = {"color": figure_style.SERIES[index], "markerfacecolor": filling, "markersize": 5.0}
+            axes.plot(height, fraction, figure_style.MARKERS[index], **style)
         axes.set(xlabel="height (m)", ylim=(0.0, 1.0))
         axes.set_title(_NAMES[name], fontsize=9)
     figure.axes[0].set_ylabel("yield")
@@ -126,7 +124,13 @@ def _panels(products: Products, kind: str) -> list[Panel]:
         return []
     if map_image is None or landmarks is None:
         return [Panel(image, title), Panel(text="no pose on the map")]
-    style = {"marker": "o", "linestyle": "none", "markersize": 5.0, "fillstyle": "none", "color": section.SERIES[1]}
+    style = {
+        "marker": "o",
+        "linestyle": "none",
+        "markersize": 5.0,
+        "fillstyle": "none",
+        "color": figure_style.SERIES[1],
+    }
     on_image, on_map = (Mark(landmarks[:, columns], style) for columns in ([0, 1], [2, 3]))
     return [Panel(image, f"{title}, {len(landmarks)} landmarks", [on_image]), Panel(map_image, "Its map", [on_map])]
 

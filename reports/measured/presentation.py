@@ -1,7 +1,5 @@
 """Presentation of measured cases (real images): agreement with measured poses, matches, and the algorithm's figures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any
@@ -12,7 +10,7 @@ from jaxtyping import Bool, Float
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from marsyard.reports import section
+from marsyard.reports import figure_style, section
 from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import DIMES_CASE
 from marsyard.reports.hda.case_figures import FIGURES, available_figures
@@ -86,16 +84,18 @@ def agreement_section(subject: section.Subject) -> section.Section | None:
     return section.Section("agreement", "Agreement", "Images compared with measured poses", blocks, data)
 
 
-@section.in_page_style
+@figure_style.in_page_style
 def residual_figure(frame: pd.DataFrame) -> Figure:
     """Draw the median and the 90 % quantile of the residuals of each case, ordered by the median."""
     medians, percentile_90 = numbers(frame, MEDIAN), numbers(frame, PERCENTILE_90)
     finite = np.flatnonzero(np.isfinite(medians))
     order = finite[np.argsort(medians[finite], kind="stable")]
     x = np.arange(1, order.size + 1)
-    figure, axes = section.new_axes(6.2, 3.2)
+    figure, axes = figure_style.new_axes(6.2, 3.2)
     for values, name, index in ((percentile_90, "90 %", 1), (medians, "median", 0)):
-        axes.plot(x, values[order], section.MARKERS[index], color=section.SERIES[index], markersize=5.0, label=name)
+        axes.plot(
+            x, values[order], figure_style.MARKERS[index], color=figure_style.SERIES[index], markersize=5.0, label=name
+        )
     axes.set(xlabel="case, in order of the median", ylabel="residual (px)", ylim=(0.0, None))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(0.5, order.size + 0.5)
@@ -203,7 +203,7 @@ def read_matched_pairs(products: Products) -> list[MatchedPair]:
     return pairs
 
 
-@section.in_page_style
+@figure_style.in_page_style
 def draw_pair(pair: MatchedPair) -> Figure:
     """Draw both images with the matches, coloured by their residuals, and the offsets."""
     figure = Figure(figsize=(12.0, 5.2), layout="constrained")
@@ -224,7 +224,7 @@ def draw_pair(pair: MatchedPair) -> Figure:
     axis_limit = max(_MAX_COLOUR_PX, 1.5 * float(np.quantile(finite, 0.9))) if finite.size else _MAX_COLOUR_PX
     scatter.scatter(*offsets.T, linewidths=0.0, **style)
     for line in (scatter.axhline, scatter.axvline):
-        line(0.0, color=section.MUTED, linewidth=0.8)
+        line(0.0, color=figure_style.MUTED, linewidth=0.8)
     # rows increase downwards
     scatter.set(xlim=(-axis_limit, axis_limit), ylim=(axis_limit, -axis_limit), aspect="equal")
     scatter.set(xlabel="to the right (px)", ylabel="down (px)")

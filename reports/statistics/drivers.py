@@ -5,8 +5,6 @@ terrain, and r_x and r_y are the intraclass correlations of condition and respon
 two-stage sampling on ordinary least squares methods", J. Amer. Statist. Assoc. 77, 1982.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

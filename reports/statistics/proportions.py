@@ -6,8 +6,6 @@ The bounds are those of Clopper & Pearson, "The use of confidence or fiducial li
 binomial", Biometrika 26, 1934.
 """
 
-from __future__ import annotations
-
 import bisect
 import math
 from dataclasses import dataclass

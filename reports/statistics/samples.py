@@ -17,8 +17,6 @@ larger values has its bound (`marsyard.reports.statistics.clusters`).
 `python -m benchmarks.validation --only intervals --only shared` measures the coverage of all these intervals.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Callable, Sequence

@@ -18,8 +18,6 @@ largest weight m = max u, so that it is valid where no case failed. With equal w
 and Pearson, on which verdicts rest.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

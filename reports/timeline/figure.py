@@ -1,7 +1,5 @@
 """Perspective view of a case: ground, true and estimated path, cameras and points."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Bool
@@ -9,7 +7,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-from marsyard.reports.section import MARKERS, MUTED, in_page_style
+from marsyard.reports.figure_style import MARKERS, MUTED, in_page_style
 from marsyard.reports.timeline.mesh import camera_outlines, colour
 from marsyard.scenarios.timeline import SurfacePatch, Timeline
 

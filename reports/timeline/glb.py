@@ -1,7 +1,5 @@
 """Scene of a case as a binary glTF file (.glb), for Blender, web browsers and other viewers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

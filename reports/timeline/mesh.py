@@ -1,7 +1,5 @@
 """Triangles and outlines for three-dimensional views of a timeline."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64, Int32, UInt8
 from scipy.spatial.transform import Rotation

@@ -16,8 +16,6 @@ Positions are in the frame `world` (east, north, up). Time 0 of the bag is the f
 simulation's clock is the custom data `start_s` in `metadata.yaml`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

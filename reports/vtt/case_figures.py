@@ -7,8 +7,6 @@ template), and the right subframe around the stereo match. The title contains th
 figure contains a top view of the path, and an enlarged view of the target's estimated positions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,9 +20,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from scipy import ndimage
 
+from marsyard.reports.figure_style import GRID, INK, MUTED, SERIES, in_page_style
 from marsyard.reports.images import Image, Mark, Panel, box, draw_panels, square
 from marsyard.reports.products import Products, check_shape, numeric_product, to_matrix
-from marsyard.reports.section import GRID, INK, MUTED, SERIES, in_page_style
 
 Point = Float[np.ndarray, "2"]
 #: Orange and blue of Okabe and Ito; the true position is a white cross with a dark outline. The target's square is
@@ -210,10 +208,7 @@ def draw_path(products: Products) -> Figure:
 
 
 def _stop_panels(stop: StopImages, side_px: float) -> tuple[Panel, Panel, Panel]:
-    """Create the panels of the left subframe of a stop, of the enlarged match, and of the right subframe.
-
-    side_px: side of the template, pixels
-    """
+    """Create the panels of a stop: left subframe, enlarged match, right subframe; `side_px` is the template's side."""
     corner, target = stop.corners[0], stop.matches[0] - stop.corners[0]
     marks = square(target, side_px, _TARGET_STYLE)
     if np.isfinite([*stop.window, *corner]).all():

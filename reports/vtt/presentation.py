@@ -1,7 +1,5 @@
 """Presentation of visual target tracking: report sections, and views of cases with stops, path and updates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -5,8 +5,6 @@ A step is the motion of the rover from one image to the next: an angle, or a fra
 The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence

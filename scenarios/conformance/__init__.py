@@ -5,8 +5,6 @@
 suites (`marsyard.scenarios.tasks.Task.suite`). This module selects the suite, and runs its checks one by one.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from contextlib import suppress

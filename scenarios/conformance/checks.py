@@ -4,8 +4,6 @@ A custom part is a user-defined motion, instrument or score (`marsyard.scenarios
 of an algorithm or part: its methods, their inputs, and the rules for their answers.
 """
 
-from __future__ import annotations
-
 import ast
 import random
 import time

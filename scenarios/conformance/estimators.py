@@ -1,7 +1,5 @@
 """Conformance checks of estimators; each task declares measurements, and rules for its answers (`SuiteRules`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -3,8 +3,6 @@
 Each pixel's ray is intersected with the plane, without a renderer.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache

@@ -3,8 +3,6 @@
 Parts are described in `marsyard.scenarios.parts`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache

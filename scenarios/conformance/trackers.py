@@ -1,7 +1,5 @@
 """Conformance checks of target trackers: a drive towards a textured wall, with injected faults."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial

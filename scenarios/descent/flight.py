@@ -1,7 +1,5 @@
 """True motion of a descent: simulated dynamics, a custom motion, or a recorded flight."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

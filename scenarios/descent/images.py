@@ -1,7 +1,5 @@
 """Images of a descent: camera and its mounting, haze, a falling heat shield in view, and the detector."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ The overlap follows from true positions, attitudes and camera alone, so that it 
 et al., "Field Testing of the MER DIMES", require an area "at least 110 m across": a displacement of 30 m/s in 3.75 s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Result columns of a descent: conditions, measurement errors, and the landing with the estimate."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

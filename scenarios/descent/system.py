@@ -1,7 +1,5 @@
 """DIMES as a system: velocity of a lander under its parachute."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from marsyard.scenarios.systems import System

@@ -7,8 +7,6 @@ neglected.
 The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 

@@ -3,8 +3,6 @@
 The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

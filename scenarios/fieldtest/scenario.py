@@ -3,8 +3,6 @@
 The paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial

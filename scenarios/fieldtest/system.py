@@ -1,7 +1,5 @@
 """The field test of DIMES as a system."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from marsyard.scenarios.systems import System

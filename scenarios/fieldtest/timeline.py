@@ -1,7 +1,5 @@
 """Timeline of a triple of the field test, for its figure in the report and the exports of `marsyard replay`."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Description of a custom algorithm's class or function; its module is imported in a process of its own."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
@@ -12,7 +10,7 @@ from pydantic import BaseModel
 
 
 def describe_factory(factory: Any) -> dict[str, Any]:
-    """Return the kind, members, version and options of a class or function, as JSON values; see `Description`."""
+    """Return kind, members, version and options of a class or function, as JSON values (`AlgorithmDescription`)."""
     version = getattr(factory, "version", None)
     return {
         "kind": type(factory).__name__,

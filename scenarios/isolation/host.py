@@ -5,8 +5,6 @@ guardian and thereby itself. The arguments of a call arrive pickled in shared me
 representation (`plain`). Everything that the algorithm prints goes to standard error.
 """
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import json

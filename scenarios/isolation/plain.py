@@ -5,8 +5,6 @@ intermediate products of an answer (`details`) are omitted. A value of any other
 type, so that the validation of the answer reports it.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass

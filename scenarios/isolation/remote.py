@@ -4,8 +4,6 @@ The process is started once per worker, constructs the algorithm once, and recei
 after an exception, an exceeded limit or an unreadable answer; the next case starts a new one.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import sys
@@ -22,7 +20,7 @@ from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.process import Command, RunningProgram, temporary_folder
 from marsyard.algorithms.exchange.serving import acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
-from marsyard.algorithms.processes import children, processor_time_s
+from marsyard.algorithms.processes import children, processor_time_s, worker_device
 from marsyard.scenarios.imports import source_root
 from marsyard.scenarios.isolation.plain import decode
 from marsyard.scenarios.isolation.transport import Sender
@@ -86,7 +84,7 @@ class RemoteAlgorithm:
         child = cast(PythonProgram, self._server.child)
         self._sender = Sender(child.memory)
         self._process = child.find_algorithm()
-        start = {"path": search_path(), "spec": spec, "device": limits.device}
+        start = {"path": search_path(), "spec": spec, "device": worker_device(limits.devices)}
         child.left_s = math.inf
         answer = self._request("start", start, limits.loading_s)
         child.left_s = limits.total_s
@@ -171,7 +169,7 @@ def search_path() -> list[str]:
 
 
 @dataclass(frozen=True)
-class Description:
+class AlgorithmDescription:
     """Description of the class or function that creates a custom algorithm.
 
     - kind: name of its type
@@ -188,7 +186,7 @@ class Description:
 
 
 @cache
-def describe(spec: str) -> Description:
+def describe_in_process(spec: str) -> AlgorithmDescription:
     """Import a custom algorithm in a process of its own, and describe it. Raises ImportError with the reason."""
     spec = absolute_spec(spec)
     command, limits = PythonCommand(spec=spec), ExecutableLimits()
@@ -202,4 +200,4 @@ def describe(spec: str) -> Description:
     if "error" in answer or "fault" in answer:
         raise ImportError(str(answer.get("error", answer.get("message"))))
     contents = {key: value for key, value in answer.items() if key != "exchange"}
-    return Description(**{**contents, "members": frozenset(contents["members"])})
+    return AlgorithmDescription(**{**contents, "members": frozenset(contents["members"])})

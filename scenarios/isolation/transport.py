@@ -3,8 +3,6 @@
 Calibrations are large and the same for all images of a case: each is sent once per case. Received arrays are read-only.
 """
 
-from __future__ import annotations
-
 import io
 import os
 import pickle  # of measurements only, from the worker to the algorithm

@@ -1,7 +1,5 @@
 """Images of a landing case."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Numba kernels of `relief`: heights of rocks on a grid, robust planes, slope and roughness of footprints."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

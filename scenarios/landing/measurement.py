@@ -1,7 +1,5 @@
 """Create the measurements of a landing algorithm from the images and the true motion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Landing scenario: simulate images and measurements, run the algorithms, simulate the landings, and score them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from functools import partial
 from typing import Any

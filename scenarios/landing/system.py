@@ -1,7 +1,5 @@
 """Hazard detection and avoidance as a system: a helicopter selects its landing site."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from marsyard.scenarios.systems import System

@@ -8,8 +8,6 @@ unique because the filter is causal. The change of the path in the last iteratio
 "The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

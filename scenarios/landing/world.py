@@ -10,21 +10,17 @@ from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.landing.faults import sun_elevation_with_shadow_deg
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.meshes import MeshParameters
-from marsyard.scenarios.radiance import sun_at, sunlight_ratio
+from marsyard.scenarios.radiance import SiteWorld, sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround
-from marsyard.sim.render import Sun
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
 
 @dataclass(frozen=True)
-class LandingWorld:
+class LandingWorld(SiteWorld):
     """Terrain with rocks, custom meshes, and sun of a landing case."""
 
-    ground: SiteGround
-    sun: Sun
-    meshes: tuple[MeshParameters, ...]
-    brightness: float  #: sunlight at the ground / reference sunlight of the detector
+    meshes: tuple[MeshParameters, ...] = ()
 
     @classmethod
     def from_parameters(
@@ -40,4 +36,4 @@ class LandingWorld:
         ground = replace(ground, site=dusty_site.model_copy(update={"ground_texture": scaled_texture}))
         elevation_deg = sun_elevation_with_shadow_deg(p.faults, p.sun.elevation_deg)
         sun = sun_at(air, p.sun.azimuth_deg, elevation_deg)
-        return cls(ground, sun, p.meshes, sunlight_ratio(air, float(np.radians(elevation_deg)), p.detector))
+        return cls(ground, sun, sunlight_ratio(air, float(np.radians(elevation_deg)), p.detector), p.meshes)

@@ -7,8 +7,6 @@ the measurements of a descent one by one, and answers each image, and the end of
 `position_suite(...)` creates the suite for one estimator (`marsyard conformance`).
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

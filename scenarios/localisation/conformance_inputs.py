@@ -4,8 +4,6 @@ The lander descends at constant velocity and turns slowly, so that its inertial 
 those of the conformance suites' textured plane, without terrain or renderer.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Times of the images of a landing."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measurements of a descent in the order of arrival: inputs of a position estimator, and check of its answers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@
 line for each estimate of a descent: one per image, in the order of the images, then the final estimate.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

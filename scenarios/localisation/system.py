@@ -1,7 +1,5 @@
 """Localisation on a map as a system: position of a lander."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from marsyard.scenarios.systems import System

@@ -1,7 +1,5 @@
 """Task of the position estimators: names of the algorithms, their options, and how they are created."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from marsyard.algorithms.exchange import ExecutableAlgorithm

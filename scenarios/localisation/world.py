@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from marsyard.scenarios.radiance import sun_at, sunlight_ratio
+from marsyard.scenarios.radiance import SiteWorld, sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, mesh_size, site_scene
-from marsyard.sim.render import Scene, Sun
+from marsyard.sim.render import Scene
 from marsyard.sim.sensor import DetectorParameters
-from marsyard.sim.terrain import Environment, Site, Surface, TerrainParameters
+from marsyard.sim.terrain import Site, TerrainParameters
 
 
-@dataclass(frozen=True)
-class LocalisationWorld:
-    """Terrain and light of a landing.
-
-    - ground: terrain of the site, with the reflectance and the atmosphere of the landing
-    - sun: sun of the landing
-    - brightness: sunlight at the ground divided by the reference sunlight of the detector's responsivity
-    """
-
-    ground: SiteGround
-    sun: Sun
-    brightness: float = 1.0
-
-    @property
-    def air(self) -> Environment:
-        """Atmosphere of the landing."""
-        return self.ground.site.environment
-
-    @property
-    def surface(self) -> Surface:
-        """Surface of the ground; it is periodic."""
-        return self.ground.surface
+class LocalisationWorld(SiteWorld):
+    """Terrain and light of a landing."""
 
     @classmethod
     def from_parameters(

@@ -7,8 +7,6 @@ into the later image, from the position of the earlier camera to infinity. The r
 from the nearest point of this curve. For two images from one position, the curve is a single point.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,10 +81,7 @@ def compare_with_poses(
 
 
 def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
-    """Return the columns of a case: number of matches, residuals over all pairs, and the largest median of a pair.
-
-    Residuals are NaN without matches.
-    """
+    """Return the columns of a case: matches, residuals over all pairs (NaN without), largest median of a pair."""
     nan = float("nan")
     residuals = np.concatenate([pair.residuals_px for pair in pairs])
     inliers = np.concatenate([pair.matches.inliers for pair in pairs])

@@ -1,7 +1,5 @@
 """Rendered counterpart of an image over a map: another ground, with the same camera, height, attitude and map pixel."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Annotated
 

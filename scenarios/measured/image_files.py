@@ -3,8 +3,6 @@
 Those of the task `map` can also be JPEG, and in colour: published copies usually are.
 """
 
-from __future__ import annotations
-
 import warnings
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Convert a folder of recorded images into stored cases and their campaign: `marsyard ingest`."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Poses of cameras in the labels of images, and the world in which the poses of a case are compared."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform, Rotation

@@ -1,7 +1,5 @@
 """Estimation of landing sites from recorded images of the ground."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated

@@ -7,8 +7,6 @@ if it agrees with the common pose. The yield is the fraction of correct matches 
 that were searched.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -30,7 +28,6 @@ from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.algorithms.localisation.rectification import rectify_patches, view_ground
 from marsyard.scenarios.interface import Scalar
-from marsyard.sim.image_statistics import TEMPLATE
 
 #: Matchers, in the order of their ranks if their yields are equal.
 MATCHERS = ("template", "sift", "orb", "lvs")
@@ -40,7 +37,7 @@ TOLERANCE_PX = 2.5
 #: Minimum number of templates that agree with a homography (as in the statistics of image pairs).
 _MIN_INLIERS = 12
 #: Side of the squares in which an image is resampled; spacing and search range of the templates: map pixels (assumed).
-_TILE_PX, _TEMPLATE_STEP_PX, _SEARCH_PX = 16, 16, 12
+_TILE_PX, _TEMPLATE_PX, _TEMPLATE_STEP_PX, _SEARCH_PX = 16, 31, 16, 12
 #: Area for each feature of SIFT and of ORB, map pixels (assumed): both find so many in images from Mars.
 _FEATURE_AREA_PX = 300
 #: Fraction of the templates with the largest Harris interest on the map that are the strong ones (assumed).
@@ -173,14 +170,14 @@ class _Templates:
 
 def _match_templates(footprint: Footprint) -> _Templates:
     """Search templates of the image on the map; without any template, the arrays are empty."""
-    interest = harris_interest(*structure_tensor(footprint.appearance, TEMPLATE)) / footprint.appearance.mean()
+    interest = harris_interest(*structure_tensor(footprint.appearance, _TEMPLATE_PX)) / footprint.appearance.mean()
     centres, found, correlations = [], [], []
-    size = TEMPLATE + 2 * _SEARCH_PX
+    size = _TEMPLATE_PX + 2 * _SEARCH_PX
     for row, column in _template_corners(footprint.valid):
-        template = footprint.image[row : row + TEMPLATE, column : column + TEMPLATE]
+        template = footprint.image[row : row + _TEMPLATE_PX, column : column + _TEMPLATE_PX]
         window = footprint.appearance[row - _SEARCH_PX :, column - _SEARCH_PX :][:size, :size]
         peak = highest_peak(normalized_correlation(template, window))
-        centres.append((column + TEMPLATE // 2, row + TEMPLATE // 2))
+        centres.append((column + _TEMPLATE_PX // 2, row + _TEMPLATE_PX // 2))
         found.append((peak.column - _SEARCH_PX, peak.row - _SEARCH_PX))
         correlations.append(peak.value)
     pixels = np.array(centres, dtype=np.int64).reshape(-1, 2)
@@ -209,10 +206,10 @@ def _errors_px(pixels: Points2, map_pixels: Points2, alignment: Float[np.ndarray
 
 def _template_corners(valid: Bool[np.ndarray, "rows columns"]) -> Iterator[tuple[int, int]]:
     """Yield the corners (row, column) of the templates in the image whose search windows lie in the footprint."""
-    last = np.array(valid.shape) - TEMPLATE - _SEARCH_PX
+    last = np.array(valid.shape) - _TEMPLATE_PX - _SEARCH_PX
     for row in range(_SEARCH_PX, int(last[0]) + 1, _TEMPLATE_STEP_PX):
         for column in range(_SEARCH_PX, int(last[1]) + 1, _TEMPLATE_STEP_PX):
-            if valid[row : row + TEMPLATE, column : column + TEMPLATE].all():
+            if valid[row : row + _TEMPLATE_PX, column : column + _TEMPLATE_PX].all():
                 yield row, column
 
 

@@ -1,7 +1,5 @@
 """Read the map of `marsyard ingest`, and find the poses of images on it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Comparison of recorded images with a map, and of rendered images of the same kind with theirs."""
 
-from __future__ import annotations
-
 from enum import Enum
 from typing import Annotated
 
@@ -42,9 +40,7 @@ class OverMapParameters(MeasuredParameters):
 
     task_name = "map"
 
-    position_sd_m: Annotated[
-        NonNegative, Field(description="SD of a measured position per axis, m: range of the landmarks' search")
-    ] = 100.0
+    position_sd_m: Annotated[NonNegative, Field(description="SD of a measured position: range of the search")] = 100.0
     lvs: Annotated[LvsOptions, Field(description="options of the landmarks")] = LvsOptions()
     rendered: Annotated[CounterpartParameters, Field(description="rendered images")] = CounterpartParameters()
 

@@ -3,8 +3,6 @@
 World axes are east, north, up; attitudes are those of the body.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

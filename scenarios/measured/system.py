@@ -1,7 +1,5 @@
 """Recorded images as a system: other systems' algorithms on real images, compared with measured poses."""
 
-from __future__ import annotations
-
 from marsyard.scenarios.systems import System
 
 SYSTEM = System(

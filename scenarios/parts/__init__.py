@@ -3,8 +3,6 @@
 `motions`, `instruments` and `scores` define the inputs and outputs of parts. `named` imports and constructs parts.
 """
 
-from __future__ import annotations
-
 from marsyard.scenarios.parts.instruments import InstrumentReadings, InstrumentTruth
 from marsyard.scenarios.parts.motions import MotionInputs, Poses
 from marsyard.scenarios.parts.scores import (

@@ -10,8 +10,6 @@ Poses are interpolated as in a recorded flight (`marsyard.sim.dynamics.recorded`
 motion as they measure a simulated motion.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -73,10 +71,7 @@ class Poses:
 
 
 class CustomMotion(CustomPart, RecordedAxes):
-    """A user-defined motion (see `marsyard.scenarios.parts.motions`).
-
-    Positions are those of the camera or, with `lever_m`, of the vehicle.
-    """
+    """A user-defined motion, as its module describes: of the camera or, with `lever_m`, of the vehicle."""
 
     kind = DYNAMICS
     name_key = "motion"

@@ -6,8 +6,6 @@ imports of the modules with the simulated truth. The parameters of a leg are the
 Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

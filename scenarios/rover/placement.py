@@ -3,8 +3,6 @@
 The section is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 

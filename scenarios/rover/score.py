@@ -3,8 +3,6 @@
 Tables and figures are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 

@@ -1,7 +1,5 @@
 """Visual target tracking as a system: a rover drives to a target."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from marsyard.scenarios.systems import System

@@ -1,7 +1,5 @@
 """Task of the target trackers: names of the algorithms, their options, and how they are created."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from marsyard.algorithms.exchange import ExecutableTargetTracker

@@ -5,8 +5,6 @@ Each is converted to the names of OpenCV's YAML files (`camera_matrix`, `distort
 0.5 is subtracted from its principal point. Files of Ames Stereo Pipeline do not contain the image's size.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from typing import Any

@@ -10,8 +10,6 @@ describes the whole detector: its images are cropped to `roi`, then each block o
 becomes one pixel.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping, Sequence

@@ -12,8 +12,6 @@ fish-eye, 3 general) and for type 3 the linearity: ``Model = CAHVORE3,0.37 = gen
 values Hs, Hc, Vs, Vc and Theta, the covariance matrices ``S`` and ``S internal``, and unknown lines.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -4,8 +4,6 @@
 (chi, f).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

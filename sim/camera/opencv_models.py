@@ -15,8 +15,6 @@ CAHVOR with O = A equals the pinhole model with k3 = p1 = p2 = 0; for other coef
 O. CAHVORE with O = A, linearity 0 and a fixed pupil equals the fisheye model with k3 = k4 = 0.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar

@@ -7,8 +7,6 @@ frames (`marsyard.sim.camera.label_frames`). The image's size is that of the lab
 to the product or detached; Curiosity's begin with ODL_VERSION_ID.
 """
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -85,11 +83,6 @@ class Pds3Product:
     counts: UInt16[np.ndarray, "rows columns"]
     pose: tuple[LabelFrame, RigidTransform] | None
     time_s: float | None
-
-    @property
-    def site_from_rover(self) -> RigidTransform | None:
-        """The rover's pose in the site frame (x north, y east, z down), metres; None if unknown."""
-        return self.pose[1] if self.pose is not None and self.pose[0].name == SITE else None
 
 
 def read_pds3(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:

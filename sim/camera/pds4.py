@@ -5,8 +5,6 @@ The class `geom:Camera_Model_Parameters` of the geometry dictionary contains a m
 label's image array. Prefixes and versions of namespaces are ignored.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from xml.etree import ElementTree

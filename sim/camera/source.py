@@ -1,7 +1,5 @@
 """Camera files: reading of their bytes, error messages, and creation of cameras from the vectors of a model."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

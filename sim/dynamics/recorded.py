@@ -15,8 +15,6 @@ one is subtracted before the conversion to floating point.
 Quaternions rotate from the body's axes to the world's. Except for SPICE the files do not define these axes.
 """
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from collections.abc import Iterable, Sequence
@@ -193,10 +191,7 @@ def _read_file(path: str, _modified_ns: int, size: int) -> RecordedPoses:
 
 
 def _read_table(path: str, head: bytes) -> tuple[Decimal, Float64[np.ndarray, "n 8"]]:
-    """Read the first time and, of each row, time since then, position and quaternion (x, y, z, w).
-
-    The first bytes determine the format.
-    """
+    """Read, from any format, the first time, and of each row time since then, position and quaternion (x, y, z, w)."""
     first_line = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
         return _read_parquet(path)

@@ -15,8 +15,6 @@ A kernel can be a meta-kernel, which names further kernels. SPICE reads their re
 here they are relative to the meta-kernel or, if the kernel is not there, to the file ``*.spice.toml``.
 """
 
-from __future__ import annotations
-
 import hashlib
 import tomllib
 from pathlib import Path

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.detector import MAX_EXPOSURE_S, Detector
-from marsyard.sim.sensor.optics import Image, ImageMotion
+from marsyard.sim.sensor.optics import Image
 
 
 class AutoExposureParameters(Parameters):
@@ -47,21 +47,15 @@ class AutoExposure:
 
 
 def auto_expose(
-    detector: Detector,
-    radiance: Image,
-    parameters: AutoExposureParameters,
-    rng: np.random.Generator,
-    region: tuple[slice, slice] | None = None,
-    motion: ImageMotion | None = None,
+    detector: Detector, radiance: Image, parameters: AutoExposureParameters, rng: np.random.Generator
 ) -> AutoExposure:
     """Expose test images and scale the exposure time until the image has the target brightness.
 
     - detector: its exposure time is that of the first test image
     - rng: random generator for the noise of the test images
-    - region: rows and columns of the delivered image in which the percentile is computed; all by default
 
     After each test image the exposure time is multiplied by a factor from 1/8 to 8. The factor is 1/4 if the percentile
-    is saturated (99 % of full scale or full well). Raises ValueError if the region is empty.
+    is saturated (99 % of full scale or full well).
     """
     exposures: list[float] = []
     p = detector.parameters
@@ -70,9 +64,7 @@ def auto_expose(
     while True:
         test_detector = detector.with_exposure(exposure)
         exposures.append(exposure)
-        counts = test_detector.expose(radiance, rng, motion)[region or np.s_[:]]
-        if counts.size == 0:
-            raise ValueError("the auto-exposure region is empty")
+        counts = test_detector.expose(radiance, rng)
         level = float(np.percentile(counts, parameters.percentile))
         signal = max(level - p.offset_dn, 1.0)
         factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))

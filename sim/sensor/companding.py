@@ -4,8 +4,6 @@
 chosen such that full scale has code 255. A code is expanded to the centre of its range of counts.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -4,8 +4,6 @@ The Mars Exploration Rovers compress images with ICER, a wavelet coder, to about
 2003, IPN Progress Report 42-155). Here ICER is replaced by JPEG 2000, which is also a wavelet coder.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import UInt16

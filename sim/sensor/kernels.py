@@ -6,8 +6,6 @@ at x - velocity * t at mid exposure. The velocity is constant within tiles of `T
 charge of one pixel, which is shifted through all rows above it during the transfer.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

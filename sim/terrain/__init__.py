@@ -1,9 +1,10 @@
 """Terrain: heightfields with albedo and rocks, synthesised from a seed or imported from files; cached on disk."""
 
 from marsyard.sim.terrain.bank import MAX_TERRAINS, TerrainBank, synthesise
+from marsyard.sim.terrain.environment import Environment
 from marsyard.sim.terrain.parameters import TerrainParameters
 from marsyard.sim.terrain.rocks import PlacedRock, RockField, RockMesh, RockParameters
-from marsyard.sim.terrain.sites import Environment, PhotometryChanges, Site, site, sites
+from marsyard.sim.terrain.sites import PhotometryChanges, Site, site, sites
 from marsyard.sim.terrain.surface import Surface
 
 __all__ = ["MAX_TERRAINS", "Environment", "PlacedRock", "RockField", "RockMesh", "RockParameters", "Site", "Surface"]

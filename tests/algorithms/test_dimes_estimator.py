@@ -357,7 +357,6 @@ def test_products_contain_the_keys_used_by_reports(measurements: DescentMeasurem
 
 def test_products_report_failures_and_selection(measurements: DescentMeasurements) -> None:
     details = get_details(ESTIMATOR.estimate(measurements))
-    assert details.selected is not None
     products = dimes_products(details)
     np.testing.assert_array_equal(products["selected"], [details.selected.first, details.selected.second])
     uniform = _change_counts(measurements, lambda number, counts: np.full_like(counts, 1000))

@@ -105,7 +105,6 @@ def test_common_tilt_is_corrected(flights: list[tuple[Flight, DescentMeasurement
         answer = CORRECTED.estimate(tilted)
         assert np.hypot(*(valid_velocity(answer) - truth)) == pytest.approx((1.0 - TILT_FRACTION) * 1.96, abs=0.35)
         fit = get_details(answer).ground
-        assert fit is not None
         assert fit.agrees_with_instruments
         # the normal of level ground in a frame that is rotated by the tilt; 0.2 deg is about one standard deviation
         np.testing.assert_allclose(fit.inclination, [tilt[1], -tilt[0]], atol=np.deg2rad(0.4))

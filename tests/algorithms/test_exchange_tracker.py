@@ -104,8 +104,6 @@ def test_program_matches_python_tracker(tmp_path: Path) -> None:
     lost, expected = (
         trackers.update_tracker(tracker, trackers.pose(2.0), blank=0) for tracker in (program, python_tracker)
     )
-    assert lost is not None
-    assert expected is not None
     assert lost.state is program.state is TrackingState.LOST
     assert TargetLoss.LOW_MATCH_SCORE in expected.losses
     assert lost.losses == expected.losses

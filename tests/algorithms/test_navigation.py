@@ -71,7 +71,6 @@ def test_free_ground_is_crossed_in_a_straight_line() -> None:
     plan = navigate(_map_ground(), _make_pose(0.0, 0.0), np.array([5.0, 0.0]), 0.5, OPTIONS)
     assert plan.outcome is NavigationOutcome.PATH
     assert plan.commands == (DriveCommand(forward_m=0.5),)
-    assert plan.path_m[-1] == pytest.approx([5.0, 0.0])
 
 
 def test_lateral_goal_is_reached_along_gentle_arcs() -> None:
@@ -178,7 +177,10 @@ def test_plan_with_a_long_step_contains_both_arcs_of_the_path() -> None:
     plan = navigate(_map_ground((3.0, 0.0, 0.25, 0.4)), _make_pose(0.0, 0.0), np.array([6.0, 0.0]), 20.0, OPTIONS)
     curvatures = [command.turn_left_rad / command.forward_m for command in plan.commands if command.forward_m]
     assert len(curvatures) == 2
-    assert _compute_path_length_m(plan) == pytest.approx(np.hypot(*np.diff(plan.path_m, axis=0).T).sum(), rel=1e-3)
+    pose = _make_pose(0.0, 0.0)
+    for command in plan.commands:
+        pose = _apply_command(pose, command)
+    assert pose.translation[:2] == pytest.approx([6.0, 0.0], abs=0.01)
 
 
 def test_invalid_options_are_rejected() -> None:
@@ -323,7 +325,6 @@ def test_limits_of_depth_are_respected() -> None:
 def test_motion_is_recovered_despite_a_wrong_prediction(path_fraction: float) -> None:
     result = estimate_motion(_render_pair(START), _render_pair(MOTION), _make_prediction(path_fraction))
     assert result.outcome is VisualOdometryOutcome.CONVERGED
-    assert result.first_from_second is not None
     error_m = np.linalg.norm(result.first_from_second.translation - MOTION.translation)
     assert error_m < 0.005
     assert error_m < 4.0 * result.sigma_m
@@ -337,7 +338,6 @@ def test_slip_is_measured() -> None:
     result = estimate_motion(
         _render_pair(START), _render_pair(START), rigid(Rotation.identity(), np.array([0.3, 0.0, 0.0]))
     )
-    assert result.first_from_second is not None
     assert np.linalg.norm(result.first_from_second.translation) < 0.003
 
 
@@ -359,5 +359,4 @@ def test_calibration_error_scales_the_motion() -> None:
     straight = rigid(Rotation.identity(), np.array([0.5, 0.0, 0.0]))
     pairs = [replace(_render_pair(pose), cameras=(CAMERAS[0], wide)) for pose in (START, straight)]
     result = estimate_motion(pairs[0], pairs[1], straight)
-    assert result.first_from_second is not None
     assert np.linalg.norm(result.first_from_second.translation) / 0.5 == pytest.approx(1.05, abs=0.01)

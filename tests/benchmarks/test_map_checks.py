@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.validation.image_statistics import compute_map_statistics
 from benchmarks.validation.map_checks import FLOWN, HALF_FIELD_DEG, PIXEL_M, rectify, reduce_to_map
 from marsyard.scenarios.localisation.instruments import LanderCameraParameters, true_camera
-from marsyard.sim.image_statistics import compute_map_statistics
 
 
 def test_rectified_image_shows_directions_at_the_pixels_of_a_pinhole() -> None:

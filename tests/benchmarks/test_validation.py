@@ -20,7 +20,7 @@ from benchmarks.validation.__main__ import CHECKS
 from benchmarks.validation.document import RESULTS
 from benchmarks.validation.imu_reference import VelocityErrors
 from benchmarks.validation.records import Measure
-from marsyard.reports.validation_rows import VALIDATION_FILE
+from marsyard.reports.validation_rows import VALIDATION_FILE, RowKind
 from marsyard.scenarios.localisation.sites import localisation_sites
 from marsyard.scenarios.systems import systems
 from marsyard.sim.sensor.presets import PRESETS
@@ -193,3 +193,11 @@ def test_every_pattern_of_conditions_matches_a_row() -> None:
         if not any(fnmatchcase(row["claim"], item.rows) for row in stored[check.name]["measures"])
     ]
     assert unmatched == []
+
+
+@pytest.mark.parametrize(
+    ("data", "kind"),
+    [("", RowKind.VERIFICATION), ("spirit-descent", RowKind.FIT), ("dimes-templates", RowKind.VALIDATION)],
+)
+def test_kind_follows_from_the_register(data: str, kind: RowKind) -> None:
+    assert document.kind_of(data) is kind

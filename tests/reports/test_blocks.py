@@ -69,7 +69,6 @@ def make_rows_of_two_altitudes() -> pd.DataFrame:
 
 def test_section_contains_its_blocks_and_their_data_in_order() -> None:
     section = altitude_section(make_subject(make_rows_of_two_altitudes()))
-    assert section is not None
     # rates, distribution, rates by condition (figure, table), scatter plot, note
     assert [len(block.figures) for block in section.blocks] == [0, 1, 1, 0, 1, 0]
     assert section.blocks[-1].note == "Synthetic data."
@@ -124,7 +123,6 @@ def test_paper_values_are_compared_with_results(tmp_path: Path) -> None:
         """
     )
     section = paper_section(make_subject(make_rows_of_two_altitudes()), path)
-    assert section is not None
     assert section.data == {
         "altitude error (cm)": {"paper": "120", "ours": "100 (100 to 200)"},
         "answered": {"paper": "–", "ours": "30 of 40: 75.00 %"},

@@ -44,7 +44,6 @@ def make_section(frame: pd.DataFrame) -> Any:
 
 def test_boundary_of_two_true_conditions_is_drawn() -> None:
     section = make_section(make_rows(800, seed=1))
-    assert section is not None
     (fit,) = section.data["VEL"]
     assert set(fit["conditions"]) == set(CONDITIONS)
     assert fit["drawn"]

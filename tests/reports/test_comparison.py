@@ -10,7 +10,6 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from marsyard.reports.common_sections import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.comparison import (
     MetricComparison,
     campaign_diff_grid,
@@ -19,6 +18,7 @@ from marsyard.reports.comparison import (
     list_metrics,
     select_algorithm,
 )
+from marsyard.reports.consistency import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.statistics.changes import difference_p_value
 from marsyard.reports.stored import read_run
 from tests.reports.synthetic_run import MakeRun, make_rows

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from marsyard.reports.draws import ParameterSample, draws_figure, save_figure
+from marsyard.reports.figure_style import svg_markup
 from marsyard.reports.figures import (
     count_beyond_axis,
     error_distribution,
@@ -24,7 +25,6 @@ from marsyard.reports.figures import (
     error_scatter_against,
     outcome_bars,
 )
-from marsyard.reports.section import svg_markup
 from tests.reports.synthetic_run import make_rows
 
 METRIC = "velocity_error_m_s"

@@ -15,7 +15,6 @@ def test_panel_extends_over_its_cells() -> None:
     figure = draw_panels([[wide, wide], [narrow, text]], (4.0, 4.0), [3.0, 1.0])
     figure.draw_without_rendering()
     upper, left, right = (axes.get_subplotspec() for axes in figure.axes)
-    assert upper is not None
     assert (upper.rowspan, upper.colspan) == (range(1), range(2))
     assert upper.get_gridspec().get_height_ratios() == [3.0, 1.0]
     assert [spec is not None and spec.colspan.start for spec in (left, right)] == [0, 1]

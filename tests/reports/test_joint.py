@@ -115,7 +115,6 @@ def test_later_confirmations_use_the_sequential_test() -> None:
     frame["velocity_error_m_s"] = 1.0
     (first,) = evaluate_requirements(frame, [REQUIREMENT])
     part = collect_evidence(frame.head(5), REQUIREMENT, INDEPENDENT, has_own_terrains=True)
-    assert part is not None
     part = RequirementEvidence.from_table(part.to_table(), is_first=True)
     (later,) = evaluate_requirements(frame.tail(17), [REQUIREMENT], earlier=[part])
     assert (first.n, later.n, first.status, later.status) == (22, 22, Status.PASS, Status.INSUFFICIENT)

@@ -30,7 +30,6 @@ def test_report_is_read_as_written(make_run: MakeRun, options: dict[str, Any]) -
     write_report(directory)
     text = (directory / "report.json").read_text()
     report = read_report(text)
-    assert report is not None
     assert report.to_json() == json.loads(text)
     evaluation = evaluate_run(directory)
     assert repr(report.verdicts) == repr(tuple(evaluation.verdicts))  # NaN is not equal to itself

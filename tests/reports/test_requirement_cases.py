@@ -123,7 +123,6 @@ def test_summary_has_results_percentiles_and_neighbours(make_run: MakeRun) -> No
     frame.loc[30, "velocity_error_m_s"] = 7.5
     finder = _make_finder(make_run, frame, VELOCITY, AVAILABLE)
     summary = finder.summary(30)
-    assert summary is not None
     assert [(status.requirement_id, status.word) for status in summary.statuses] == [
         ("DIMES-VEL", "violated"),
         ("A", "met"),
@@ -148,7 +147,6 @@ def test_conditions_of_a_landing_contain_no_results(make_run: MakeRun) -> None:
     frame = frame.assign(**{name: rng.random(len(frame)) for name in (*results, *conditions)})
     evaluation = evaluate_run(make_run(frame, [AVAILABLE], definition={"scenario": "landing"}, scenario="landing"))
     summary = CaseFinder(evaluation.run, evaluation.verdicts).summary(0)
-    assert summary is not None
     assert {driver.name for driver in summary.drivers} >= {label(name) for name in conditions}
     results += [str(name) for name in frame if str(name).startswith(("footprints", "gross"))]
     assert not {driver.name for driver in summary.drivers} & {label(name) for name in results}
@@ -185,7 +183,6 @@ def test_similar_violations_have_the_nearest_conditions(make_run: MakeRun) -> No
             frame.loc[case, driver] = value
         frame.loc[case, "velocity_error_m_s"] = 9.0
     summary = _make_finder(make_run, frame, VELOCITY).summary(10)
-    assert summary is not None
     assert list(summary.similar) == [20, 40]
 
 

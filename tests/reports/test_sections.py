@@ -27,7 +27,6 @@ def make_subject(frame: pd.DataFrame, bound: float | None = 5.0) -> Subject:
 
 def find_cells(section: Section | None, row: str) -> list[str]:
     """Return the cells of the row with this name in the section's tables."""
-    assert section is not None
     grids = [block.grid for block in section.blocks if block.grid is not None]
     (cells,) = [list(cells) for grid in grids for cells in grid.rows if cells[0] == row]
     return cells
@@ -80,7 +79,6 @@ def test_condition_bins_have_correct_error_statistics() -> None:
     for bins in by_column.values():
         np.testing.assert_array_equal(np.sum([is_in_bin for _, is_in_bin in bins], axis=0), 1)
     section = conditions_section(make_subject(frame))
-    assert section is not None
     bins = section.data["attitude_rate_max_deg_s"]
     assert [entry["answered"]["n"] for entry in bins] == [200] * 5
     assert [entry["means"][0] for entry in bins] == pytest.approx([0.6, 1.8, 3.0, 4.2, 5.4], abs=0.15)
@@ -216,7 +214,6 @@ def test_landing_section_reports_lower_and_higher_touchdown_speeds() -> None:
     )
     frame.loc[100] = [np.nan, np.nan]  # crashed
     section = landing_section(make_subject(frame))
-    assert section is not None
     assert (section.data["landings"], section.data["reduced_fraction"], section.data["increased_fraction"]) == (
         100,
         0.7,

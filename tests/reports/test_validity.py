@@ -123,7 +123,6 @@ def test_terminal_report_and_json_state_the_domain_and_missed_checks(run: Path) 
     assert missed in page
     assert 'id="validity"' in page
     report = read_report((run / "report.json").read_text())
-    assert report is not None
     assert [domain.outside for domain in report.validity.domains] == [24, 40]
     assert [item.kind for item in report.validity.missed] == [RowKind.VALIDATION]
 
@@ -133,14 +132,6 @@ def test_system_of_another_package_has_no_domain(make_run: MakeRun) -> None:
     directory = make_run(make_rows(40), requirements=[], definition=definition, scenario="mine:Scenario")
     write_report(directory)
     assert read_validity(directory) == validity.Validity()
-
-
-@pytest.mark.parametrize(
-    ("data", "kind"),
-    [("", RowKind.VERIFICATION), ("spirit-descent", RowKind.FIT), ("dimes-templates", RowKind.VALIDATION)],
-)
-def test_kind_follows_from_the_register(data: str, kind: RowKind) -> None:
-    assert validation_rows.kind_of(data) is kind
 
 
 @pytest.mark.parametrize(

@@ -343,7 +343,6 @@ def test_population_defined_by_truth_is_named_and_compared_with_all_cases() -> N
     requirement = {**VELOCITY, "population": "lit", "statement": "The error is small."}
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"})
     assert verdict.statement == "Given truth (lit): The error is small."
-    assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.failures) == (10, 20, 2)
     assert verdict.note == (
         "'lit' means: the sun is up. For comparison: if all 20 cases counted, and cases without a value were failures, "
@@ -362,7 +361,6 @@ def test_configured_conditions_also_restrict_the_result_of_all_cases() -> None:
     frame["lit"], frame["navcam"] = np.arange(20) >= 10, np.arange(20) % 2 == 0
     requirement = {**VELOCITY, "population": "lit and navcam"}
     (verdict,) = evaluate_requirements(frame, [requirement], from_truth={"lit": "the sun is up"}, configured=("nav*",))
-    assert verdict.all_cases is not None
     assert (verdict.n, verdict.all_cases.n, verdict.all_cases.configured) == (5, 10, ("navcam",))
     assert verdict.all_cases.text.startswith("For comparison: if all 10 cases with the navcam counted, ")
     # the population is the definition itself

@@ -36,7 +36,6 @@ def test_additional_cases_lead_to_pass_on_new_terrains() -> None:
     frame.loc[5 * np.arange(6), "velocity_error_m_s"] = 6.0
     verdict = evaluate(frame, VELOCITY, probability=0.95)
     assert verdict.status is Status.INSUFFICIENT
-    assert verdict.clustered is not None
     assert (verdict.clustered.failed_terrains, verdict.clustered.failure_pairs) == (6, 0)
     assert verdict.additional_cases
     extended_rows = pd.concat(

@@ -88,7 +88,6 @@ def test_unresolved_rocks_occlude_distant_ground_by_their_frontal_area(gusev_ima
     image = gusev_image
     frame, ground = image.frame, SiteGround.from_site(site("gusev"), "ground")
     rocks, limit_rad, rms_slope = ground.rocks, 1.2e-3, 0.02
-    assert rocks is not None
     # With black ground and white rocks the radiance is the occluded fraction.
     is_ground = frame.body == GROUND
     black_ground = replace(frame, radiance=np.where(is_ground, 0.0, 1.0).astype(np.float32))

@@ -31,7 +31,6 @@ SUN = Sun(direction(np.radians(250.0), np.radians(35.0)))
 def _make_small_site(name: str, samples: int = 512) -> Site:
     """Return a preset site with fewer terrain samples, which is built quickly."""
     preset_site = site(name)
-    assert preset_site.ground is not None
     return preset_site.model_copy(update={"ground": preset_site.ground.model_copy(update={"samples": samples})})
 
 
@@ -92,7 +91,6 @@ def test_horizontal_view_covers_sector_and_nadir_view_disc(ground: SiteGround) -
 
 def test_min_rock_size_grows_with_distance(ground: SiteGround) -> None:
     field = ground.rocks
-    assert field is not None
     # The radius is less than half a terrain period, so that no rock occurs twice.
     viewpoint = Viewpoint(2.0, 3.0, 1.5, pixel_rad=5e-3, max_distance_m=12.0)
     objects = select_rocks(ground, viewpoint)

@@ -3,8 +3,6 @@
 Sections are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

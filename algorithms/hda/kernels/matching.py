@@ -1,7 +1,5 @@
 """Kernels of 'Vision Guided Landing': correlation tracker (section II.A) and search on epipolar segments (II.C)."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Normalised correlation uses float32 images, so that a vector register contains e
 from each other are float64. Eq. 11 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

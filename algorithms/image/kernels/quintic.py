@@ -1,7 +1,5 @@
 """Compiled evaluation of quintic splines from their coefficients, for `marsyard.algorithms.image.registration`."""
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Compiled kernels of `marsyard.algorithms.image.registration`; definitions and input checks are in that module."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

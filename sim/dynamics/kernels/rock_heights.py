@@ -1,7 +1,5 @@
 """Kernel that rasterizes rocks to a grid of maximum heights."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled geometry of a rocker-bogie suspension; `marsyard.sim.dynamics.rover` defines the model and its angles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ time derivative, direction of the lander's axis and its time derivative, and the
 world axes), then the lander's spin.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Compiled wind as a function of height: mean wind and gusts; `marsyard.sim.dynamics.wind` defines the model."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ A row is the state at a knot, a time step of the simulation: position, velocity 
 pitch, roll), their rates and accelerations. Accelerations are linear between knots, which defines the motion exactly.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

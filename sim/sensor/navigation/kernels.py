@@ -6,8 +6,6 @@ estimated errors and nine considered errors: the wander of the receiver's positi
 and velocity, the compass bias, and the biases of the two inclinometers. "Fix" means a receiver's solution.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

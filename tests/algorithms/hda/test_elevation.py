@@ -21,7 +21,6 @@ def draw_points(count: int, rng: np.random.Generator, slopes: tuple[float, float
 def test_map_has_one_point_per_cell_on_average() -> None:
     points = draw_points(600, np.random.default_rng(1))
     ground = elevation_map(points)
-    assert ground is not None
     extent = np.ptp(points[:, :2], axis=0)
     # The paper's cell size s = sqrt(A / N), and the number of whole cells that cover the box.
     assert ground.cell_m == pytest.approx(np.sqrt(extent[0] * extent[1] / 600))
@@ -42,7 +41,6 @@ def test_points_are_distributed_by_bilinear_weights() -> None:
     # Four corner points and one inner point in a box of 3 m x 3 m: cells of sqrt(9 / 5) m, hence 3 x 3 cells.
     points = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 4.0], [3.0, 3.0, 0.0], [0.9, 2.1, 8.0]])
     ground = elevation_map(points)
-    assert ground is not None
     cell = ground.cell_m
     weights = np.zeros(ground.elevation_m.shape)
     sums = np.zeros(ground.elevation_m.shape)
@@ -61,7 +59,6 @@ def test_plane_is_reconstructed_from_even_points() -> None:
     x, y = np.meshgrid(np.arange(40) * 0.25, np.arange(30) * 0.25)
     points = np.column_stack([x.ravel(), y.ravel(), 0.2 * x.ravel() - 0.1 * y.ravel() - 9.0])
     ground = elevation_map(points)
-    assert ground is not None
     positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
     plane = 0.2 * positions[..., 0] - 0.1 * positions[..., 1] - 9.0
     # Points are up to half a cell from the cell centre: the error is at most the rise within half a cell.
@@ -73,7 +70,6 @@ def test_cells_without_points_are_unknown() -> None:
     points = draw_points(4000, np.random.default_rng(3))
     points = points[np.hypot(points[:, 0] - 1.0, points[:, 1]) > 1.0]
     ground = elevation_map(points)
-    assert ground is not None
     positions = ground.positions(np.moveaxis(np.indices(ground.elevation_m.shape).astype(np.float64), 0, -1))
     distance = np.hypot(positions[..., 0] - 1.0, positions[..., 1])
     assert np.all(np.isnan(ground.elevation_m[distance < 1.0 - ground.cell_m]))

@@ -369,7 +369,6 @@ def test_steep_footprints_are_hazards() -> None:
 def test_elevation_map_is_centred_on_its_points() -> None:
     x, y = np.meshgrid(np.arange(10.0), np.arange(6.0))
     ground = elevation_map(np.stack([x.ravel(), y.ravel(), np.zeros(60)], axis=-1))
-    assert ground is not None
     rows, columns = ground.elevation_m.shape
     corners = ground.positions(np.array([[0.0, 0.0], [rows - 1.0, columns - 1.0]]))
     np.testing.assert_allclose(corners.mean(axis=0), [4.5, 2.5], atol=1e-9)

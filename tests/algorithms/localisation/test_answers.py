@@ -106,13 +106,11 @@ def test_valid_answer_is_copied(time_s: float) -> None:
         original += 100.0
         np.testing.assert_array_equal(getattr(checked, name), expected)
         assert getattr(checked, name).dtype == np.float64
-    assert checked.world_from_body is not None
     assert checked.world_from_body.approx_equal(Rotation.from_rotvec([0.1, 0.0, 0.2]), atol=1e-12)
 
 
 def test_single_precision_is_converted() -> None:
     checked = check_estimate(_Malformed(position_m=np.array([1.0, 2.0, 3.0], dtype=np.float32)), SPAN_S)
-    assert checked.position_m is not None
     assert checked.position_m.dtype == np.float64
 
 

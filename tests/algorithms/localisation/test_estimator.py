@@ -3,10 +3,8 @@
 The matching stages are replaced by functions with given results (`Stages`), or run on a small synthetic map.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,68 +16,28 @@ from marsyard.algorithms.localisation.coarse import CoarseFix, CoarseMatches, Co
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.fine import LandmarkMatches
-from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
-from marsyard.algorithms.localisation.map_sampling import elevation_at
+from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
-from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
-from tests.algorithms.localisation.synthetic_map import Scene, make_camera, make_scene, trace_image
+from marsyard.sim.measurements import AltitudeMeasurement
+from tests.algorithms.localisation.synthetic_flight import (
+    ATTITUDE,
+    ERROR_M,
+    FLAT_MAP,
+    START_M,
+    descend,
+    list_outcomes,
+    make_image,
+    make_images,
+    make_increments,
+    make_initial,
+    position_error_m,
+    true_position,
+)
 
-GRAVITY_M_S2, RATE_HZ = 3.71, 100
-START_M, VELOCITY_M_S = np.array([150.0, -100.0, 1700.0]), np.array([12.0, -8.0, -60.0])
-ATTITUDE = Rotation.from_euler("zyx", [25.0, 4.0, -3.0], degrees=True)
-ERROR_M = np.array([110.0, -70.0, 15.0])  #: True minus initial position.
 NO_COARSE_FIX, INCONSISTENT = PositionOutcome.NO_COARSE_FIX, PositionOutcome.INCONSISTENT
 UNCERTAIN, VALID = PositionOutcome.UNCERTAIN, PositionOutcome.VALID
-STUB_CAMERA = make_camera(64)
-
-
-def _true_position(time_s: float) -> np.ndarray:
-    return START_M + VELOCITY_M_S * time_s
-
-
-def _make_initial(**changes: Any) -> InitialState:
-    """Initial state with the error `ERROR_M` of the position; velocity and attitude are exact."""
-    variances = [1e4, 1e4, 400.0, *[0.01] * 3, *[1e-6] * 3]
-    initial = InitialState(0.0, START_M - ERROR_M, VELOCITY_M_S, ATTITUDE, np.diag(variances), GRAVITY_M_S2)
-    return replace(initial, **changes)
-
-
-def _make_increments(first_s: float, last_s: float) -> ImuIncrements:
-    """Exact increments of a flight with constant velocity and attitude."""
-    times = np.linspace(first_s, last_s, round((last_s - first_s) * RATE_HZ) + 1)
-    force = ATTITUDE.inv().apply([0.0, 0.0, GRAVITY_M_S2])
-    velocities = np.diff(times)[:, np.newaxis] * force
-    return ImuIncrements(times, 1.0 / RATE_HZ, np.zeros_like(velocities), velocities)
-
-
-def _make_image(time_s: float, radiance: np.ndarray, camera: CameraModel = STUB_CAMERA) -> DetectorImage:
-    calibration = DetectorCalibration(np.ones(radiance.shape), 150e-6, 0.0, 0.0, 1, 0.0, 4095)
-    return DetectorImage(np.rint(1000.0 * radiance).astype(np.uint16), time_s, camera, calibration)
-
-
-def _descend(
-    estimator: InertialEstimator | MapRelativeEstimator,
-    map_product: MapProduct,
-    images: Sequence[DetectorImage],
-    initial: InitialState | None = None,
-    *,
-    with_altitudes: bool = True,
-) -> Iterator[PositionEstimate]:
-    """Run an estimator over images, each with an exact altitude before it; yield each estimate, and the final one."""
-    estimator.start(_make_initial() if initial is None else initial, map_product)
-    previous_s = 0.0
-    for image in images:
-        estimator.process_increments(_make_increments(previous_s, image.time_s))
-        previous_s = image.time_s
-        position = _true_position(image.time_s)
-        if with_altitudes:
-            height = float(position[2]) - elevation_at(map_product, position[:2])
-            estimator.process_altitude(AltitudeMeasurement(height, image.time_s))
-        yield estimator.process_image(image)
-    yield estimator.finish()
 
 
 # --- stages with given results -----------------------------------------------------------------------------------
@@ -121,7 +79,7 @@ class Stages:
         points = np.stack([east.ravel(), north.ravel(), np.zeros(east.size)], axis=-1)
         result = self.fine.pop(0)
         turn, is_found = (Rotation.identity(), result) if isinstance(result, bool) else (_rotation(result), True)
-        camera = image.camera.transform(rigid(turn * ATTITUDE, _true_position(image.time_s)))
+        camera = image.camera.transform(rigid(turn * ATTITUDE, true_position(image.time_s)))
         pixels, visible = camera.project(points)
         found = visible & camera.in_frame(pixels) & is_found
         points, pixels = points[found], pixels[found]
@@ -129,11 +87,6 @@ class Stages:
         return LandmarkMatches(
             np.arange(count), points, pixels, pixels, np.ones(count), np.zeros((count, 2)), 1, 49, count, zero, zero
         )
-
-
-FLAT_MAP = MapProduct(
-    np.ones((300, 300), np.float32), np.zeros((300, 300), np.float32), np.array([-900.0, -900.0]), 6.0, 0.0, 0.0, 0.0
-)
 
 
 @pytest.fixture
@@ -149,23 +102,9 @@ def make_stages(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Stages]:
     return make
 
 
-def _images(count: int) -> list[DetectorImage]:
-    """Create uniform images, one per second, for the replaced stages."""
-    return [_make_image(1.0 + number, np.ones((64, 64))) for number in range(count)]
-
-
-def _outcomes(estimates: Sequence[PositionEstimate]) -> list[PositionOutcome]:
-    return [estimate.outcome for estimate in estimates]
-
-
 def _horizontal_sd_m(estimate: PositionEstimate) -> float:
     assert estimate.covariance is not None
     return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]))
-
-
-def _error_m(estimate: PositionEstimate) -> float:
-    assert estimate.position_m is not None
-    return float(np.linalg.norm(estimate.position_m - _true_position(estimate.time_s)))
 
 
 def _check_error(estimate: PositionEstimate) -> None:
@@ -174,13 +113,13 @@ def _check_error(estimate: PositionEstimate) -> None:
     A pixel of the small image is 40 m on the ground, with a standard deviation of 0.3 pixels for some 40 landmarks.
     """
     assert estimate.covariance is not None
-    assert _error_m(estimate) < min(np.sqrt(np.trace(estimate.covariance[:3, :3])), 2.0)
+    assert position_error_m(estimate) < min(np.sqrt(np.trace(estimate.covariance[:3, :3])), 2.0)
 
 
 def test_no_position_before_three_images(make_stages: Callable[..., Stages]) -> None:
     stages = make_stages([ERROR_M[:2]], [True, True])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(4)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, VALID, VALID, VALID]
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(4)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, VALID, VALID, VALID]
     assert [estimate.time_s for estimate in estimates] == [1.0, 2.0, 3.0, 4.0, 4.0]
     assert [image.time_s for image in stages.coarse_images[0]] == [1.0, 2.0, 3.0]
     for estimate in estimates[2:]:
@@ -190,7 +129,7 @@ def test_no_position_before_three_images(make_stages: Callable[..., Stages]) -> 
     assert details.inliers is not None
     assert details.inliers > 20
     assert details.coarse_position_m is not None
-    np.testing.assert_allclose(details.coarse_position_m, _true_position(3.0)[:2], atol=1e-6)
+    np.testing.assert_allclose(details.coarse_position_m, true_position(3.0)[:2], atol=1e-6)
 
 
 def test_altitudes_before_the_fix_refer_to_the_ground_below_the_fix(make_stages: Callable[..., Stages]) -> None:
@@ -200,31 +139,31 @@ def test_altitudes_before_the_fix_refer_to_the_ground_below_the_fix(make_stages:
     elevation[:, east_m < START_M[0] - 0.5 * ERROR_M[0]] = 100.0
     make_stages([ERROR_M[:2]], [True])
     estimator = MapRelativeEstimator()
-    list(_descend(estimator, replace(FLAT_MAP, elevation_m=elevation), _images(3)))
+    list(descend(estimator, replace(FLAT_MAP, elevation_m=elevation), make_images(3)))
     state = estimator._filter.state_at(2.0)
     # the altitudes reduce the initial height error of 15 m; at the initial position they would be 100 m too large
-    assert abs(state.position_m[2] - _true_position(2.0)[2]) < 15.0
+    assert abs(state.position_m[2] - true_position(2.0)[2]) < 15.0
 
 
 def test_coarse_stage_is_not_run_without_an_altitude(make_stages: Callable[..., Stages]) -> None:
     make_stages([], [])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(4), with_altitudes=False))
-    assert set(_outcomes(estimates)) == {NO_COARSE_FIX}
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(4), with_altitudes=False))
+    assert set(list_outcomes(estimates)) == {NO_COARSE_FIX}
 
 
 def test_refused_coarse_stage_is_repeated_with_the_last_three_images(make_stages: Callable[..., Stages]) -> None:
     stages = make_stages([CoarseRefusal.AMBIGUOUS, CoarseRefusal.NO_CONSENSUS, ERROR_M[:2]], [True])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 4 + [VALID] * 2
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 4 + [VALID] * 2
     times = [[image.time_s for image in images] for images in stages.coarse_images]
     assert times == [[1.0, 2.0, 3.0], [2.0, 3.0, 4.0], [3.0, 4.0, 5.0]]
 
 
 def test_position_is_uncertain_between_coarse_fix_and_first_match(make_stages: Callable[..., Stages]) -> None:
     make_stages([ERROR_M[:2]], [False, True, False, False])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(6)))
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(6)))
     # after a match, two images without one: the state is propagated
-    assert _outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, UNCERTAIN, VALID, VALID, VALID, VALID]
+    assert list_outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, UNCERTAIN, VALID, VALID, VALID, VALID]
     assert all(estimate.position_m is None for estimate in estimates[:3])
     for estimate in estimates[3:]:
         _check_error(estimate)
@@ -233,67 +172,67 @@ def test_position_is_uncertain_between_coarse_fix_and_first_match(make_stages: C
 def test_wrong_fix_is_discarded_and_the_coarse_stage_restarts(make_stages: Callable[..., Stages]) -> None:
     wrong = ERROR_M[:2] + np.array([-160.0, 90.0])
     stages = make_stages([wrong, ERROR_M[:2]], [False, False, False, True])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(8)))
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(8)))
     expected = [NO_COARSE_FIX, NO_COARSE_FIX, UNCERTAIN, UNCERTAIN, INCONSISTENT, NO_COARSE_FIX, NO_COARSE_FIX, VALID]
-    assert _outcomes(estimates) == [*expected, VALID]
+    assert list_outcomes(estimates) == [*expected, VALID]
     # the images of the second search are those after the wrong fix, at the positions of inertial navigation
     assert [image.time_s for image in stages.coarse_images[1]] == [6.0, 7.0, 8.0]
     for image in stages.coarse_images[1]:
         # tolerance: rounding of the sums of 800 increments
-        np.testing.assert_allclose(image.position_m, _true_position(image.time_s) - ERROR_M, atol=1e-6)
+        np.testing.assert_allclose(image.position_m, true_position(image.time_s) - ERROR_M, atol=1e-6)
     _check_error(estimates[-1])
 
 
 def test_contradicting_landmarks_are_failures(make_stages: Callable[..., Stages]) -> None:
     """Exact landmarks after a coarse fix that is wrong by 16 standard deviations: no position is reported."""
     make_stages([ERROR_M[:2] + np.array([-160.0, 0.0])], [True] * 3)
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
 
 
 def test_no_position_after_contradicting_landmarks_until_the_next_update(make_stages: Callable[..., Stages]) -> None:
     """The covariance is below the limit throughout, and the last update is recent: only the contradiction matters."""
     turned = np.radians([5.0, 0.0, 0.0])
     make_stages([ERROR_M[:2]], [True, True, turned, False, True])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(7)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 2 + [INCONSISTENT] * 2 + [VALID] * 2
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(7)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 2 + [INCONSISTENT] * 2 + [VALID] * 2
     assert estimates[4].position_m is None
     _check_error(estimates[6])
 
 
 def test_contradiction_at_the_end_of_the_descent_refuses_the_final_position(make_stages: Callable[..., Stages]) -> None:
     make_stages([ERROR_M[:2]], [True, np.radians([0.0, 5.0, 0.0])])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(4)))
-    assert _outcomes(estimates)[-2:] == [INCONSISTENT] * 2
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(4)))
+    assert list_outcomes(estimates)[-2:] == [INCONSISTENT] * 2
 
 
 def test_landmarks_of_a_wrong_attitude_never_update_the_state(make_stages: Callable[..., Stages]) -> None:
     """All landmarks show a tilt of 5 deg, 87 standard deviations; a subset near the nadir fits the wrong state."""
     make_stages([ERROR_M[:2] + np.array([0.0, 150.0])], [np.radians([5.0, 0.0, 0.0])] * 3)
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [INCONSISTENT] * 3 + [NO_COARSE_FIX]
 
 
 def test_position_without_a_recent_update_is_uncertain(make_stages: Callable[..., Stages]) -> None:
     """The last update is at 3 s: the position is reported until 8 s, with any number of images without a match."""
     make_stages([ERROR_M[:2]], [True, *[False] * 6])
     options = LvsOptions(max_failures=100, max_position_sd_m=1000.0)
-    estimates = list(_descend(MapRelativeEstimator(options), FLAT_MAP, _images(9)))
+    estimates = list(descend(MapRelativeEstimator(options), FLAT_MAP, make_images(9)))
     assert [estimate.time_s for estimate in estimates[-3:]] == [8.0, 9.0, 9.0]
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 6 + [UNCERTAIN] * 2
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 2 + [VALID] * 6 + [UNCERTAIN] * 2
 
 
 def test_position_whose_covariance_grows_above_the_limit_is_uncertain(make_stages: Callable[..., Stages]) -> None:
     """Without a match the standard deviation of the position grows by that of the velocity, 0.1 m/s before updates."""
     make_stages([ERROR_M[:2]], [True, *[False] * 5])
-    estimates = list(_descend(MapRelativeEstimator(LvsOptions(max_failures=100)), FLAT_MAP, _images(8)))
-    assert set(_outcomes(estimates[2:])) == {VALID}
+    estimates = list(descend(MapRelativeEstimator(LvsOptions(max_failures=100)), FLAT_MAP, make_images(8)))
+    assert set(list_outcomes(estimates[2:])) == {VALID}
     deviations = [_horizontal_sd_m(estimate) for estimate in estimates[2:]]
     assert np.all(np.diff(deviations[:-1]) > 0.0)
     make_stages([ERROR_M[:2]], [True, *[False] * 5])
     options = LvsOptions(max_failures=100, max_position_sd_m=0.5 * (deviations[2] + deviations[3]))
-    limited = list(_descend(MapRelativeEstimator(options), FLAT_MAP, _images(8)))
-    assert _outcomes(limited[2:]) == [VALID] * 3 + [UNCERTAIN] * 4
+    limited = list(descend(MapRelativeEstimator(options), FLAT_MAP, make_images(8)))
+    assert list_outcomes(limited[2:]) == [VALID] * 3 + [UNCERTAIN] * 4
 
 
 @pytest.mark.parametrize("make_estimator", [MapRelativeEstimator, InertialEstimator, FeatureEstimator])
@@ -304,20 +243,20 @@ def test_measurements_outside_of_the_inertial_data_are_not_used(
     """Time tags before the initial state, older than the filter's memory of 5 s, and after the last increment."""
     make_stages([ERROR_M[:2]], [True, True])
     estimator = make_estimator()
-    estimator.start(_make_initial(), FLAT_MAP)
+    estimator.start(make_initial(), FLAT_MAP)
     images = [1.0, 2.0, 3.0] if has_fix else [1.0]
     previous_s = 0.0
     for time_s in images:
-        estimator.process_increments(_make_increments(previous_s, time_s))
+        estimator.process_increments(make_increments(previous_s, time_s))
         previous_s = time_s
-        estimator.process_altitude(AltitudeMeasurement(float(_true_position(time_s)[2]), time_s))
-        estimator.process_image(_make_image(time_s, np.ones((64, 64))))
-    estimator.process_increments(_make_increments(previous_s, 8.0))
+        estimator.process_altitude(AltitudeMeasurement(float(true_position(time_s)[2]), time_s))
+        estimator.process_image(make_image(time_s, np.ones((64, 64))))
+    estimator.process_increments(make_increments(previous_s, 8.0))
     before = estimator.finish()
     for time_s in (-0.5, 1.5, 8.5):
         # an altitude of 1 m would give a wrong scale and a wrong height
         estimator.process_altitude(AltitudeMeasurement(1.0, time_s))
-        answer = estimator.process_image(_make_image(time_s, np.ones((64, 64))))
+        answer = estimator.process_image(make_image(time_s, np.ones((64, 64))))
         assert answer.outcome is PositionOutcome.OUTSIDE_INERTIAL_DATA
         assert answer.position_m is None
         assert answer.time_s == 8.0
@@ -330,135 +269,52 @@ def test_measurements_outside_of_the_inertial_data_are_not_used(
 def test_ignored_altitude_does_not_set_the_scale_of_the_coarse_stage(make_stages: Callable[..., Stages]) -> None:
     stages = make_stages([CoarseRefusal.NO_CONSENSUS], [])
     estimator = MapRelativeEstimator()
-    estimator.start(_make_initial(), FLAT_MAP)
+    estimator.start(make_initial(), FLAT_MAP)
     previous_s = 0.0
-    for image in _images(3):
-        estimator.process_increments(_make_increments(previous_s, image.time_s))
+    for image in make_images(3):
+        estimator.process_increments(make_increments(previous_s, image.time_s))
         previous_s = image.time_s
-        estimator.process_altitude(AltitudeMeasurement(float(_true_position(image.time_s)[2]), image.time_s))
+        estimator.process_altitude(AltitudeMeasurement(float(true_position(image.time_s)[2]), image.time_s))
         estimator.process_altitude(AltitudeMeasurement(1.0, image.time_s + 0.5))
         estimator.process_image(image)
-    expected = [_true_position(image.time_s)[2] for image in _images(3)]
+    expected = [true_position(image.time_s)[2] for image in make_images(3)]
     np.testing.assert_allclose(stages.heights_m[0], expected, atol=1e-6)
 
 
 def test_max_failures_sets_the_number_of_images(make_stages: Callable[..., Stages]) -> None:
     make_stages([ERROR_M[:2]], [True, False])
-    estimates = list(_descend(MapRelativeEstimator(LvsOptions(max_failures=1)), FLAT_MAP, _images(5)))
-    assert _outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, VALID, INCONSISTENT, NO_COARSE_FIX, NO_COARSE_FIX]
+    estimates = list(descend(MapRelativeEstimator(LvsOptions(max_failures=1)), FLAT_MAP, make_images(5)))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, VALID, INCONSISTENT, NO_COARSE_FIX, NO_COARSE_FIX]
 
 
 def test_reported_deviation_above_the_limit_is_uncertain(make_stages: Callable[..., Stages]) -> None:
     make_stages([ERROR_M[:2]], [True])
-    (*_, valid) = _descend(MapRelativeEstimator(), FLAT_MAP, _images(3))
+    (*_, valid) = descend(MapRelativeEstimator(), FLAT_MAP, make_images(3))
     sd_m = _horizontal_sd_m(valid)
     for factor, outcome in ((1.01, VALID), (0.99, UNCERTAIN)):
         make_stages([ERROR_M[:2]], [True])
         options = LvsOptions(max_position_sd_m=factor * sd_m)
-        (*_, final) = _descend(MapRelativeEstimator(options), FLAT_MAP, _images(3))
+        (*_, final) = descend(MapRelativeEstimator(options), FLAT_MAP, make_images(3))
         assert final.outcome is outcome
         assert (final.position_m is None) == (final.covariance is None) == (outcome is UNCERTAIN)
 
 
 def test_improbable_coarse_fix_does_not_change_the_state(make_stages: Callable[..., Stages]) -> None:
     """The filter rejects a fix 8 standard deviations from the narrow axis of the prior; later images are processed."""
-    initial = _make_initial(covariance=np.diag([1e4, 100.0, 400.0, *[0.01] * 3, *[1e-6] * 3]))
+    initial = make_initial(covariance=np.diag([1e4, 100.0, 400.0, *[0.01] * 3, *[1e-6] * 3]))
     stages = make_stages([np.array([0.0, 120.0]), np.array([30.0, 120.0]), np.array([110.0, -10.0])], [False])
-    estimates = list(_descend(MapRelativeEstimator(), FLAT_MAP, _images(5), initial))
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 4 + [UNCERTAIN] * 2
+    estimates = list(descend(MapRelativeEstimator(), FLAT_MAP, make_images(5), initial))
+    assert list_outcomes(estimates) == [NO_COARSE_FIX] * 4 + [UNCERTAIN] * 2
     assert estimates[-1].time_s == 5.0
-    np.testing.assert_allclose(stages.coarse_images[2][-1].position_m, _true_position(5.0) - ERROR_M, atol=1e-6)
+    np.testing.assert_allclose(stages.coarse_images[2][-1].position_m, true_position(5.0) - ERROR_M, atol=1e-6)
 
 
 def test_start_resets_the_estimator(make_stages: Callable[..., Stages]) -> None:
     estimator = MapRelativeEstimator()
     make_stages([ERROR_M[:2]], [True])
-    first = list(_descend(estimator, FLAT_MAP, _images(3)))
+    first = list(descend(estimator, FLAT_MAP, make_images(3)))
     make_stages([ERROR_M[:2]], [True])
-    second = list(_descend(estimator, FLAT_MAP, _images(3)))
-    assert _outcomes(second) == _outcomes(first)
+    second = list(descend(estimator, FLAT_MAP, make_images(3)))
+    assert list_outcomes(second) == list_outcomes(first)
     assert first[-1].position_m is not None
     np.testing.assert_array_equal(second[-1].position_m, first[-1].position_m)
-
-
-# --- baselines and stages on a synthetic map ---------------------------------------------------------------------
-
-
-@cache
-def _scene(seed: int) -> Scene:
-    """Terrain of 4.6 km: at 1700 m the camera sees 3.6 km."""
-    return make_scene(seed=seed, size=768, relief_m=40.0)
-
-
-@cache
-def _traced_images() -> tuple[DetectorImage, ...]:
-    """Images of the first terrain from the true positions."""
-    camera = make_camera(256)
-    return tuple(
-        _make_image(time_s, trace_image(_scene(1), camera, _true_position(time_s), ATTITUDE), camera)
-        for time_s in (1.0, 2.0, 3.0, 4.0)
-    )
-
-
-def test_inertial_baseline_propagates_the_initial_state() -> None:
-    estimates = list(_descend(InertialEstimator(), FLAT_MAP, _images(6)))
-    assert set(_outcomes(estimates)) == {VALID}
-    deviations = []
-    for estimate in estimates:
-        assert estimate.position_m is not None
-        assert estimate.velocity_m_s is not None
-        assert estimate.world_from_body is not None
-        assert estimate.covariance is not None
-        # tolerance: rounding of the sums of 600 increments
-        np.testing.assert_allclose(estimate.position_m, _true_position(estimate.time_s) - ERROR_M, atol=1e-6)
-        np.testing.assert_allclose(estimate.velocity_m_s, VELOCITY_M_S, atol=1e-9)
-        assert (estimate.world_from_body.inv() * ATTITUDE).magnitude() < 1e-9
-        # sd of 0.1 m/s for up to 6 s; the attitude's 1 mrad adds 0.5 g t^2 1e-3 = 0.07 m
-        expected = np.hypot(100.0, 0.1 * estimate.time_s)
-        assert np.sqrt(estimate.covariance[0, 0]) == pytest.approx(expected, abs=1e-3)
-        deviations.append(estimate.covariance[0, 0])
-    assert np.all(np.diff(deviations[:-1]) > 0.0)
-
-
-def test_stages_find_the_position_on_a_synthetic_map() -> None:
-    estimates = list(_descend(MapRelativeEstimator(), _scene(1).map_product, _traced_images()))
-    assert _outcomes(estimates) == [NO_COARSE_FIX, NO_COARSE_FIX, VALID, VALID, VALID]
-    # images without noise and exact attitude: below a map pixel of 6 m
-    assert max(_error_m(estimate) for estimate in estimates[2:]) < 3.0
-
-
-def test_stages_find_no_position_on_an_unrelated_map() -> None:
-    estimates = list(_descend(MapRelativeEstimator(), _scene(2).map_product, _traced_images()))
-    assert set(_outcomes(estimates)) == {NO_COARSE_FIX}
-
-
-def test_features_find_the_position_on_a_synthetic_map() -> None:
-    estimates = list(_descend(FeatureEstimator(), _scene(1).map_product, _traced_images()[:2]))
-    assert _outcomes(estimates) == [VALID] * 3
-    for estimate in estimates:
-        assert estimate.position_m is not None
-        error = estimate.position_m[:2] - _true_position(estimate.time_s)[:2]
-        # features at the working scale of about 13 m a pixel, and no use of the attitude
-        assert np.hypot(*error) < 40.0
-    details = estimates[0].details
-    assert isinstance(details, LocalisationDetails)
-    assert details.inliers is not None
-    assert details.inliers >= LvsOptions().min_matches
-
-
-@pytest.mark.slow
-def test_features_find_no_position_on_an_unrelated_map() -> None:
-    estimates = list(_descend(FeatureEstimator(), _scene(2).map_product, _traced_images()[:2]))
-    assert _outcomes(estimates) == [NO_COARSE_FIX] * 3
-
-
-def test_features_need_contrast_and_an_altitude() -> None:
-    """A uniform map and a uniform image have no features; without an altitude the scale is not known."""
-    complete = _scene(1).map_product
-    product = replace(
-        complete, appearance=complete.appearance[:200, :200], elevation_m=complete.elevation_m[:200, :200]
-    )
-    assert set(_outcomes(list(_descend(FeatureEstimator(), FLAT_MAP, _traced_images()[:1])))) == {NO_COARSE_FIX}
-    assert set(_outcomes(list(_descend(FeatureEstimator(), product, _images(1))))) == {NO_COARSE_FIX}
-    without = _descend(FeatureEstimator(), product, _traced_images()[:1], with_altitudes=False)
-    assert set(_outcomes(list(without))) == {NO_COARSE_FIX}

@@ -241,7 +241,6 @@ def test_failures_of_a_program_are_faults(tmp_path: Path, body: str, fault: Faul
 def test_a_failure_in_a_case_is_recorded_as_an_outcome(tmp_path: Path) -> None:
     spec = f"serve:{write_plain(tmp_path, 'sys.exit(repr(actions))')}"
     algorithm_run = run_algorithm(lambda: run(spec), lambda answer: answer)
-    assert algorithm_run.failure is not None
     assert algorithm_run.failure.outcome == "CRASHED"
     assert algorithm_run.row["stderr"] == "['start']\n"
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.interface import PixelBox, TargetTracker, TargetUpdate
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.tracker import VttDetails
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker, VttDetails
 from marsyard.sim.camera import Cahv, Cahvor, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import MastCalibration, MastGeometry, MastImage, RoverMeasurements, RoverTarget
@@ -240,13 +240,21 @@ def make_scene(body: Plane | Sphere, target: np.ndarray, seed: int) -> Scene:
     return Scene((body,), draw_waves(seed, count=100), target)
 
 
+def start_drive(target: np.ndarray, seed: int) -> Drive:
+    """Create a drive to a face, designate the target at the start, and stop there."""
+    drive = Drive(make_scene(make_face(seed, target), target, seed), navcam(), VisualTargetTracker(SMALL_WINDOW))
+    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
+    drive.stop(pose(0.0, 0.0))
+    return drive
+
+
 def get_details(update: TargetUpdate | None) -> VttDetails:
     assert update is not None
     assert isinstance(update.details, VttDetails)
     return update.details
 
 
-def get_pixel(update: TargetUpdate) -> np.ndarray:
+def get_pixel(update: TargetUpdate | None) -> np.ndarray:
     match = get_details(update).match
     assert match is not None
     return match.pixel

@@ -90,10 +90,8 @@ def test_rounding_does_not_shift_subframe_borders() -> None:
     # A centred target puts the borders on whole pixels, where rounding depends on the last bit.
     target, options = np.array([6.0, 0.5, 0.1]), VttOptions()
     aim = aim_at_position(target, navcam(), options)
-    assert aim is not None
     for offset_m in (-1e-13, 1e-13, -3e-12, 3e-12):
         shifted_aim = aim_at_position(target + offset_m, navcam(), options)
-        assert shifted_aim is not None
         assert (shifted_aim.left, shifted_aim.right) == (aim.left, aim.right)
 
 
@@ -124,7 +122,6 @@ def test_near_targets_need_pair_centred_pointing() -> None:
     target = np.array([1.2, -0.1, 0.1])
     assert aim_at_position(target, pancam(), VttOptions()) is None
     aim = aim_at_position(target, pancam(), VttOptions(aim_pair=True))
-    assert aim is not None
     assert aim.left.corner[0] - aim.right.corner[0] > 400
 
 
@@ -139,7 +136,6 @@ def test_mast_limits_are_enforced() -> None:
 def test_aim_subframes_cover_the_search_windows() -> None:
     options = VttOptions()
     aim = aim_at_position(np.array([6.0, 0.5, 0.1]), navcam(), options)
-    assert aim is not None
     angles = (aim.azimuth_rad, aim.elevation_rad)
     target_in_head = navcam().geometry.rover_from_head(*angles).inv().apply(np.array([6.0, 0.5, 0.1]))
     # Half the window on each side. The right image adds half the disparity range and two rows of epipolar tolerance.
@@ -155,7 +151,6 @@ def test_aim_subframes_cover_the_search_windows() -> None:
 def test_pixel_designation_uses_its_pixel_and_covers_all_ranges() -> None:
     mast, options = navcam(), VttOptions(seed_range_m=(2.0, 30.0))
     aim = aim_at_pixel(PixelTarget(np.array([400.0, 700.0]), 0.3, -0.2), mast, options)
-    assert aim is not None
     assert (aim.azimuth_rad, aim.elevation_rad) == (0.3, -0.2)
     _, direction = mast.left.rays(np.array([400.0, 700.0]))
     for range_m in (2.0, 5.0, 30.0):

@@ -125,7 +125,6 @@ def test_arm_receives_only_tracked_targets_at_the_goal() -> None:
     tracked_target = TargetUpdate(NORMAL, (), target_m)
     at_goal = hand_off(tracked_target, goal, navcam())
     assert at_goal.outcome is HandOffOutcome.HANDED_OFF
-    assert at_goal.target is not None
     np.testing.assert_array_equal(at_goal.target.position_rover, target_m)
     # Eq. 5 of the tracking paper at 1.735 m from the mast's elevation axis, which is 0.35 m ahead of the rover's origin
     # and 1.4 m above it: 1.23 cm of stereo error, and 0.35 cm for a drift of 2.5 px.

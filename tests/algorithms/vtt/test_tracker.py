@@ -29,6 +29,7 @@ from tests.algorithms.vtt.synthetic_drive import (
     navcam,
     pancam,
     pose,
+    start_drive,
 )
 
 # ----- drift -----
@@ -58,7 +59,6 @@ def test_tracked_point_does_not_drift_from_10_m_to_2_m(fraction: float, make_bod
         assert np.linalg.norm(last.position_rover - true_pose.inv().apply(target)) < 0.003
         for (_, previous), (_, current) in pairwise(stops):
             change = get_details(current).change
-            assert change is not None
             # The pose predicts the magnification, stereo measures it. 0.1 px of disparity changes the range by 0.4 %
             # at 10 m.
             range_ratio = get_details(previous).distance_m / get_details(current).distance_m
@@ -124,9 +124,7 @@ def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     tilted_pose = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
     update = drive.stop(tilted_pose)
     change = get_details(update).change
-    assert change is not None
     assert np.degrees(change.roll_rad) == pytest.approx(-25.0, abs=4.0)
-    assert update is not None
     assert update.tracked == roll
     if roll:
         np.testing.assert_allclose(get_pixel(update), drive.true_pixel(tilted_pose, target), atol=0.3)
@@ -134,16 +132,11 @@ def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
 
 def test_turn_in_place_changes_only_mast_angles() -> None:
     target = np.array([6.0, 0.5, 0.2])
-    drive = Drive(make_scene(make_face(4, target), target, 4), navcam(), VisualTargetTracker(SMALL_WINDOW))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 4)
     update = drive.stop(pose(0.0, 0.0, np.deg2rad(45.0)))
     result = get_details(update)
-    assert update is not None
     assert update.tracked
-    assert result.match is not None
     assert result.match.score > 0.95
-    assert result.change is not None
     # The mast is 0.35 m ahead of the turn axis: the direction changes by 2.5 deg, the distance of 5.6 m by 0.1 m.
     assert abs(result.change.magnification - 1.0) < 0.03
     assert abs(np.degrees(result.azimuth_change_rad)) < 4.0
@@ -165,28 +158,22 @@ def test_circling_reduces_the_score_but_not_the_accuracy() -> None:
         drive.tracker.designate(RoverTarget(first.inv().apply(target)), first)
         drive.stop(first)
         update = drive.stop(second)
-        assert update is not None
         assert update.tracked
         # The mast is ahead and to the left of the rover origin; the angle is that of the line of sight.
         assert abs(np.degrees(get_details(update).azimuth_change_rad)) == pytest.approx(step, rel=0.02)
         np.testing.assert_allclose(get_pixel(update), drive.true_pixel(second, target), atol=0.2)
         match = get_details(update).match
-        assert match is not None
         scores[step] = match.score
     assert 0.79 < scores[15.0] < scores[8.0] < scores[2.0]
 
 
 def test_driving_backwards_shrinks_the_template() -> None:
     target = np.array([4.0, 0.1, 0.2])
-    drive = Drive(make_scene(make_face(2, target), target, 2), navcam(), VisualTargetTracker(SMALL_WINDOW))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 2)
     for x in (-0.4, -0.8, -1.2):
         update = drive.stop(pose(x, 0.0))
         change = get_details(update).change
-        assert update is not None
         assert update.tracked
-        assert change is not None
         assert 0.88 < change.magnification < 0.93
         np.testing.assert_allclose(get_pixel(update), drive.true_pixel(pose(x, 0.0), target), atol=0.15)
 
@@ -209,13 +196,11 @@ def test_all_three_designations_define_the_same_target() -> None:
         drive = Drive(scene, navcam(), VisualTargetTracker(replace(SMALL_WINDOW, seed_range_m=(3.0, 15.0))))
         drive.tracker.designate(designation, start)
         update = drive.stop(start)
-        assert update is not None
         assert update.tracked
         assert update.position_rover is not None
         # A tenth of a pixel of disparity is 2 cm of range at 7 m.
         np.testing.assert_allclose(update.position_rover, target, atol=0.02)
         second_update = drive.stop(pose(0.7, 0.0))
-        assert second_update is not None
         assert second_update.tracked
         np.testing.assert_allclose(get_pixel(second_update), drive.true_pixel(pose(0.7, 0.0), target), atol=0.1)
 
@@ -227,7 +212,6 @@ def test_range_of_a_near_target_is_accurate_if_the_mast_centres_both_images() ->
     drive = Drive(make_scene(make_face(6, target), target, 6), pancam(), VisualTargetTracker(options))
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
-    assert update is not None
     assert update.position_rover is not None
     np.testing.assert_allclose(update.position_rover, target, atol=0.001)
 
@@ -277,19 +261,15 @@ def test_slip_appears_as_a_position_correction() -> None:
     assert last.position_rover is not None
     np.testing.assert_allclose(last.position_rover, true_pose.inv().apply(target), atol=0.01)
     evidence = get_details(last).evidence
-    assert evidence is not None
     # After 6 m the target has moved by 4 % of that in the estimated world frame.
     assert evidence.position_correction_m == pytest.approx(0.24, abs=0.05)
 
 
 def test_pointing_error_does_not_change_the_match() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(make_scene(make_face(5, target), target, 5), navcam(), VisualTargetTracker(SMALL_WINDOW))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 5)
     drive.pointing_error_rad = (np.deg2rad(0.5), np.deg2rad(-0.3))
     update = drive.stop(pose(0.5, 0.0))
-    assert update is not None
     assert update.tracked
     result = get_details(update)
     assert result.predicted_pixel is not None
@@ -311,7 +291,6 @@ def test_stereo_tolerates_row_offsets_within_the_epipolar_tolerance(row_offset_p
     )
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0))
-    assert update is not None
     assert update.tracked == is_tracked
     if is_tracked:
         # Row errors hardly affect the range: a tenth of a pixel of disparity is 1.5 cm here.
@@ -328,7 +307,6 @@ def test_spinning_wheels_are_detected() -> None:
     drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     drive.stop(pose(0.0, 0.0))
     update = drive.stop(pose(0.0, 0.0), pose(1.5, 0.0))
-    assert update is not None
     assert update.state is TrackingState.LOST
 
 
@@ -401,7 +379,6 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
         drive.scene = hide_behind_board(clear_scene) if stop in occluded_stops else clear_scene
         true_pose = pose(0.25 * stop, 0.0)
         update = drive.stop(true_pose)
-        assert update is not None
         states.append(update.state)
         if update.tracked:
             np.testing.assert_allclose(get_pixel(update), drive.true_pixel(true_pose, target), atol=0.2)
@@ -414,7 +391,6 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
     if states[-1] is TrackingState.FAILURE:
         drive.scene = clear_scene
         later_update = drive.stop(pose(1.0, 0.0))
-        assert later_update is not None
         assert (later_update.state, later_update.losses, later_update.tracked) == (TrackingState.FAILURE, (), False)
     tracker.clear()
     assert tracker.state is TrackingState.NO_TARGET
@@ -424,10 +400,7 @@ def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], ex
 
 def test_image_without_the_target_is_reported_as_lost() -> None:
     target = np.array([6.0, 0.1, 0.2])
-    scene = make_scene(make_face(3, target), target, 3)
-    drive = Drive(scene, navcam(), VisualTargetTracker(SMALL_WINDOW))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 3)
     measurements = drive.measurements[-1]
     blank = MastImage(np.full((40, 40), 1000, dtype=np.uint16), (0, 0))
     for invalid, loss in (
@@ -452,11 +425,9 @@ def test_image_without_the_target_is_reported_as_lost() -> None:
 
 
 def test_target_outside_all_images_is_abandoned() -> None:
-    tracker = VisualTargetTracker(SMALL_WINDOW)
     target = np.array([6.0, 0.1, 0.2])
-    drive = Drive(make_scene(make_face(3, target), target, 3), navcam(), tracker)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 3)
+    tracker = drive.tracker
     other_direction = replace(drive.measurements[-1], azimuth_rad=2.0)
     tracker.designate(RoverTarget(target), pose(0.0, 0.0))
     assert [tracker.update(other_direction).state for _ in range(3)] == [

@@ -253,7 +253,6 @@ def _make_verdict(estimate: float, lower: float = 0.9) -> Verdict:
 
 def test_sparkline_rises_with_the_rate() -> None:
     line = sparkline([_make_verdict(0.9), _make_verdict(0.97), _make_verdict(1.0)])
-    assert line is not None
     line_y = [float(point.split(",")[1]) for point in line.points.split()]
     # the y axis of SVG points down: a higher rate has a smaller y
     assert line_y[0] > line.required_y > line_y[1] > line_y[2]

@@ -50,7 +50,6 @@ def test_page_reports_misprints_and_categories(make_run: MakeRun, field_frame: p
     assert "1,925" in page
     assert "Pisgah Run 3, short time (128 + 8 ≠ 134)" in page
     section = field_test_section(Subject(read_run(directory), "velocity_error_m_s", 5.0))
-    assert section is not None
     assert len(section.blocks[1].figures) == 2  # the third category has no answers
     # the comparison is with data to which constants were fitted
     assert "Fit, not validation: fitted to these data are crest_length, regularity, cover" in section.blocks[0].note

@@ -109,8 +109,6 @@ def test_sites_are_marked_in_image_and_map(hda_products: dict[str, Any]) -> None
 def test_true_terrain_is_aligned_with_the_map(hda_products: dict[str, Any]) -> None:
     """The highest point of the true terrain lies at the highest map cell."""
     maps, truth = read_landing_maps(hda_products), read_ground_truth(hda_products)
-    assert maps is not None
-    assert truth is not None
     peak_cell = maps.world_to_cell(truth.offset_from_nadir_m.reshape(-1, 2)[np.argmax(truth.elevation_m)])
     np.testing.assert_allclose(
         peak_cell, np.unravel_index(np.argmax(maps.elevation_m), maps.elevation_m.shape), atol=1.0

@@ -78,7 +78,6 @@ def test_rate_of_zero_has_no_bootstrap_interval() -> None:
 
 def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
     section = run_times_section(_make_subject(landing_frame(20)))
-    assert section is not None
     assert section.data["cases"] == 20
     times = section.data["stages"]
     # Table 1 of the paper: 0.77 s in total
@@ -92,7 +91,6 @@ def test_run_times_are_scaled_to_the_sum_of_table_1() -> None:
 def test_touchdown_errors_are_compared_with_table_2() -> None:
     frame = landing_frame(200)
     section = touchdown_section(_make_subject(frame))
-    assert section is not None
     landings = frame[frame["landed"]]
     assert section.data["landings"] == len(landings)
     assert section.data["mean_m"]["touchdown_error_gps_m"] == pytest.approx(landings["touchdown_error_gps_m"].mean())
@@ -152,7 +150,6 @@ def test_distance_to_hazards_is_0_on_unsafe_ground() -> None:
 def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:
     frame = landing_frame(10)
     blocks = create_class_blocks(frame)
-    assert blocks[0].grid is not None
     assert [row[1] for row in blocks[0].grid.rows] == 2 * ["1 to 1.5", "1.5 to 2", "2 to 3", "> 3"]
     # 400 of 1000 footprints are classified as safe, 2 of them are unsafe; 600 are truly safe
     rightly_safe = blocks[-1].data["rates"]["truly safe footprints that are classified as safe"]
@@ -165,7 +162,6 @@ def test_only_hazards_are_in_the_table_of_missed_hazards() -> None:
 def test_rates_are_reported_per_roughness_threshold() -> None:
     frame = landing_frame(40).assign(max_roughness_m=np.tile([0.1, 0.2], 20), false_alarms=np.tile([120, 30], 20))
     section = threshold_section(_make_subject(frame))
-    assert section is not None
     low, high = section.data["thresholds"]
     assert (low["max_roughness_m"], high["max_roughness_m"]) == (0.1, 0.2)
     assert (low["false_alarms"].fraction, high["false_alarms"].fraction) == (pytest.approx(0.2), pytest.approx(0.05))
@@ -257,9 +253,7 @@ def test_quantiles_and_correlations_need_20_maps(maps: int, has_statistics: bool
     columns = ("baseline_fraction", "texture", "elevation_noise_m", "elevation_rms_m", "slope_error_rms_deg")
     values = {name: rng.uniform(0.1, 1.0, maps) for name in columns}
     section = map_section(_make_subject(landing_frame(maps).assign(height_m=10.0, **values)))
-    assert section is not None
     errors, effects = section.blocks
-    assert errors.grid is not None
     assert list(errors.grid.head[1:]) == (
         ["Minimum", "5 %", "Median", "95 %", "Maximum"] if has_statistics else ["Minimum", "Median", "Maximum"]
     )

@@ -95,7 +95,6 @@ def test_positions_are_drawn_on_the_map(products: dict[str, Any]) -> None:
 
 def test_landmarks_are_drawn_by_use(products: dict[str, Any]) -> None:
     figure = draw_landmarks(products)
-    assert figure is not None
     markers = {
         str(line.get_marker()): np.array(line.get_data()).T
         for line in figure.axes[0].lines
@@ -172,7 +171,6 @@ def test_view_of_a_refused_descent_has_one_row() -> None:
 def test_position_section_has_rates_and_quantiles() -> None:
     frame = localisation_frame(200)
     section = position_section(_make_subject(frame))
-    assert section is not None
     rates = section.data["rates"]
     assert rates["Position reported within 10 s"].hits == frame["fixed_in_time"].sum()
     assert rates["Coarse position within 200 m"].hits == frame["fixed_in_time"].sum()
@@ -183,7 +181,6 @@ def test_position_section_has_rates_and_quantiles() -> None:
 
 def test_condition_section_is_created() -> None:
     section = conditions_section(_make_subject(localisation_frame(200)))
-    assert section is not None
     bins = section.data["by_condition"]
     assert sum(entry["n"] for entry in bins) == 200
     assert [entry["fixed_in_time"].hits for entry in bins] == [entry["answered"].hits for entry in bins]
@@ -191,7 +188,6 @@ def test_condition_section_is_created() -> None:
 
 def test_algorithm_without_coarse_stage_has_no_coarse_rate() -> None:
     section = position_section(_make_subject(localisation_frame(200).assign(coarse_error_m=np.nan)))
-    assert section is not None
     assert section.data["rates"]["Coarse position within 200 m"].n == 0
 
 
@@ -199,7 +195,6 @@ def test_algorithm_without_coarse_stage_has_no_coarse_rate() -> None:
 def test_sections_of_refusals_report_their_rate(section: Any) -> None:
     """A campaign in which no descent has a position still reports that fact."""
     created = section(_make_subject(localisation_frame(30, fixed_fraction=0.0)))
-    assert created is not None
     assert created.blocks
 
 

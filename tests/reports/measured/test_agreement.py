@@ -44,12 +44,10 @@ def test_section_reports_residuals_and_unmatched_cases() -> None:
             **{"mine.difference_m_s": [0.1, np.nan, 0.3, 0.2]},
         )
     )
-    assert section is not None
     assert (section.data["cases"], section.data["unmatched"]) == (4, 1)
     assert section.data["median_of_medians_px"] == 0.6
     assert section.data["differences"] == {"mine.difference_m_s": 0.2}
     (block,) = section.blocks
-    assert block.grid is not None
     assert list(block.grid.rows[0][:4]) == ["0", "a", "VALID", "120"]
     assert block.grid.rows[1][4] == "–"
     assert len(block.figures) == 1

@@ -34,7 +34,6 @@ def test_section_has_medians_of_images_with_a_pose() -> None:
             }
         )
     )
-    assert section is not None
     counts = [section.data[name] for name in ("images", "recorded_with_pose", "rendered", "rendered_with_pose")]
     assert counts == [4, 3, 3, 2]
     medians = section.data["medians"]
@@ -42,7 +41,6 @@ def test_section_has_medians_of_images_with_a_pose() -> None:
     assert medians["template_yield"] == [0.9, 0.6]
     assert medians["orb_yield"] == [None, None]
     (block,) = section.blocks
-    assert block.grid is not None
     rows = {row[0]: list(row[1:]) for row in block.grid.rows}
     assert rows["images with a pose"] == ["3", "2"]
     assert rows["template yield"] == ["0.900 (0.800 to 1.000)", "0.600 (0.500 to 0.700)"]
@@ -59,7 +57,6 @@ def test_figure_shows_image_and_map(tmp_path: Path) -> None:
     image = rng.integers(0, 255, (64, 64)).astype(np.uint16)
     products = {"recorded_image": image}
     kind = find_case_kind(products)
-    assert kind is not None
     assert "landmarks" in kind.legend
     bare, complete = tmp_path / "bare", tmp_path / "complete"
     for folder in (bare, complete):

@@ -78,6 +78,5 @@ def test_explained_fraction_is_1_for_constant_responses() -> None:
     """Two conditions with constant responses: the explained fraction is 1 and the F ratio infinite."""
     condition = np.repeat([400.0, 800.0], 20)
     result = estimate_driver(condition, condition / 400.0, None, 0.9)
-    assert result is not None
     assert (result.fraction, result.fraction_lower, result.fraction_upper, result.p_value) == (1.0, 1.0, 1.0, 0.0)
     assert result.correlation == pytest.approx(1.0)

@@ -20,7 +20,6 @@ def _draw_errors(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def test_error_ellipse_of_normal_errors_has_the_true_axes() -> None:
     ellipse = error_ellipse(_draw_errors(np.random.default_rng(1), 40_000), 0.95)
-    assert ellipse is not None
     # chi-square quantile with two degrees of freedom: -2 ln 0.05 = 5.991 = 2.4477^2
     assert (ellipse.semi_major, ellipse.semi_minor) == pytest.approx((3 * 2.4477, 2.4477), rel=0.015)
     assert ellipse.centre == pytest.approx((2.0, -1.0), abs=0.06)
@@ -36,7 +35,6 @@ def test_error_ellipse_of_ten_errors_contains_the_next_error_with_95_percent() -
     for _ in range(4000):
         points = _draw_errors(rng, 11)
         ellipse = error_ellipse(points[:10], 0.95)
-        assert ellipse is not None
         angle = math.radians(ellipse.angle_deg)
         x, y = points[10] - ellipse.centre
         major, minor = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
@@ -48,7 +46,6 @@ def test_too_few_or_equal_points_have_no_ellipse() -> None:
     assert error_ellipse(np.ones((4, 2)), 0.95) is None
     assert error_ellipse(np.ones((50, 2)), 0.95) is None
     line = error_ellipse(np.column_stack([np.arange(50.0), np.zeros(50)]), 0.95)
-    assert line is not None
     assert (line.semi_minor, line.angle_deg) == (0.0, 0.0)
 
 

@@ -26,7 +26,6 @@ from tests.reports.timeline.timeline_example import CENTRE_M, make_camera, make_
 def test_timeline_survives_storage_as_products() -> None:
     timeline = make_timeline()
     stored = Timeline.from_products(unpack_products(pack_products({PRODUCT: timeline.to_products()})))
-    assert stored is not None
     np.testing.assert_equal(stored.to_products(), {**timeline.to_products(), "images": stored.to_products()["images"]})
     for read, written in zip(stored.images, timeline.images, strict=True):
         np.testing.assert_equal(vars(read.pose), vars(written.pose))

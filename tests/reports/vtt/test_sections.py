@@ -92,7 +92,6 @@ def test_step_rates_are_compared_with_fig_8() -> None:
     assert (rate_at["pure-ncc", 23]["good"].hits, rate_at["pure-ncc", 23]["paper_percent"]) == (4, 15.0)
     assert rate_at["pure-ncc", 10]["paper_percent"] is None
     section = steps_section(make_subject(frame, legs=[{"motion": "approach"}]))
-    assert section is not None
     assert "Fig. 8" in section.title
     assert "Open marks" in section.blocks[0].figures[0].caption
     assert read_table(section)[0]["Tracker"] == "vtt"
@@ -117,7 +116,6 @@ def test_step_rates_of_circles_and_turns_are_per_degree() -> None:
     turn_rates = step_rates(make_subject(frame, legs=[{"motion": "turn"}]))
     assert {rate["paper_percent"] for rate in turn_rates} == {None}
     section = steps_section(make_subject(frame, legs=[{"motion": "turn"}]))
-    assert section is not None
     # without numbers in the paper, there is no column of dashes and no mark to explain
     assert "Open marks" not in section.blocks[0].figures[0].caption
     assert "Paper, of selectable" not in read_table(section)[0]
@@ -138,9 +136,7 @@ def test_oblique_targets_are_reported_separately() -> None:
     (cell,) = step_rates(run_subject)
     assert (cell["good"].hits, cell["good"].n, cell["all_targets"].n) == (6, 6, 13)
     section = steps_section(run_subject)
-    assert section is not None
     grid = section.blocks[-1].grid
-    assert grid is not None
     assert [list(row) for row in grid.rows] == [["0 to 45", "6 of 6"], ["70 to 90", "0 of 4"]]
 
 
@@ -284,7 +280,6 @@ def test_goal_statistics_are_computed_per_camera() -> None:
 def test_quantiles_without_enough_runs_are_omitted() -> None:
     section = goal_section(make_subject(make_rows(20)))
     assert "99 %" not in " ".join(read_table(section, 1)[0])
-    assert section is not None
     assert "Too few runs" in section.blocks[-1].note
 
 

@@ -58,7 +58,6 @@ def set_values(frame: pd.DataFrame, index: int, **values: Any) -> None:
 
 def read_table(section: Section | None, block: int = 0) -> list[dict[str, str]]:
     """Return the rows of a section's table number `block` as dictionaries from heading to cell."""
-    assert section is not None
     blocks = [entry for entry in section.blocks if isinstance(entry, Block)]
     grids = [entry.grid for entry in blocks if entry.grid is not None]
     return [dict(zip(grids[block].head, row, strict=True)) for row in grids[block].rows]

@@ -76,6 +76,5 @@ def test_misbehaviour_affects_only_its_own_row(
 
 def test_traceback_of_the_algorithm_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     failure = run_case(monkeypatch, tmp_path, "raise").failure
-    assert failure is not None
     assert failure.error == "RuntimeError: no"
     assert "misbehaving.py" in failure.trace

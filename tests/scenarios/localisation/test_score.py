@@ -140,10 +140,8 @@ def test_refusal_has_no_errors() -> None:
 
 def test_truth_is_at_the_time_of_the_tag_without_the_clock_offset() -> None:
     (error,) = compute_errors(_make_descent(), _answers(_estimate(6.0, [0.0, 0.0, 0.0])))
-    assert error is not None
     np.testing.assert_allclose(error.position_m, 0.0, atol=1e-9)
     (wrong,) = compute_errors(_make_descent(imu_offset_s=0.0), _answers(_estimate(6.0, [0.0, 0.0, 0.0])))
-    assert wrong is not None
     # half a second at 10, 5 and -90 m/s
     np.testing.assert_allclose(wrong.position_m, -0.5 * VELOCITY_M_S, atol=1e-9)
 
@@ -221,7 +219,6 @@ def test_rows_have_equal_declared_columns() -> None:
     valid, refused, empty = _row(_estimate(6.0, [0.0] * 3)), _row(_refusal(6.0)), _row(_refusal(END_S))
     assert valid.keys() == refused.keys() == empty.keys()
     declared = row_columns("localisation")
-    assert declared is not None
     for name, value in valid.items():
         assert declared.has(name, bool if isinstance(value, bool) else float)
 

@@ -72,7 +72,6 @@ def test_measured_surface_agrees_with_the_rock(placed_run: tuple[bool, RoverRun]
 def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, RoverRun]) -> None:
     """A tool axis tilted by 60 deg from the surface normal: 5 cm x tan(60 deg) exceeds the clearance."""
     _, run = placed_run
-    assert run.placement is not None
     assert run.placement.normal_rover is not None
     normal = run.placement.normal_rover
     across = np.cross(normal, [0.0, 1.0, 0.0])

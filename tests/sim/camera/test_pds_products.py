@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.camera import CameraFileError, read_pds3_product
+from marsyard.sim.camera.label_frames import SITE
 
 #: Image of the synthetic products, 3 x 4 counts, and their label.
 COUNTS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 300
@@ -60,9 +61,12 @@ def test_all_sample_types_are_read(tmp_path: Path, sample_dtype: str, pointer: s
     assert np.array_equal(result.counts, counts)
     assert result.time_s == 100.5
     # The quaternion has the scalar first. It is a right turn about the down axis by 2 acos 0.8.
-    forward = result.site_from_rover.rotation.apply(np.array([1.0, 0.0, 0.0]))
+    assert result.pose is not None
+    frame, site_from_rover = result.pose
+    assert frame.name == SITE
+    forward = site_from_rover.rotation.apply(np.array([1.0, 0.0, 0.0]))
     assert np.allclose(forward, [0.8**2 - 0.6**2, 2 * 0.8 * 0.6, 0.0])
-    assert np.allclose(result.site_from_rover.translation, [1.0, 2.0, 3.0])
+    assert np.allclose(site_from_rover.translation, [1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize(
@@ -126,7 +130,8 @@ def test_images_with_detached_label_are_read(tmp_path: Path, pointer: str, offse
     data.write_bytes(bytes(offset_bytes) + COUNTS.astype(">i2").tobytes())
     result = read_pds3_product(path)
     assert np.array_equal(result.counts, COUNTS)
-    assert np.allclose(result.site_from_rover.translation, [1.0, 2.0, 3.0])
+    assert result.pose is not None
+    assert np.allclose(result.pose[1].translation, [1.0, 2.0, 3.0])
     data.write_bytes(bytes(offset_bytes) + b"cut")
     with pytest.raises(CameraFileError, match="IMAGE: ends after 3 bytes"):
         read_pds3_product(path)

@@ -81,7 +81,6 @@ def test_sky_hidden_by_a_convex_body_equals_ray_casting() -> None:
 def test_sky_hidden_by_a_half_sphere_equals_integration() -> None:
     # x, y, radius and top
     mounds = Mounds.of(np.array([[2.0, 0.0, 0.5, 0.5]]))
-    assert mounds is not None
     directions = _draw_sphere(17)
     directions = directions[directions[:, 2] > 0.0]
     positions = np.array([[1.3, 0.0, 0.0], [2.0, 1.2, 0.0], [0.5, -0.6, 0.0], [7.0, 0.0, 0.0]])

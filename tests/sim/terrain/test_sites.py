@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
+from marsyard.sim.terrain.published_sites import PAPER
 from marsyard.sim.terrain.rocks import RockField
-from marsyard.sim.terrain.sites import PAPER
 from marsyard.sim.terrain.surface import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
 from tests.sim.scenes import make_ground
 

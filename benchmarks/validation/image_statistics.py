@@ -1,7 +1,5 @@
 """Statistics of terrain images, of pairs, and of images on maps, to compare rendered with real ones; uncalibrated."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -10,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from scipy.ndimage import gaussian_filter, median_filter
 
-#: Side of the resized images, pixels, as in DIMES; and side of the blocks for the local contrast.
-SIDE, BLOCK = 256, 16
+from marsyard.scenarios.condition_columns import BLOCK, SIDE, local_contrast
+
 #: Side of the resized images for features and pairs, pixels; side of the templates in images of `SIDE`, pixels.
 FEATURE_SIDE, TEMPLATE = 512, 31
 #: Minimum numbers of matches, and of matches that agree with the homography of a pair.
@@ -248,20 +246,6 @@ def _search_templates(
             found.append((correlation[peak], distance, strength[row, column]))
     columns_of = np.array(found, dtype=np.float64).reshape(-1, 3).T
     return columns_of[0], columns_of[1], columns_of[2]
-
-
-def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
-    """Compute the 10th, 50th and 90th percentiles over all blocks of (standard deviation / mean of a block).
-
-    The image is resized to `SIDE` x `SIDE` pixels first. The result is NaN if all blocks are black.
-    """
-    small = cv2.resize(np.asarray(image, dtype=np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-    blocks = small.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK)
-    deviation, mean = blocks.std(axis=(1, 3)), blocks.mean(axis=(1, 3))
-    if not np.any(mean > 0.0):
-        return (np.nan, np.nan, np.nan)
-    p10, p50, p90 = np.percentile(deviation[mean > 0.0] / mean[mean > 0.0], [10.0, 50.0, 90.0])
-    return float(p10), float(p50), float(p90)
 
 
 def spectral_slope(image: Float[np.ndarray, "side side"]) -> float:

@@ -1,0 +1,137 @@
+"""Section of the report on convergence: success rate and error quantiles against the number of cases."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+from marsyard.reports import rates
+from marsyard.reports.column_values import numbers
+from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.figure_style import REQUIREMENT, SERIES, in_page_style, new_axes
+from marsyard.reports.rates import CONFIDENCE
+from marsyard.reports.sampling_design import read_sampling_design
+from marsyard.reports.section import Block, Section, Subject, svg_figure
+from marsyard.reports.statistics.samples import mean_interval, quantile_bounds
+from marsyard.reports.wording import magnitude_label, note_text
+
+#: A logarithmic axis with a smaller ratio of maximum to minimum also has ticks at 2 and 5.
+_MAX_TICK_RATIO = 50
+#: Number of points of a convergence curve, spaced logarithmically, and the minimum number of cases.
+MAX_POINTS, MIN_CASES = 12, 8
+QUANTILE = 0.95
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of a convergence curve: estimate from the first `cases` cases; bounds are NaN or infinite if unknown."""
+
+    cases: int
+    estimate: float
+    lower: float
+    upper: float
+
+
+def convergence_section(subject: Subject) -> Section | None:
+    """Plot success rates, mean and 95 % quantile of the errors against the number of cases; None below 16 cases."""
+    frame = subject.all_cases
+    if len(frame) < 2 * MIN_CASES:
+        return None
+    curves = success_rate_curves(subject)
+    svg_figures = [
+        svg_figure(
+            curve_figure(points, "success rate", rate), f"converge{index}", f"{name}: success rate and its bounds."
+        )
+        for index, (name, rate, points) in enumerate(curves)
+    ]
+    data = {name: points for name, _, points in curves}
+    for key, (name, axis, points) in error_curves(frame, subject.metric).items():
+        bound = subject.bound if key == "quantile" else None
+        svg_figures.append(svg_figure(curve_figure(points, axis, bound), f"converge-{key}", f"{name} and its bounds."))
+        data[f"{subject.metric}: {name}"] = points
+    if not svg_figures:
+        return None
+    note = note_text("common.convergence")
+    return Section(
+        "convergence",
+        "Convergence",
+        "Estimates against the number of cases",
+        [Block(figures=svg_figures, note=note)],
+        data,
+    )
+
+
+def curve_sizes(cases: int) -> list[int]:
+    """Return the number of cases of each point of a convergence curve."""
+    return sorted({round(float(size)) for size in np.geomspace(MIN_CASES, cases, MAX_POINTS)})
+
+
+def success_rate_curves(subject: Subject) -> list[tuple[str, float, list[Point]]]:
+    """Return name, required rate and convergence curve of each requirement that can be evaluated."""
+    sampling = read_sampling_design(subject.run.definition)
+    frame, requirements = subject.all_cases, subject.run.requirements
+    sizes = curve_sizes(len(frame))
+    evaluated = [(size, evaluate_requirements(frame.head(size), requirements, sampling)) for size in sizes]
+    curves = []
+    for index, final in enumerate(evaluated[-1][1]):
+        points = [
+            Point(size, verdicts[index].estimate, verdicts[index].lower, verdicts[index].upper)
+            for size, verdicts in evaluated
+            if not math.isnan(verdicts[index].estimate)
+        ]
+        if len(points) > 1:
+            curves.append((final.requirement_id, final.probability, points))
+    return curves
+
+
+def error_curves(frame: pd.DataFrame, metric: str | None) -> dict[str, tuple[str, str, list[Point]]]:
+    """Return name, axis label and points of mean and 95 % quantile of the first n errors; empty for too few cases."""
+    if metric is None:
+        return {}
+    magnitude, groups = np.abs(numbers(frame, metric)), rates.terrain_groups(frame)
+    means, quantiles = [], []
+    for size in curve_sizes(len(frame)):
+        finite = np.isfinite(magnitude[:size])
+        if finite.sum() >= MIN_CASES:
+            values, finite_groups = magnitude[:size][finite], None if groups is None else groups[:size][finite]
+            means.append(Point(size, float(values.mean()), *mean_interval(values, CONFIDENCE, finite_groups)))
+            bounds = quantile_bounds(values, QUANTILE, CONFIDENCE, finite_groups)
+            quantiles.append(Point(size, float(np.quantile(values, QUANTILE)), *bounds))
+    if len(quantiles) < 2:
+        return {}
+    name = magnitude_label(metric)
+    return {
+        "mean": ("Mean of the errors", f"mean of {name}", means),
+        "quantile": ("95 % quantile of the errors", f"95 % of {name}", quantiles),
+    }
+
+
+@in_page_style
+def curve_figure(points: Sequence[Point], name: str, required: float | None) -> Figure:
+    """Draw an estimate and its bounds against the number of cases."""
+    figure, axes = new_axes(4.2, 2.8)
+    cases, estimates, lower, upper = np.array([astuple(point) for point in points]).T
+    values = np.concatenate([estimates, lower, upper, [math.nan if required is None else required]])
+    values = values[np.isfinite(values)]
+    if values.size:
+        # margin of 6 % of the range; infinite bounds extend to the edges of the axes
+        margin = 0.06 * float(np.ptp(values)) or 0.06
+        bottom, top = float(values.min()) - margin, float(values.max()) + margin
+        axes.set_ylim(bottom, top)
+        axes.fill_between(
+            cases, np.where(np.isfinite(lower), lower, bottom), np.where(np.isfinite(upper), upper, top),
+            where=~np.isnan(lower), color=SERIES[0], alpha=0.25, linewidth=0.0,
+        )  # fmt: skip
+    axes.plot(cases, estimates, color=SERIES[0], marker="o", markersize=3.5)
+    if required is not None and math.isfinite(required):
+        axes.axhline(required, color=REQUIREMENT, linewidth=1.4, linestyle="--")
+    axes.set(xscale="log", xlabel="cases", ylabel=name)
+    if cases[-1] < _MAX_TICK_RATIO * cases[0]:
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    return figure
