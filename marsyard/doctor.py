@@ -61,20 +61,23 @@ class CheckResult(Enum):
     FAIL = "red"
 
 
+OK, WARN, FAIL = CheckResult
+
+
 @dataclass(frozen=True)
 class DoctorCheck:
     """Result of a check: name, finding, verdict, and the remedy of a problem (empty without a problem)."""
 
     name: str
     finding: str
-    verdict: CheckResult = CheckResult.OK
+    verdict: CheckResult = OK
     remedy: str = ""
 
 
 def run(console: Console, *, as_json: bool = False) -> int:
     """Print all checks as a table or JSON; return 0 if a campaign can run on this machine, else 1."""
     checks, version = list(run_checks()), importlib.metadata.version("marsyard")
-    failed_checks = [check.name for check in checks if check.verdict is CheckResult.FAIL]
+    failed_checks = [check.name for check in checks if check.verdict is FAIL]
     table = Table(title=f"Marsyard {version} in {ROOT}", title_justify="left")
     for heading in ("check", "finding", "verdict"):
         table.add_column(heading, overflow="fold")
@@ -122,11 +125,9 @@ def check_python() -> DoctorCheck:
     finding = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}"
     required = importlib.metadata.metadata("marsyard")["Requires-Python"]
     if platform.python_version() not in SpecifierSet(required):
-        return DoctorCheck(
-            "python", f"{finding}; {required} is required", CheckResult.FAIL, f"install Python {required}"
-        )
+        return DoctorCheck("python", f"{finding}; {required} is required", FAIL, f"install Python {required}")
     if sys.platform != "linux":
-        return DoctorCheck("python", finding, CheckResult.WARN, "Marsyard is tested on Linux only")
+        return DoctorCheck("python", finding, WARN, "Marsyard is tested on Linux only")
     return DoctorCheck("python", finding)
 
 
@@ -136,7 +137,7 @@ def check_optimisation(has_assertions: bool) -> DoctorCheck:
     return (
         DoctorCheck("assertions", "on")
         if has_assertions
-        else DoctorCheck("assertions", "off (python -O)", CheckResult.FAIL, remedy)
+        else DoctorCheck("assertions", "off (python -O)", FAIL, remedy)
     )
 
 
@@ -149,24 +150,18 @@ def check_shadowing() -> Iterator[DoctorCheck]:
     origin = Path(origins[0]).resolve() if origins else None
     if origin != ROOT / PACKAGE:
         remedy = "uninstall that package, unset PYTHONPATH, or change to another folder; then " + REINSTALL
-        yield DoctorCheck(
-            "package shadowing", f"another package is imported: {PACKAGE} from {origin}", CheckResult.FAIL, remedy
-        )
+        yield DoctorCheck("package shadowing", f"another package is imported: {PACKAGE} from {origin}", FAIL, remedy)
     else:
         yield DoctorCheck("package shadowing", f"{PACKAGE} is imported from {origin}")
     owners = importlib.metadata.packages_distributions().get(PACKAGE, [])
     other_owners = sorted({canonicalize_name(owner) for owner in owners} - {"marsyard"})
     if other_owners:
         finding = f"{', '.join(other_owners)} also installs a package named {PACKAGE}"
-        yield DoctorCheck(
-            "package names", finding, CheckResult.WARN, f"pip uninstall {' '.join(other_owners)}, then {REINSTALL}"
-        )
+        yield DoctorCheck("package names", finding, WARN, f"pip uninstall {' '.join(other_owners)}, then {REINSTALL}")
     for required, conflicting in CONFLICTS:
         if _find_version(conflicting) is not None:
             remedy = f"pip uninstall -y {conflicting} {required}, then {REINSTALL}"
-            yield DoctorCheck(
-                "package names", f"{conflicting} overwrites files of {required}", CheckResult.FAIL, remedy
-            )
+            yield DoctorCheck("package names", f"{conflicting} overwrites files of {required}", FAIL, remedy)
 
 
 def check_dependencies(failures: Mapping[str, str]) -> Iterator[DoctorCheck]:
@@ -177,18 +172,18 @@ def check_dependencies(failures: Mapping[str, str]) -> Iterator[DoctorCheck]:
         name = canonicalize_name(requirement.name)
         version = _find_version(name)
         if version is None:
-            yield DoctorCheck(name, "not installed", CheckResult.FAIL, REINSTALL)
+            yield DoctorCheck(name, "not installed", FAIL, REINSTALL)
         elif not requirement.specifier.contains(version, prereleases=True):
-            yield DoctorCheck(name, f"{version}, but {requirement} is required", CheckResult.FAIL, REINSTALL)
+            yield DoctorCheck(name, f"{version}, but {requirement} is required", FAIL, REINSTALL)
         elif (error := failures.get(_import_name(name))) is not None:
-            yield DoctorCheck(name, f"{version} cannot be imported: {error}", CheckResult.FAIL, REINSTALL)
+            yield DoctorCheck(name, f"{version} cannot be imported: {error}", FAIL, REINSTALL)
         else:
             n_valid += 1
             if pins.get(name, version) != version:
                 pin_deviations.append(f"{name} {version} (pinned {pins[name]})")
     yield DoctorCheck("dependencies", f"{n_valid} distributions have supported versions and can be imported")
     if pin_deviations:
-        yield DoctorCheck("pinned versions", ", ".join(pin_deviations), CheckResult.WARN, REINSTALL)
+        yield DoctorCheck("pinned versions", ", ".join(pin_deviations), WARN, REINSTALL)
 
 
 def find_import_failures(modules: Iterable[str]) -> dict[str, str]:
@@ -263,24 +258,19 @@ def check_rendering(probes: Mapping[str, Probe]) -> Iterator[DoctorCheck]:
     """Check each backend, and the backend that a campaign would use."""
     checks = {backend: _check_backend(backend, probe) for backend, probe in probes.items()}
     yield from checks.values()
-    working = [backend for backend, check in checks.items() if check.verdict is CheckResult.OK]
+    working = [backend for backend, check in checks.items() if check.verdict is OK]
     selected_backend = os.environ.get("MARSYARD_GL", next(iter(BACKENDS))).lower()
     if selected_backend not in BACKENDS:
         finding = f"MARSYARD_GL is '{selected_backend}'; allowed: {', '.join(BACKENDS)}"
-        yield DoctorCheck("GL backend in use", finding, CheckResult.FAIL, "unset MARSYARD_GL")
+        yield DoctorCheck("GL backend in use", finding, FAIL, "unset MARSYARD_GL")
     elif selected_backend in working:
         yield DoctorCheck("GL backend in use", selected_backend)
     elif working:
         remedy = f"export MARSYARD_GL={working[0]}, or install {BACKENDS[selected_backend]}"
-        yield DoctorCheck(
-            "GL backend in use", f"{selected_backend} does not work; {working[0]} works", CheckResult.WARN, remedy
-        )
+        yield DoctorCheck("GL backend in use", f"{selected_backend} does not work; {working[0]} works", WARN, remedy)
     else:
         yield DoctorCheck(
-            "GL backend in use",
-            "no backend works",
-            CheckResult.FAIL,
-            f"sudo apt-get install {BACKENDS[selected_backend]}",
+            "GL backend in use", "no backend works", FAIL, f"sudo apt-get install {BACKENDS[selected_backend]}"
         )
 
 
@@ -288,13 +278,13 @@ def _check_backend(backend: str, probe: Probe) -> DoctorCheck:
     name = f"GL: {backend}"
     remedy = f"sudo apt-get install {BACKENDS[backend]}"
     if probe.measurements is None:
-        return DoctorCheck(name, probe.error, CheckResult.WARN, remedy)
+        return DoctorCheck(name, probe.error, WARN, remedy)
     values = probe.measurements
     finding = f"{values['renderer']}, {values['version']}"
     error_m, offset = values["depth_error_m"], values["offset_px"]
     if not values["has_colour"] or error_m > gl_probe.DEPTH_TOLERANCE_M:
         problem = f"; wrong image: depth error of the test plane {error_m:.3g} m"
-        return DoctorCheck(name, finding + problem, CheckResult.WARN, "use the other backend, or another driver")
+        return DoctorCheck(name, finding + problem, WARN, "use the other backend, or another driver")
     finding += f"; depth error {error_m * 1e3:.2g} mm at {gl_probe.DISTANCE_M:.0f} m"
     if max(map(abs, offset)) > gl_probe.OFFSET_TOLERANCE_PX:
         pixels = f"({offset[0]:+.3f}, {offset[1]:+.3f}) px"
@@ -310,7 +300,7 @@ def check_numba_cache() -> DoctorCheck:
     if _is_writable(folder):
         return DoctorCheck("numba cache", f"{folder} is writable")
     remedy = "export NUMBA_CACHE_DIR=FOLDER, where FOLDER is writable"
-    return DoctorCheck("numba cache", f"cannot write to {folder}", CheckResult.WARN, remedy)
+    return DoctorCheck("numba cache", f"cannot write to {folder}", WARN, remedy)
 
 
 def check_disk() -> Iterator[DoctorCheck]:
@@ -322,7 +312,7 @@ def check_disk() -> Iterator[DoctorCheck]:
 
         cache = cache_directory("terrain")
     except (ImportError, OSError) as error:
-        yield DoctorCheck("disk, cache", str(error), CheckResult.FAIL, remedy)
+        yield DoctorCheck("disk, cache", str(error), FAIL, remedy)
         return
     yield _check_disk_space("disk, cache", cache, remedy)
 
@@ -330,11 +320,9 @@ def check_disk() -> Iterator[DoctorCheck]:
 def _check_disk_space(name: str, folder: Path, remedy: str) -> DoctorCheck:
     free = shutil.disk_usage(folder).free // BYTES_PER_MIB
     if not _is_writable(folder):
-        return DoctorCheck(name, f"cannot write to {folder}", CheckResult.FAIL, remedy)
-    verdict = (
-        CheckResult.OK if free >= SUFFICIENT_DISK_MIB else CheckResult.FAIL if free < MIN_DISK_MIB else CheckResult.WARN
-    )
-    return DoctorCheck(name, f"{free} MiB free in {folder}", verdict, "" if verdict is CheckResult.OK else remedy)
+        return DoctorCheck(name, f"cannot write to {folder}", FAIL, remedy)
+    verdict = OK if free >= SUFFICIENT_DISK_MIB else FAIL if free < MIN_DISK_MIB else WARN
+    return DoctorCheck(name, f"{free} MiB free in {folder}", verdict, "" if verdict is OK else remedy)
 
 
 def check_machine() -> DoctorCheck:
@@ -346,9 +334,7 @@ def check_machine() -> DoctorCheck:
     memory = min(limits) // BYTES_PER_MIB
     finding = f"{cores} cores, {memory} MiB of memory"
     if memory < WORKER_MEMORY_MIB * cores:
-        return DoctorCheck(
-            "cores and memory", finding, CheckResult.WARN, f"run with --jobs {max(1, memory // WORKER_MEMORY_MIB)}"
-        )
+        return DoctorCheck("cores and memory", finding, WARN, f"run with --jobs {max(1, memory // WORKER_MEMORY_MIB)}")
     return DoctorCheck("cores and memory", finding)
 
 
@@ -357,7 +343,7 @@ def check_threads(environment: Mapping[str, str], cores: int) -> DoctorCheck:
     counts = {name: environment[name] for name in THREAD_VARIABLES if environment.get(name)}
     finding = ", ".join(f"{name}={value}" for name, value in counts.items()) or "not set; the libraries decide"
     if any(not value.isdigit() or int(value) > cores for value in counts.values()):
-        return DoctorCheck("threads", finding, CheckResult.WARN, f"unset {' '.join(counts)}")
+        return DoctorCheck("threads", finding, WARN, f"unset {' '.join(counts)}")
     return DoctorCheck("threads", finding)
 
 
@@ -368,14 +354,12 @@ def check_systems() -> Iterator[DoctorCheck]:
 
         systems = registry()
     except ImportError as error:
-        yield DoctorCheck("systems", f"cannot be read: {error}", CheckResult.FAIL, REINSTALL)
+        yield DoctorCheck("systems", f"cannot be read: {error}", FAIL, REINSTALL)
         return
     plugins = ", ".join(system.name for system in systems.plugins)
     yield DoctorCheck("systems", f"{len(systems.own)} built in; plug-ins: {plugins or 'none'}")
     for problem in systems.problems:
-        yield DoctorCheck(
-            "systems", problem, CheckResult.WARN, "correct or uninstall the package that defines the system"
-        )
+        yield DoctorCheck("systems", problem, WARN, "correct or uninstall the package that defines the system")
 
 
 def _count_cores() -> int:

@@ -1,7 +1,5 @@
 """Options and fixtures of all tests. The statements at module level run before any import of Marsyard's packages."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -1,7 +1,5 @@
 """Validation of the answers of a position estimator."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

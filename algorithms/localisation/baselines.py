@@ -1,7 +1,5 @@
 """Baselines of localisation: inertial navigation alone, and SIFT features with a perspective-n-point pose (OpenCV)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from marsyard.algorithms.localisation.details import LocalisationDetails

@@ -12,8 +12,6 @@ the estimated attitude and the altimeter's height, and correlated with the map a
    (`consistency`). Patches with a wrong attitude agree on a wrong offset, but not within the stated errors.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum

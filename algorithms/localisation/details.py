@@ -1,7 +1,5 @@
 """Intermediate products of map-relative localisation, for figures and diagnosis."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

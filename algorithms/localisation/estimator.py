@@ -9,8 +9,6 @@ in several consecutive images, the fix is discarded: the filter returns to the s
 the coarse stage is repeated.
 """
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

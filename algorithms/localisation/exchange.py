@@ -3,8 +3,6 @@
 `POSITION_STREAM.serve` answers the requests of a campaign with a Python estimator (docs/custom-algorithms.md).
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

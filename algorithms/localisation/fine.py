@@ -10,8 +10,6 @@ If the uncertainty of the pose requires a large search window, an acquisition st
 landmarks, in an image that is binned further.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -4,8 +4,6 @@ World frame: east, north, up; the map covers a part of its x-y plane. Body frame
 attitude is a rotation vector e in world axes: true attitude = exp(e) estimated attitude.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """Landmarks: points of the map with contrast in all directions, and their selection for one image."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

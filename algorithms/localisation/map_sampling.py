@@ -1,7 +1,5 @@
 """Sampling of the map: coordinates, interpolation, averaging, and intersection of rays with the map's elevation."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32

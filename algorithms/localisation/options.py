@@ -1,7 +1,5 @@
 """Options of map-relative localisation's image matching (coarse and fine stage), with the sources of their defaults."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

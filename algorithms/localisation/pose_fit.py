@@ -5,8 +5,6 @@ world axes). A point of the world at the offset d from the body frame's origin a
 show the point displaced by d x rotation - translation.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rectification of images to the grid of a coarse map: onto a horizontal plane, or onto the map's elevation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

@@ -12,8 +12,6 @@ Landmarks of one image have an unknown common error of the map, which is not est
 three more errors of zero mean in the update, which are marginalised afterwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum

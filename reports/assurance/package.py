@@ -5,8 +5,6 @@ and the credibility factors; `runs/NAME` with the record, rows and report of eac
 confirmations; `manifest.json` with the SHA-256 of every other file.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

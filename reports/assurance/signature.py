@@ -1,7 +1,5 @@
 """OpenSSH signatures of a file, made and checked by `ssh-keygen` with a key of the user."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Without a signature, the hashes show accidental changes only: a person who chang
 The other steps then still find rows, records and claims that contradict each other.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -56,7 +56,7 @@ POSITION = SuiteRules(
     describe=describe_answers,
     failures=", ".join(outcome.name for outcome in PositionOutcome if outcome is not PositionOutcome.VALID),
     unusual={
-        # no reason excludes a position: inertial navigation has one without images
+        # a position is no violation here: inertial navigation gives one also with blank images
         **unusual_images(inputs.ordinary_descent, inputs.BLANK_COUNTS, ""),
         "repeated": Unusual(
             "images that repeat the first, each delivered twice", (inputs.descent_with_repeated_images,)

@@ -5,8 +5,6 @@ programs are stored in the cache folder; their names are hashes of their instruc
 Results do not depend on the number of threads, because each pixel is computed independently of the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -4,8 +4,6 @@ The backend must be chosen before pyrender or PyOpenGL is first imported. A cont
 thread that created it.
 """
 
-from __future__ import annotations
-
 import os
 from ctypes.util import find_library
 from typing import Literal

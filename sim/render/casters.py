@@ -8,8 +8,6 @@ around a camera in a scene with hills at a distance of kilometres. A ray is test
 cell of each body with a projection that contains the ray.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import drjit as dr

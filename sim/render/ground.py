@@ -4,8 +4,6 @@ All distances are along the ray, in metres. A search is needed for rays that gra
 guess does not resolve every crest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import drjit as dr

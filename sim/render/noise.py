@@ -3,8 +3,6 @@
 Positions have double precision; the offsets from the lattice points, and the noise, have single precision.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import product
 

@@ -4,8 +4,6 @@ This module imports pyrender and PyOpenGL, which read the backend from the envir
 `renderer.create_depth_renderer` instead of importing this module.
 """
 
-from __future__ import annotations
-
 import ctypes
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A rover as an object on the ground: body, wheels, legs, mast and arm, built from boxes and cylinders."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The radiance of every pixel: sample the surface that its ray meets, then texture, illumination and reflectance."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

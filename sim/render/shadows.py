@@ -1,7 +1,5 @@
 """The fraction of the sun's disc that ground and objects leave visible at the points that rays meet."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import drjit as dr

@@ -1,7 +1,5 @@
 """Synthesis of terrains from seeds, and the bank of numbered terrains, which can store them on disk for many cases."""
 
-from __future__ import annotations
-
 import hashlib
 import warnings
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Environment of a site: gravity, rotation, sunlight, and the dusty atmosphere that transmits and scatters it."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Values of GeoTIFF files, as rasterio datasets: heights, brightness of orthoimages, and full turns of longitude."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

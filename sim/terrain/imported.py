@@ -1,7 +1,5 @@
 """Digital terrain models (DTM) from files, embedded in periodic synthetic terrain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled kernels of the terrain: evaluation of the cubic B-spline, upper height bounds, and coarser levels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

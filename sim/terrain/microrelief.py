@@ -1,7 +1,5 @@
 """Relief finer than a terrain's samples: its spectrum is extended to 1 mm by octaves of height noise."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Published albedo, slope and relief of sites, with which `marsyard terrain stats` compares the simulated terrain."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Read digital terrain models (DTM) and orthoimages from files: heights and brightness on grids, missing values NaN."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Tests of the nightly check for slower code (`benchmarks.check`) with random time ratios: false alarms, detections."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the negative controls: each fails a requirement on small campaigns."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tests of the page of run times: values of another machine are scaled before they are compared with the limits."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of the validation checks: they fail for lost cases and a wrong threshold, and their limits are not too wide."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable

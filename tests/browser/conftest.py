@@ -1,7 +1,5 @@
 """Fixtures of a headless browser: Debian's Chromium, driven by Playwright."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field

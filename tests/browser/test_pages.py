@@ -1,7 +1,5 @@
 """Tests of reports and dashboard in a browser: content, interaction, requests and accessibility."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

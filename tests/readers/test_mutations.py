@@ -4,8 +4,6 @@ A reader may accept a mutation, because a changed digit is not detectable. Any o
 traceback.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Boxes in figures of cases, for the tests of their positions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

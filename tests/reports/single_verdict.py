@@ -1,7 +1,5 @@
 """Rows and evaluation of one requirement, for the tests of verdicts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

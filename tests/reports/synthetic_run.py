@@ -1,7 +1,5 @@
 """Folders of synthetic runs of descents, with rows of known statistics."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

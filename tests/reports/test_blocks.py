@@ -1,7 +1,5 @@
 """Tests of blocks of report sections: rates, distributions and figures of rows, and sections of a system."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

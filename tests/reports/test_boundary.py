@@ -1,7 +1,5 @@
 """Tests of failure boundaries (fitted probability of a violation): true probabilities, and fits without skill."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of the report page: valid markup, content, escaping of texts and damaged runs."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable

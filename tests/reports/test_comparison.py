@@ -1,7 +1,5 @@
 """Tests of comparisons of algorithms and of campaigns, and of the consistency of covariances."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

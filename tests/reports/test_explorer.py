@@ -1,7 +1,5 @@
 """Tests of the explorer (the interactive scatter plot), of the gallery (cases on the page) and of its candidates."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

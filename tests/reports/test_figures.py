@@ -3,8 +3,6 @@
 An error axis ends at most at 3 times the bound (15 m/s for 5 m/s), unless more than a quarter of the errors exceed it.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from pathlib import Path
 

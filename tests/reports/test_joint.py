@@ -3,8 +3,6 @@
 The examples have a true success rate exactly at the limit of the requirement: every PASS is wrong.
 """
 
-from __future__ import annotations
-
 import bisect
 import json
 

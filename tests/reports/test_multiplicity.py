@@ -1,7 +1,5 @@
 """Tests of the statement on several requirements: expected number of false PASSes, and where it is shown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the sentences on a study of rare violations."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from typing import Any

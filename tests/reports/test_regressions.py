@@ -1,7 +1,5 @@
 """Tests of the history of nightly runs ("nights") and of the detection of regressions."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Tests of `report.json`: it is read into the record that it was written from."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

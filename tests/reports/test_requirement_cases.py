@@ -1,7 +1,5 @@
 """Tests of the lists of violations by requirement, of their causes, and of the summaries of cases."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Tests of verdicts for sampling designs: only independent random draws give probability statements."""
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """Tests of optional report sections with rows of known statistics."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

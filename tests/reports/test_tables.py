@@ -1,7 +1,5 @@
 """Tests of tables, captions, names of columns, printed numbers and requirements in words."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

@@ -1,7 +1,5 @@
 """Tests of the verification matrix (CSV) and of the JUnit file."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Tests of verdicts on requirements: populations, bounds, shared terrains, crashes and repeated evaluations."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

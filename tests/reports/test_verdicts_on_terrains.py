@@ -1,7 +1,5 @@
 """Tests of verdicts on cases that share terrains, and of their advice."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

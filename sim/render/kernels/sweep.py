@@ -1,7 +1,5 @@
 """Kernels over all samples of a terrain: shadow of the ground, range of heights, steepest steps."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Kernels that prepare the pinhole views drawn by OpenGL: depth conversion and ground mesh."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

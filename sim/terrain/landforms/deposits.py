@@ -1,7 +1,5 @@
 """Albedo that follows the ground: layers of rock that relief exposes, and sand that the wind leaves in its lee."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

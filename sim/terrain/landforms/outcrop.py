@@ -1,7 +1,5 @@
 """Outcrops of bedrock: polygonal slabs between joints, with sand in the gaps, as at Meridiani and in Jezero."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

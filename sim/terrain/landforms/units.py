@@ -5,8 +5,6 @@ plains, soil with a lag of granules, rubble and outcrop, sand sheets (Greeley et
 Gusev; Sullivan et al. 2005 for Meridiani).
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

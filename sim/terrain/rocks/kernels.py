@@ -1,7 +1,5 @@
 """Compiled kernels of the rocks: placement without overlap, wind tails, and assembly of their triangles."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

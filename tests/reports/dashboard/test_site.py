@@ -1,7 +1,5 @@
 """Tests of the dashboard: list of campaigns, pages, links, escaping of texts and sparklines."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Tests of the report section on the field test: results are compared with the paper, errors shown by category."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """Fixtures of a synthetic landing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Products of a synthetic landing over sinusoidal terrain with one rock, and rows of synthetic campaigns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

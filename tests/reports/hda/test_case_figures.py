@@ -1,7 +1,5 @@
 """Tests of the figures of a landing: positions, colours and missing stages."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

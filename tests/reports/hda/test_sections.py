@@ -1,7 +1,5 @@
 """Tests of the report sections on landings with rows of known statistics."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Products of a synthetic descent over a map, and rows of a synthetic campaign with known statistics."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of the report on localisation: sections with rows of known statistics, and the view of a case."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

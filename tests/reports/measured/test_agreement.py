@@ -1,7 +1,5 @@
 """Tests of the report section on recorded images: match residuals, and figures with complete and missing data."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

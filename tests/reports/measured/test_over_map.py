@@ -1,7 +1,5 @@
 """Tests of the report on images over a map: medians of images with a pose, and figures with and without a pose."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of two-sample comparisons: exact tests, permutations, shared terrains and Holm's correction."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

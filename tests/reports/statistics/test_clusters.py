@@ -1,7 +1,5 @@
 """Tests of the bounds of rates of cases that share terrains: exactness, coverage and power."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Tests of `estimate_driver` (effect of a condition on errors): rank correlation, explained variance, intervals."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import stats

@@ -1,7 +1,5 @@
 """Tests of paired comparisons of algorithms: closed forms, and false alarm rates on shared terrains."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

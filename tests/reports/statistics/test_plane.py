@@ -1,7 +1,5 @@
 """Tests of statistics of two-dimensional errors: error ellipse and circular error probable."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

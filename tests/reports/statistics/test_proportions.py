@@ -1,7 +1,5 @@
 """Tests of Clopper-Pearson bounds and sample sizes for proportions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tests of statistics of samples: intervals of mean, standard deviation and quantiles."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 A look is one evaluation of the verdict during a campaign (interim analysis).
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

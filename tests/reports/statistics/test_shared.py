@@ -1,7 +1,5 @@
 """Tests of statistics of samples with several values per terrain: simulated coverage, and closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

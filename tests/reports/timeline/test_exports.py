@@ -1,7 +1,5 @@
 """Tests of the exports of timelines: the files are read back by other packages, or by the library's own reader."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

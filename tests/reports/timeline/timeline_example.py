@@ -1,7 +1,5 @@
 """A small timeline with each kind of content."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Tests of the figures of a tracking case: positions, titles and missing products."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

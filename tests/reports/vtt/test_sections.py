@@ -1,7 +1,5 @@
 """Tests of the report sections on visual target tracking with rows of known statistics."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

@@ -1,7 +1,5 @@
 """Synthetic rows and products of tracking cases."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A velocity estimator with the misbehaviour that a file names; the variable MISBEHAVIOUR points to the file."""
 
-from __future__ import annotations
-
 import builtins
 import ctypes
 import gc

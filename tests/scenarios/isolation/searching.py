@@ -1,7 +1,5 @@
 """Velocity estimators for tests of the isolation: one counts its constructions, another searches for the truth."""
 
-from __future__ import annotations
-
 import gc
 import os
 import re

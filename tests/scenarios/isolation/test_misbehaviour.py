@@ -1,7 +1,5 @@
 """Misbehaviours of a custom algorithm: its own outcome, and the unchanged row of the other algorithm of the case."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Custom algorithms in processes of their own: life cycle, devices, answers, and no access to the truth."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path

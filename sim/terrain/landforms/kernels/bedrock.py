@@ -1,7 +1,5 @@
 """Compiled shapes of bedrock: cracks, polygonal slabs and exposed strata."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

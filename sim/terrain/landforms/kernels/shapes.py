@@ -1,7 +1,5 @@
 """Compiled kernels of the landforms. Grids are periodic squares with a power of two as side; changed in place."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
