@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 from marsyard.algorithms.arrays import Points3, Raster, Vector2
 from marsyard.algorithms.hda.kernels import elevation as kernels
@@ -27,7 +27,7 @@ class ElevationMap:
     corner_m: Vector2
     cell_m: float
 
-    def positions(self, cells: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    def positions(self, cells: Num[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
         """Convert cells (row, column; may be fractional) to positions (x, y), metres."""
         return np.asarray(self.corner_m + self.cell_m * cells[..., ::-1] * np.array([1.0, -1.0]))
 
