@@ -24,24 +24,20 @@ from marsyard.campaigns.running.shared_inputs import plan_inputs
 from marsyard.scenarios.image_samples import ProvidesSamples
 from marsyard.scenarios.systems import scenario, scenario_names
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
-from marsyard.sim.sensor.compression import compress_and_decompress
 
 MANIFEST = "dataset.json"
 
 
-def write_dataset(
-    campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int, bits_per_pixel: float | None = None
-) -> list[Path]:
+def write_dataset(campaign: Campaign, folder: Path, cases_per_shard: int, jobs: int) -> list[Path]:
     """Write the shards that do not exist; return the paths of all shards.
 
-    `bits_per_pixel`: size of the images after lossy compression; None for no lossy compression.
     Raises CampaignError if the scenario provides no samples, or the folder is read-only or contains another data set.
     """
     if not isinstance(campaign.scenario, ProvidesSamples):
         name = campaign.definition.scenario
         allowed = ", ".join(name for name in scenario_names() if isinstance(scenario(name), ProvidesSamples))
         raise CampaignError(f"the scenario '{name}' provides no training samples; allowed: {allowed}")
-    _write_manifest(campaign, folder, cases_per_shard, bits_per_pixel)
+    _write_manifest(campaign, folder, cases_per_shard)
     total = campaign.definition.total_cases
     starts = range(0, total, cases_per_shard)
     paths = [folder / f"shard-{number:06d}.tar" for number in range(len(starts))]
@@ -54,9 +50,7 @@ def write_dataset(
 
         # build terrains once here; otherwise each worker process would build them
         _prepare_terrains(campaign, itertools.chain.from_iterable(cases for _, cases in missing_shards))
-        Parallel(n_jobs=jobs)(
-            delayed(_write_shard)(campaign, path, cases, bits_per_pixel) for path, cases in missing_shards
-        )
+        Parallel(n_jobs=jobs)(delayed(_write_shard)(campaign, path, cases) for path, cases in missing_shards)
     return paths
 
 
@@ -67,13 +61,12 @@ def _prepare_terrains(campaign: Campaign, cases: Iterable[int]) -> None:
         campaign.scenario.prepare(parameters, number)
 
 
-def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits_per_pixel: float | None) -> None:
+def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int) -> None:
     """Write the manifest of the data set. Raises StoreError if the folder contains another data set."""
     definition = campaign.definition
     manifest = {
         "campaign": definition.name,
         "cases_per_shard": cases_per_shard,
-        **({} if bits_per_pixel is None else {"bits_per_pixel": bits_per_pixel}),
         "definition_sha256": definition_hash(definition),
         "definition": definition.model_dump(mode="json"),
     }
@@ -82,7 +75,7 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits
         folder.mkdir(parents=True, exist_ok=True)
         if path.exists():
             previous = json.loads(path.read_text(encoding="utf-8"))
-            for key in ("definition_sha256", "cases_per_shard", "bits_per_pixel"):
+            for key in ("definition_sha256", "cases_per_shard"):
                 if previous.get(key) != manifest.get(key):
                     raise StoreError(f"{folder} contains another data set ({key} differs); choose another folder")
             return
@@ -91,19 +84,19 @@ def _write_manifest(campaign: Campaign, folder: Path, cases_per_shard: int, bits
         raise StoreError(f"{path} cannot be read or written: {error}") from error
 
 
-def _write_shard(campaign: Campaign, path: Path, cases: range, bits_per_pixel: float | None) -> None:
+def _write_shard(campaign: Campaign, path: Path, cases: range) -> None:
     """Write a shard to a temporary file, and rename it when it is complete."""
     partial_path = path.with_suffix(".part")
     with tarfile.open(partial_path, "w", format=tarfile.USTAR_FORMAT) as shard:
         for case in cases:
-            for name, contents in _create_files(campaign, case, bits_per_pixel):
+            for name, contents in _create_files(campaign, case):
                 entry = tarfile.TarInfo(name)
                 entry.size = len(contents)
                 shard.addfile(entry, io.BytesIO(contents))
     partial_path.replace(path)
 
 
-def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -> Iterator[tuple[str, bytes]]:
+def _create_files(campaign: Campaign, case: int) -> Iterator[tuple[str, bytes]]:
     """Yield the name and the contents of each file of a case."""
     scenario = campaign.scenario
     assert isinstance(scenario, ProvidesSamples)  # noqa: S101  (checked by `write_dataset`)
@@ -116,13 +109,8 @@ def _create_files(campaign: Campaign, case: int, bits_per_pixel: float | None) -
             "image_index": number,
             "dispersed_parameters": draws,
         }
-        image = (
-            sample.image
-            if bits_per_pixel is None
-            else compress_and_decompress(sample.image, bits_per_pixel, 2**sample.bits - 1)
-        )
         # scale the counts to the full range of 16 bits
-        yield f"{key}.image.png", _encode(image * np.uint16(2 ** (16 - sample.bits)))
+        yield f"{key}.image.png", _encode(sample.image * np.uint16(2 ** (16 - sample.bits)))
         yield f"{key}.range.npy", _encode(sample.range_m)
         yield f"{key}.normal.npy", _encode(sample.normal)
         yield f"{key}.rocks.png", _encode(sample.rocks)

@@ -30,7 +30,6 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rover import rover_objects
-from marsyard.sim.sensor.compression import compress_and_decompress
 from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Site, sites
@@ -59,7 +58,6 @@ class ImageRequest:
     sun_elevation_deg: float
     seed: int
     max_hole_fraction: float
-    bits_per_pixel: float | None = None  #: size of the compressed counts; None without compression
 
     @classmethod
     def from_defaults(cls, site: str, camera: str, **given: Any) -> ImageRequest:
@@ -217,8 +215,6 @@ def _expose(
         detector, radiance, sensor.AutoExposureParameters(), streams.generator("test pictures")
     )
     counts = auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
-    if request.bits_per_pixel is not None:
-        counts = compress_and_decompress(counts, request.bits_per_pixel, parameters.full_scale_dn)
     return auto_exposure, counts
 
 

@@ -8,13 +8,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.store.record import utc_now
 from marsyard.reports.statistics.changes import Metric, Sample, correct_holm, difference_p_value
 from marsyard.reports.wording import count, format_fraction, number, percent
 
@@ -168,11 +168,6 @@ class History:
             self._connection.execute("COMMIT")
         except sqlite3.Error as error:
             raise StoreError(f"{self._path} cannot be written: {error}") from error
-
-
-def utc_now() -> str:
-    """Return the current time in UTC with a resolution of one second."""
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def _unpack(values: bytes, terrains: bytes) -> Sample:

@@ -1,15 +1,14 @@
 """Algorithms that run outside of Marsyard: export the cases, and read the answers from a table.
 
 Both are used like an algorithm of a campaign. ``export:FOLDER`` writes the inputs of the algorithm and returns a
-refusal; ``export:FOLDER::bits-per-pixel=B`` writes images after lossy compression. ``answers:FILE.csv`` returns the
-answers in a table.
+refusal. ``answers:FILE.csv`` returns the answers in a table.
 """
 
 import math
 import os
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
 from pathlib import Path
@@ -24,8 +23,6 @@ from marsyard.scenarios.user_files import check_column_groups, finite_number, fo
 from marsyard.sim.files import check_regular
 
 EXPORT, ANSWERS = "export:", "answers:"
-#: Separator between the folder of an export and the bits per pixel of its compressed images.
-LOSSY = "::bits-per-pixel="
 
 #: Folder of the cases in an export.
 CASES = "cases"
@@ -123,8 +120,7 @@ def create_offline(spec: str, answer_format: AnswerFormat[Any], case: int) -> An
     """Create the object that replaces the algorithm in a case."""
     file = answers_file(spec)
     if file is None:
-        folder, _, bits = spec.removeprefix(EXPORT).partition(LOSSY)
-        return CaseExporter(Path(folder) / CASES / f"{case:06d}", answer_format, float(bits) if bits else None)
+        return CaseExporter(Path(spec.removeprefix(EXPORT)) / CASES / f"{case:06d}", answer_format)
     answer = read_answers(file, answer_format).get(case)
     return RecordedAnswer(answer, f"{file.name} has no answer to case {case}", answer_format)
 
@@ -135,20 +131,9 @@ class CaseExporter:
 
     folder: Path
     answer_format: AnswerFormat[Any]
-    bits_per_pixel: float | None = None  #: size of the compressed images; None without compression
 
     def estimate(self, measurements: Any) -> Any:
         """Write a case. Raises OSError."""
-        if self.bits_per_pixel is not None:
-            # imported at the first use: a worker starts in three quarters of the time without the instruments
-            from marsyard.sim.sensor.compression import compress_and_decompress
-
-            bits, images = self.bits_per_pixel, measurements.images
-            counts = [compress_and_decompress(image.counts, bits, image.calibration.full_scale_dn) for image in images]
-            compressed_images = tuple(
-                replace(image, counts=values) for image, values in zip(images, counts, strict=True)
-            )
-            measurements = replace(measurements, images=compressed_images)
         temporary_folder = self.folder.with_name(f"{self.folder.name}.part{os.getpid()}")
         shutil.rmtree(temporary_folder, ignore_errors=True)
         temporary_folder.mkdir(parents=True)

@@ -138,14 +138,14 @@ class TimedImage:
 
 
 @dataclass(frozen=True)
-class Points:
+class TimedPoints:
     """Points in the world, each at its time; NaN for points that exist at all times."""
 
     times_s: Float64[np.ndarray, "n"]
     positions_m: Float64[np.ndarray, "n 3"]
 
     @classmethod
-    def permanent(cls, positions_m: Float64[np.ndarray, "*batch 3"]) -> Points:
+    def permanent(cls, positions_m: Float64[np.ndarray, "*batch 3"]) -> TimedPoints:
         """Create points that exist at all times."""
         positions = np.asarray(positions_m, dtype=np.float64).reshape(-1, 3)
         return cls(np.full(len(positions), np.nan), positions)
@@ -188,7 +188,7 @@ class InertialData:
 
 #: Type of each table of named parts of a timeline.
 _TABLES: Mapping[str, type] = {
-    "surfaces": SurfacePatch, "paths": Path, "points": Points, "ellipsoids": Ellipsoids, "series": Series
+    "surfaces": SurfacePatch, "paths": Path, "points": TimedPoints, "ellipsoids": Ellipsoids, "series": Series
 }  # fmt: skip
 
 
@@ -202,7 +202,7 @@ class Timeline:
     surfaces: Mapping[str, SurfacePatch]
     paths: Mapping[str, Path]
     images: Sequence[TimedImage]
-    points: Mapping[str, Points] = field(default_factory=dict)
+    points: Mapping[str, TimedPoints] = field(default_factory=dict)
     ellipsoids: Mapping[str, Ellipsoids] = field(default_factory=dict)
     series: Mapping[str, Series] = field(default_factory=dict)
     inertial: InertialData | None = None

@@ -13,10 +13,10 @@ from marsyard.scenarios.timeline import (
     CameraPose,
     InertialData,
     Path,
-    Points,
     Series,
     SurfacePatch,
     TimedImage,
+    TimedPoints,
     Timeline,
 )
 from marsyard.sim.camera import CameraModel
@@ -112,7 +112,7 @@ class VelocityCase:
                     marks[name if track.valid else "rejected"].append((np.asarray(pixel) + 0.5) * scale - 0.5)
         return {name: np.array(pixels).reshape(-1, 2) for name, pixels in marks.items()}
 
-    def _track_points(self, details: DimesDetails) -> dict[str, Points]:
+    def _track_points(self, details: DimesDetails) -> dict[str, TimedPoints]:
         """Return the templates on the ground at the times of their images."""
         names = {True: "valid templates", False: "rejected templates"}
         points = {}
@@ -121,5 +121,5 @@ class VelocityCase:
             states = [self.states[(self.triple or ())[track.pair]] for track in tracks]
             horizontal = [state.position_m[:2] + track.ground_m for state, track in zip(states, tracks, strict=True)]
             positions = np.array([[*point, float(self.surface.height(*point))] for point in horizontal]).reshape(-1, 3)
-            points[name] = Points(np.array([state.time_s for state in states], dtype=np.float64), positions)
+            points[name] = TimedPoints(np.array([state.time_s for state in states], dtype=np.float64), positions)
         return points

@@ -58,7 +58,6 @@ class PairDetails:
     - overlap_polygon: Outline (u, v) in the earlier image of the later image's footprint at zero horizontal motion
     - zero_phase_pixels: Anti-solar point (zero phase angle) in both images (u, v); NaN if invisible
     - gsd_m: Ground sample distance of rectified pixels
-    - candidates: Number of feasible template positions on the coarse grid
     - tracks: All tracks, valid or not
     - views: Earlier and later binned image
     """
@@ -66,7 +65,6 @@ class PairDetails:
     overlap_polygon: Float[np.ndarray, "n 2"]
     zero_phase_pixels: Float[np.ndarray, "2 2"]
     gsd_m: float
-    candidates: int
     tracks: tuple[DimesTrack, ...]
     views: tuple[BinnedView, BinnedView]
 

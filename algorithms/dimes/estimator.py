@@ -86,7 +86,6 @@ def track_pair(
         overlap_polygon=overlap.overlap_polygon(first, second, options),
         zero_phase_pixels=np.stack([overlap.zero_phase_pixel(view, sun_direction) for view in (first, second)]),
         gsd_m=geometry.gsd_m,
-        candidates=len(candidates.pixels),
         tracks=tuple(tracks),
         views=(first, second),
     )

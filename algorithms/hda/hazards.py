@@ -33,15 +33,12 @@ class Safety(IntEnum):
 class HazardMaps:
     """Hazard maps on the cells of the elevation map.
 
-    - planes: Plane of each footprint: elevation at its centre (metres) and slopes per metre along columns and rows; NaN
-      if unknown
     - smooth_m: Elevation of the smooth underlying surface
     - roughness_m: Absolute distance of the elevation from the smooth surface
     - slope_rad: Angle between the ground's normal and the vertical
     - safety: The safe landing map, values of `Safety`
     """
 
-    planes: Float[np.ndarray, "m n 3"]
     smooth_m: Raster
     roughness_m: Raster
     slope_rad: Raster
@@ -50,12 +47,12 @@ class HazardMaps:
 
 def hazard_maps(ground: ElevationMap, options: HdaOptions) -> HazardMaps:
     """Compute the hazard maps of an elevation map."""
-    planes, smooth, slope = smooth_surface(ground, options)
+    smooth, slope = smooth_surface(ground, options)
     roughness = np.abs(ground.elevation_m - smooth)
-    return HazardMaps(planes, smooth, roughness, slope, safe_landing_map(slope, roughness, ground.cell_m, options))
+    return HazardMaps(smooth, roughness, slope, safe_landing_map(slope, roughness, ground.cell_m, options))
 
 
-def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.ndarray, "m n 3"], Raster, Raster]:
+def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Raster, Raster]:
     """Fit robust planes to footprints; interpolate elevation (metres) and slope (radians) between their centres.
 
     The footprints are squares with the lander's diameter as side, distributed evenly over the map. Outside the
@@ -72,7 +69,7 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.
     )
     planes[..., 1:] /= ground.cell_m
     if planes.size == 0:
-        return planes, np.full(shape, np.nan), np.full(shape, np.nan)
+        return np.full(shape, np.nan), np.full(shape, np.nan)
     centres = [start + 0.5 * (side - 1) for start in starts]
     rows, columns = (_interpolation_weights(centre, extent) for centre, extent in zip(centres, shape, strict=True))
     smooth = _interpolate(planes[..., 0], rows, columns)
@@ -82,7 +79,7 @@ def smooth_surface(ground: ElevationMap, options: HdaOptions) -> tuple[Float[np.
             offsets = np.expand_dims(np.arange(shape[axis]) - centre[0], 1 - axis)
             smooth = smooth + _interpolate(planes[..., 2 - axis], rows, columns) * ground.cell_m * offsets
     slopes = np.arctan(np.hypot(planes[..., 1], planes[..., 2]))
-    return planes, smooth, np.maximum(_interpolate(slopes, rows, columns), 0.0)
+    return smooth, np.maximum(_interpolate(slopes, rows, columns), 0.0)
 
 
 def _square_starts(extent: int, side: int) -> Int[np.ndarray, "n"]:

@@ -70,7 +70,7 @@ def start_robust(
     rows = read_rows(run / TABLE_FILE)[int(definition.design.nominal) :]
     chosen, weights = choose_cases(rows, definition.requirements, cases, _generator(definition))
     parameters = RobustParameters((*steps, *named), tuple(chosen.tolist()), tuple(weights.tolist()))
-    session = StudySession(ROBUST, parameters, RobustStudy, executor, observer)
+    session = StudySession(ROBUST, parameters, RobustCasesStudy, executor, observer)
     n_cases = len(parameters.variants) * len(parameters.cases)
     return start_study(campaign, n_cases, directory, session, streams=definition.total_cases)
 
@@ -149,7 +149,7 @@ def _generator(definition: CampaignDefinition) -> np.random.Generator:
     return Streams(definition.seed, definition.name, 0).generator("robust: cases")
 
 
-class RobustStudy:
+class RobustCasesStudy:
     """A running study."""
 
     def __init__(self, campaign: Campaign, parameters: RobustParameters, runner: PointRunner) -> None:

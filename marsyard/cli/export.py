@@ -27,25 +27,23 @@ def export(
     jobs: options.JobsOption = None,
     cluster: options.ClusterOption = None,
     override: options.SetOption = None,
-    bits_per_pixel: options.BitsOption = None,
 ) -> None:
     """Export images, measurements and camera models for an external algorithm. Cases already exported are kept."""
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.running.export_scoring import export_campaign, truth_folder
     from marsyard.campaigns.store import record
     from marsyard.reports.wording import count
-    from marsyard.scenarios.offline_algorithms import EXPORT, LOSSY
+    from marsyard.scenarios.offline_algorithms import EXPORT
 
     truth = truth_folder(out) if truth is None else truth
     no_products = ["retain.products=none", "retain.showcase=none"]
     # the "algorithm" of an export writes the cases to the folder
-    export_algorithm = f"{EXPORT}{out.resolve()}" + ("" if bits_per_pixel is None else f"{LOSSY}{bits_per_pixel:g}")
-    export_definition = load_campaign(campaign, [*(override or []), *no_products], cases, seed, [export_algorithm])
+    algorithms = [f"{EXPORT}{out.resolve()}"]
+    export_definition = load_campaign(campaign, [*(override or []), *no_products], cases, seed, algorithms)
     command = ["marsyard", "export", campaign, "--out", str(out), "--truth", str(truth)]
     command += [] if cases is None else ["-n", str(cases)]
     command += [] if seed is None else ["--seed", str(seed)]
     command += [word for value in override or [] for word in ("--set", value)]
-    command += [] if bits_per_pixel is None else ["--bits-per-pixel", f"{bits_per_pixel:g}"]
     export_definition = replace(export_definition, command=tuple(command))
     with show_progress(truth, f"the same command again ({out})") as observer:
         export_campaign(export_definition, out, truth, make_executor(jobs, cluster), observer)
@@ -111,7 +109,6 @@ def dataset(
     shard: Annotated[int, Option(metavar="N", min=1, help="Cases per shard.")] = 50,
     jobs: Annotated[int, Option(metavar="J", min=1, help="Worker processes.")] = 1,
     override: options.SetOption = None,
-    bits_per_pixel: options.BitsOption = None,
 ) -> None:
     """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards.
 
@@ -120,6 +117,6 @@ def dataset(
     from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.dataset import write_dataset
 
-    shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs, bits_per_pixel)
+    shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs)
     total = sum(path.stat().st_size for path in shards)
     typer.echo(f"{len(shards)} shards, {size_text(total)}: {out}")

@@ -35,10 +35,6 @@ ConfirmationsOption = Annotated[
 ]
 JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
-BitsOption = Annotated[
-    float | None,
-    Option(metavar="BITS", min=0.1, max=16.0, help="Compress images by lossy JPEG 2000 to this bit rate per pixel."),
-]
 SetOption = Annotated[
     list[str] | None,
     Option("--set", metavar="KEY=VALUE", help="Set a value, such as render.backend=egl; it is not dispersed."),

@@ -46,7 +46,6 @@ class RenderOptions:
     sun_elevation: Annotated[float, Option(metavar="DEG", help="Sun elevation above the horizon.")] = 35.0
     detector: Annotated[bool, Option("--detector/--radiance", help="Write counts, or the radiance factor.")] = True
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain and the noise.")] = 1
-    bits_per_pixel: options.BitsOption = None
     overwrite: options.OverwriteOption = False
     max_holes: options.MaxHolesOption = None
 
@@ -65,7 +64,6 @@ def render(arguments: RenderOptions) -> None:
     with report_image_errors(arguments.out):
         values = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}
         values |= {f"{name}_m": getattr(arguments, name) for name in ("altitude", "east", "north")}
-        values["bits_per_pixel"] = arguments.bits_per_pixel
         angles = ("azimuth", "elevation", "sun_azimuth", "sun_elevation")
         values |= {f"{name}_deg": getattr(arguments, name) for name in angles}
         request = ImageRequest.from_defaults(arguments.site, arguments.camera, **values)

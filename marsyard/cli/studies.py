@@ -273,14 +273,14 @@ def continue_study_and_exit(
     from marsyard.campaigns.studies.budget import BudgetStudy
     from marsyard.campaigns.studies.rare import continue_rare
     from marsyard.campaigns.studies.results import BUDGET, ROBUST, SEARCH
-    from marsyard.campaigns.studies.robust import RobustStudy
+    from marsyard.campaigns.studies.robust import RobustCasesStudy
     from marsyard.campaigns.studies.runner import StudySession, continue_study
     from marsyard.campaigns.studies.search import SearchStudy
     from marsyard.campaigns.studies.study_record import StudyKind, read_study
 
     executor, name = make_executor(jobs, cluster), (read_study(directory) or {}).get("kind")
     kinds: list[tuple[StudyKind[Any, Any], Any]]
-    kinds = [(SEARCH, SearchStudy), (BUDGET, BudgetStudy), (ROBUST, RobustStudy)]
+    kinds = [(SEARCH, SearchStudy), (BUDGET, BudgetStudy), (ROBUST, RobustCasesStudy)]
     others = {kind.name: (kind, study) for kind, study in kinds}
     with show_progress(directory) as progress:
         if name not in others:

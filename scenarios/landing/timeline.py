@@ -14,10 +14,10 @@ from marsyard.scenarios.timeline import (
     CameraPose,
     InertialData,
     Path,
-    Points,
     Series,
     SurfacePatch,
     TimedImage,
+    TimedPoints,
     Timeline,
     surface_from_above,
 )
@@ -50,9 +50,9 @@ def landing_timeline(case: RenderedFlight, estimate: SiteEstimate, touchdown: To
         surfaces["map"] = _landing_map(details.ground, first)
     points = {}
     if estimate.site_world is not None:
-        points["reported site"] = Points.permanent(estimate.site_world - flight.position_error_m)
+        points["reported site"] = TimedPoints.permanent(estimate.site_world - flight.position_error_m)
     if touchdown is not None:
-        points["touchdown"] = Points(np.array([touchdown.time_s]), touchdown.state.position_m[None])
+        points["touchdown"] = TimedPoints(np.array([touchdown.time_s]), touchdown.state.position_m[None])
     paths = _paths(flight, touchdown)
     true = paths["true"]
     heights = height_above_ground(world.ground.surface, true.positions_m)

@@ -17,10 +17,10 @@ from marsyard.scenarios.timeline import (
     Ellipsoids,
     InertialData,
     Path,
-    Points,
     Series,
     SurfacePatch,
     TimedImage,
+    TimedPoints,
     Timeline,
     grey_values,
     surface_from_above,
@@ -57,7 +57,7 @@ def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers[Posi
         paths={"true": Path.from_motion(motion), **_estimated_path(descent, answers)},
         images=_images(descent, answers),
         points={
-            "initial position": Points(
+            "initial position": TimedPoints(
                 np.array([initial.time_s - descent.imu_offset_s]), _to_world(descent, initial.position_m[None])
             )
         },

@@ -45,7 +45,7 @@ _STRONG_FRACTION = 0.25
 
 
 @dataclass(frozen=True, eq=False)
-class Footprint:
+class ImageFootprint:
     """An image on the pixels of a map, and the map's appearance there.
 
     - corner: map pixel (column, row) of the first pixel
@@ -72,7 +72,7 @@ class MapComparison:
     image: PosedImage
     landmarks: LandmarkMatches
     landmark_pixels: Points2
-    footprint: Footprint | None
+    footprint: ImageFootprint | None
     row: dict[str, Scalar]
 
 
@@ -123,7 +123,7 @@ def compare_with_map(
     return MapComparison(corrected, matches, pixels, footprint, row)
 
 
-def _resample(image: PosedImage, map_product: MapProduct, options: LvsOptions) -> Footprint | None:
+def _resample(image: PosedImage, map_product: MapProduct, options: LvsOptions) -> ImageFootprint | None:
     """Resample an image to the pixels of the map, in squares; None if no square lies in both."""
     position = image.position_m
     height_m = float(position[2]) - elevation_at(map_product, position[:2])
@@ -152,7 +152,7 @@ def _resample(image: PosedImage, map_product: MapProduct, options: LvsOptions) -
     mosaic = values.reshape(rows, columns, _TILE_PX, _TILE_PX).swapaxes(1, 2).reshape(shape)
     valid = inside.reshape(rows, columns).repeat(_TILE_PX, axis=0).repeat(_TILE_PX, axis=1)
     appearance = map_product.appearance[low[1] : low[1] + shape[0], low[0] : low[0] + shape[1]]
-    return Footprint(low, mosaic, appearance, valid)
+    return ImageFootprint(low, mosaic, appearance, valid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class _Templates:
     interest: Float[np.ndarray, "n"]
 
 
-def _match_templates(footprint: Footprint) -> _Templates:
+def _match_templates(footprint: ImageFootprint) -> _Templates:
     """Search templates of the image on the map; without any template, the arrays are empty."""
     interest = harris_interest(*structure_tensor(footprint.appearance, _TEMPLATE_PX)) / footprint.appearance.mean()
     centres, found, correlations = [], [], []
@@ -213,7 +213,7 @@ def _template_corners(valid: Bool[np.ndarray, "rows columns"]) -> Iterator[tuple
                 yield row, column
 
 
-def _match_sift(footprint: Footprint) -> tuple[Points2, Points2, int]:
+def _match_sift(footprint: ImageFootprint) -> tuple[Points2, Points2, int]:
     """Match SIFT features; return their pixels in the image and on the map, and the number of the image's features."""
     count = footprint.valid.size // _FEATURE_AREA_PX
     pixels, descriptors = extract_map_features(flatten(footprint.image), count, footprint.valid)
@@ -222,7 +222,7 @@ def _match_sift(footprint: Footprint) -> tuple[Points2, Points2, int]:
     return pixels[pairs[0]], map_points[pairs[1]], len(pixels)
 
 
-def _match_orb(footprint: Footprint) -> tuple[Points2, Points2, int]:
+def _match_orb(footprint: ImageFootprint) -> tuple[Points2, Points2, int]:
     """Match ORB features as `_match_sift`."""
     options = orb.HomographyOptions(features=footprint.valid.size // _FEATURE_AREA_PX)
     pixels, descriptors = orb.detect_features(flatten(footprint.image), options)

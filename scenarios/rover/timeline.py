@@ -7,7 +7,7 @@ from marsyard.scenarios.rover.closed_loop import RoverRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.score import update_quantities
 from marsyard.scenarios.rover.stops import Stop
-from marsyard.scenarios.timeline import CameraPose, Path, Points, Series, TimedImage, Timeline, surface_from_above
+from marsyard.scenarios.timeline import CameraPose, Path, Series, TimedImage, TimedPoints, Timeline, surface_from_above
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.render import Scene
 
@@ -40,8 +40,8 @@ def run_timeline(p: RoverScenarioParameters, run: RoverRun) -> Timeline:
         },
         images=[image for stop in stops for image in _images(run, stop, p.vtt.template_px)],
         points={
-            "target": Points.permanent(target_m),
-            "tracked target": Points(
+            "target": TimedPoints.permanent(target_m),
+            "tracked target": TimedPoints(
                 np.array([stop.time_s for stop in tracked], dtype=np.float64),
                 # the reported position, seen from the true rover
                 np.array([_reported_m(stop) for stop in tracked], dtype=np.float64).reshape(-1, 3),

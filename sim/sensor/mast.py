@@ -80,13 +80,12 @@ class MastState:
     """Pointing of a mast at one time.
 
     - readings_rad, true_rad: encoder readings and true angles; azimuth and elevation
-    - axes_rad, motors_rad: angles of both axes and both motors, without the zero errors of the encoders
+    - axes_rad: angles of both axes, without the zero errors of the encoders
     """
 
     readings_rad: tuple[float, float]
     true_rad: tuple[float, float]
     axes_rad: Angles
-    motors_rad: Angles
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ class Mast:
         readings = count * np.rint(motors_rad / count) if count > 0.0 else motors_rad
         true_angles = axes_rad - self.zeros_rad
         measured_pair, true_pair = ((float(angles[0]), float(angles[1])) for angles in (readings, true_angles))
-        return MastState(measured_pair, true_pair, axes_rad, motors_rad)
+        return MastState(measured_pair, true_pair, axes_rad)
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,6 @@ class LaserParameters(RangingParameters):
     noise_m: Annotated[_Metres, ALTITUDE, Field(description="noise per reading, independent of range, m")] = 0.05
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.01
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 300.0
-    beam_mrad: Annotated[float, Field(ge=0.0, le=50.0, description="full width of the beam, mrad")] = 0.0
     boresight_deg: Annotated[_Degrees, ALTITUDE, Field(description="SD of the constant error per axis")] = 0.1
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
 

@@ -1,4 +1,4 @@
-"""Environment of a site: gravity, rotation, sunlight, and the dusty atmosphere that transmits and scatters it."""
+"""Environment of a site: gravity, sunlight, and the dusty atmosphere that transmits and scatters it."""
 
 from typing import Annotated
 
@@ -12,11 +12,10 @@ SUN_RADIUS_AT_1_AU_RAD = 0.00465  #: Angular radius of the sun at 1 AU.
 
 
 class Environment(Parameters):
-    """Gravity, planet rotation, sunlight and dusty atmosphere at a site."""
+    """Gravity, sunlight and dusty atmosphere at a site."""
 
     planet: Annotated[str, Field(description="name of the planet")] = "Mars"
     gravity_m_s2: Annotated[Positive, Field(description="gravity, m/s2")] = 3.72
-    rotation_rad_s: Annotated[float, Field(ge=0.0, description="sidereal rotation rate, rad/s")] = 7.0882e-5
     solar_irradiance: Annotated[Positive, Field(description="solar irradiance relative to that at 1 AU")] = 0.44
     optical_depth: Annotated[float, Field(ge=0.0, le=10.0, description="optical depth of the atmosphere")] = 0.5
     single_scattering_albedo: Annotated[float, Field(ge=0.0, lt=1.0, description="scattering / extinction")] = 0.94

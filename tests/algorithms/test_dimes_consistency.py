@@ -48,7 +48,7 @@ def make_nadir_view() -> BinnedView:
 def make_pair(*tracks: DimesTrack) -> PairDetails:
     """Create the details of a pair with these tracks; the images are not used."""
     nadir = make_nadir_view()
-    return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, 1, tracks, (nadir, nadir))
+    return PairDetails(np.zeros((0, 2)), np.zeros((2, 2)), 5.0, tracks, (nadir, nadir))
 
 
 def combine_tracks(first: list[np.ndarray], second: list[np.ndarray], velocities: np.ndarray) -> VelocityEstimate:

@@ -1,5 +1,6 @@
-"""Tests of the import contracts: they list each module of the simulation and of the scenarios; no circular imports."""
+"""Tests of the code as a whole: import contracts, no circular imports, and no parameter without an effect."""
 
+import ast
 import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -7,7 +8,8 @@ from typing import Any
 
 import grimp
 
-from marsyard.scenarios.systems import own_paths
+from marsyard.scenarios.systems import own_paths, scenario, scenario_names
+from marsyard.sim.parameters import Parameters
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Modules of the simulation that algorithms may import (docs/architecture.md).
@@ -41,6 +43,28 @@ def test_no_circular_imports() -> None:
     graph = grimp.build_graph("marsyard", exclude_type_checking_imports=True, cache_dir=None)
     # raises CycleError, which names the modules
     TopologicalSorter({name: graph.find_modules_directly_imported_by(name) for name in graph.modules}).prepare()
+
+
+def test_every_parameter_is_read() -> None:
+    """A parameter of the user that no code reads would have no effect. It may be read by a name in a string."""
+    names = set()
+    folders = [ROOT / name for name in ("sim", "algorithms", "scenarios", "marsyard")]
+    for path in (path for folder in folders for path in folder.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            if isinstance(node, ast.Attribute):
+                names.add(node.attr)
+            elif isinstance(node, ast.Constant):
+                names.add(str(node.value))
+    for name in scenario_names():
+        scenario(name)  # imports its parameters
+    models = [model for model in _list_subclasses(Parameters) if model.__module__.startswith("marsyard.")]
+    unread = {f"{model.__name__}.{field}" for model in models for field in model.model_fields if field not in names}
+    assert len(models) > 100
+    assert unread == set()
+
+
+def _list_subclasses(kind: type[Any]) -> list[type[Any]]:
+    return [item for child in kind.__subclasses__() for item in (child, *_list_subclasses(child))]
 
 
 def _read_contracts() -> list[dict[str, Any]]:

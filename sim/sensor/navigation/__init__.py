@@ -81,8 +81,7 @@ class NavigationSolution:
     - positions_m, velocities_m_s: world axes
     - attitudes: rotations from body to world axes
     - gyro_biases_rad_s, accelerometer_biases_m_s2: estimates, body axes
-    - deviations: standard deviations of the 15 estimated errors, SI units, in the order of the error vector
-    - covariance_indices, covariances: boundaries with stored covariances, and these covariances
+    - covariance_indices, covariances: boundaries with stored covariances, and these (15 estimated errors, SI units)
     - end: filter state at the last boundary
     """
 
@@ -92,7 +91,6 @@ class NavigationSolution:
     attitudes: Rotation
     gyro_biases_rad_s: Float64[np.ndarray, "m 3"]
     accelerometer_biases_m_s2: Float64[np.ndarray, "m 3"]
-    deviations: Float64[np.ndarray, "m 15"]
     covariance_indices: Int64[np.ndarray, "k"]
     covariances: Float64[np.ndarray, "k 15 15"]
     innovations: Innovations
@@ -181,7 +179,7 @@ class NavigationFilter:
             covariance_indices=indices,
         )
         tuning = self._create_tuning(increments.period_s)
-        states, covariances, deviations, log = kernels.run(inputs, start.state, covariance, memory, tuning)
+        states, covariances, log = kernels.run(inputs, start.state, covariance, memory, tuning)
         blocks = [kernels.VELOCITY, kernels.QUATERNION, kernels.STATE_GYRO_BIAS, kernels.STATE_ACCELEROMETER_BIAS]
         positions, velocities, quaternions, gyro_biases, accelerometer_biases = np.split(states, blocks, axis=1)
         kinds, axes = log[:, 1:3].astype(np.int64).T
@@ -192,7 +190,6 @@ class NavigationFilter:
             attitudes=Rotation.from_quat(quaternions),
             gyro_biases_rad_s=gyro_biases,
             accelerometer_biases_m_s2=accelerometer_biases,
-            deviations=deviations,
             covariance_indices=indices,
             covariances=covariances,
             innovations=Innovations(log[:, 0], kinds, axes, log[:, 3], log[:, 4] == 1.0),

@@ -332,8 +332,8 @@ def _propagate(inputs: Inputs, k: int, states: Array, p: Array, memory: Array, t
 
 
 @njit(cache=True)
-def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -> tuple[Array, Array, Array, Array]:
-    """Run the filter; return states, stored covariances, deviations at all boundaries, and innovations.
+def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -> tuple[Array, Array, Array]:
+    """Run the filter; return states, stored covariances, and innovations.
 
     `memory` and the covariance `p` are updated in place. Readings with tags before the first boundary are ignored.
     """
@@ -341,7 +341,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
     states = np.empty((times.size, STATE))
     # position and velocity change since the start of the run, from the inertial unit only
     inertial = np.zeros((times.size, 6))
-    deviations, covariances = np.empty((times.size, ESTIMATED)), np.empty((indices.size, ESTIMATED, ESTIMATED))
+    covariances = np.empty((indices.size, ESTIMATED, ESTIMATED))
     log = np.empty((6 * gps.shape[0] + 3 * compass.shape[0], INNOVATION))
     log_count = next_fix = next_reading = covariance_count = 0
     states[0] = start
@@ -383,9 +383,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
             if not math.isnan(row[YAW]):
                 update_heading(row, estimate, disturbance_rad, times[k], tuning, log[log_count : log_count + 1])
                 log_count += 1
-        for i in range(ESTIMATED):
-            deviations[k, i] = math.sqrt(p[i, i])
         while covariance_count < indices.size and indices[covariance_count] == k:
             covariances[covariance_count] = p[:ESTIMATED, :ESTIMATED]
             covariance_count += 1
-    return states, covariances, deviations, log[:log_count]
+    return states, covariances, log[:log_count]

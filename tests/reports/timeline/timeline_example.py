@@ -8,10 +8,10 @@ from marsyard.scenarios.timeline import (
     Ellipsoids,
     InertialData,
     Path,
-    Points,
     Series,
     SurfacePatch,
     TimedImage,
+    TimedPoints,
     Timeline,
 )
 from marsyard.sim.camera import Cahv
@@ -39,8 +39,8 @@ def make_timeline() -> Timeline:
         paths={"true": Path(times, positions, level), "estimated": Path(times[1:], positions[1:] + 1.0, level[1:])},
         images=[make_image(float(time), float(height)) for time, height in ((0.0, 90.0), (1.0, 80.0))],
         points={
-            "touchdown": Points(np.array([1.0]), positions[2:]),
-            "target": Points.permanent(np.array([*CENTRE_M, 0.0])),
+            "touchdown": TimedPoints(np.array([1.0]), positions[2:]),
+            "target": TimedPoints.permanent(np.array([*CENTRE_M, 0.0])),
         },
         ellipsoids={
             "estimated position": Ellipsoids(times[1:], positions[1:], np.tile(np.diag([4.0, 1.0, 9.0]), (2, 1, 1)))

@@ -150,7 +150,7 @@ def test_relief_error_is_1_for_a_plane_and_0_for_an_exact_map(map_scale: float, 
     plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
     elevation = replace(cells, elevation_m=map_scale * exact + plane)
     zeros = np.zeros((8, 8))
-    hazards = HazardMaps(np.zeros((8, 8, 3)), zeros, zeros, zeros, zeros.astype(np.uint8))
+    hazards = HazardMaps(zeros, zeros, zeros, zeros.astype(np.uint8))
     ground = MappedGround(
         Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, hazards, np.zeros(2), None
     )
@@ -189,7 +189,7 @@ def test_unknown_cells_of_a_map_are_counted() -> None:
     elevation = ElevationMap(elevation_m, np.zeros(2), 0.1)
     safety = np.full((20, 30), Safety.SAFE, dtype=np.uint8)
     safety[:5], safety[-3:] = Safety.UNKNOWN, Safety.HAZARD
-    maps = HazardMaps(np.zeros((1, 1, 3)), elevation_m, elevation_m, elevation_m, safety)
+    maps = HazardMaps(elevation_m, elevation_m, elevation_m, safety)
     ground = MappedGround(
         Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), None
     )

@@ -142,19 +142,6 @@ def test_exported_descent_equals_the_measurements(tmp_path: Path) -> None:
     }
 
 
-def test_lossy_export_compresses_the_images(tmp_path: Path) -> None:
-    measurements = simulate()
-    exporter: Any = LOCALISATION.make(f"export:{tmp_path}::bits-per-pixel=1", LvsOptions(), ExecutableLimits(), 0)
-    exporter.estimate(measurements)
-    exported = read_descent(tmp_path / "cases" / "000000")
-    differences = [
-        np.abs(image.counts.astype(float) - original.counts).mean()
-        for image, original in zip(exported.images, measurements.images, strict=True)
-    ]
-    # the counts have 8 bits: at most 255
-    assert all(0.0 < difference < 20.0 for difference in differences)
-
-
 def test_table_answers_every_image(tmp_path: Path) -> None:
     measurements = simulate()
     expected = estimate_descent(measurements)
