@@ -2,11 +2,13 @@
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from marsyard.reports.statistics import clusters
 from marsyard.reports.statistics.clusters import (
     ClusteredCases,
     Sizes,
@@ -183,6 +185,23 @@ def test_more_cases_do_not_make_the_verdict_worse() -> None:
     assert powers[0] == pytest.approx(0.999**250)
     assert powers[1] > 0.9
     assert powers[2] > 0.9
+
+
+def test_search_for_a_statistic_ends_at_a_sufficient_probability(monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes, rate, risk, calls = ((1, 4), (3, 12)), 0.21, 0.1, [0]
+    evaluate = clusters.TailFunction.of_pairs
+
+    def count(*arguments: Any) -> Any:
+        calls[0] += 1
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(clusters.TailFunction, "of_pairs", count)
+    p_values = [TerrainCounts(sizes, statistic).p_value(rate) for statistic in range(12)]
+    assert clusters.max_statistic(sizes, rate, risk) == sum(value <= risk for value in p_values) - 1
+    calls[0] = 0
+    probability, _ = clusters._find_supremum(sizes, 11, rate, risk)
+    # the grid of support points is sufficient: 17 evaluations without the limit
+    assert (calls[0], risk < probability <= p_values[11]) == (1, True)
 
 
 def test_spread_failures_are_stronger_evidence_than_failures_on_one_terrain() -> None:
