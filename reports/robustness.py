@@ -1,19 +1,15 @@
 """Robust verdicts: the smallest change of the dispersions that turns PASS of a requirement into FAIL.
 
-Each random dispersion is a function of a standard normal variable z (`marsyard.campaigns.sampling.study_points`). A
-change replaces the distribution of z for one dispersion; the distribution of all other random numbers, given this one,
-stays as declared. The stored cases are weighted by the ratio of the two densities, so that no case is run:
-
-- mean up, mean down: N(d, 1) and N(-d, 1). A normal dispersion is shifted by d standard deviations; the values of a
-  bounded one stay within its range, where cases exist.
-- wider, narrower: N(0, s^2). The standard deviation of a normal dispersion is multiplied by s.
-- more frequent: the probability P of a value of `choice` becomes P + a (1 - P).
-- all dispersions: any distribution of all random numbers whose Kullback-Leibler divergence from the declared one is at
-  most r. The largest failure rate q then has the binary divergence r from the failure rate p of the declared
-  distribution, q log(q / p) + (1 - q) log((1 - q) / (1 - p)) = r, in any dimension.
+A change of one dispersion (`marsyard.reports.dispersion_changes`) weights the stored cases by the ratio of two
+densities, so that no case is run. A change of all dispersions is any distribution of all random numbers whose
+Kullback-Leibler divergence from the declared one is at most r. The largest failure rate q then has the binary
+divergence r from the failure rate p of the declared distribution, q log(q / p) + (1 - q) log((1 - q) / (1 - p)) = r, in
+any dimension. For a population with the rate m among all cases, the smallest divergence of all cases is
+r = -log(1 - m + m exp(-r')), with the divergence r' of the two failure rates in the population.
 
 The verdict under a change is that of its own rule: PASS while the upper bound of the failure rate
-(`marsyard.reports.statistics.weighted`) is at most the permitted rate, FAIL if the lower bound is above it. The change
+(`marsyard.reports.statistics.weighted`) is at most the permitted rate, FAIL if the lower bound is above it. Both are at
+least as wide as the bounds of the verdict, in proportion, which are wider for shared terrains, for example. The change
 to FAIL is where the estimated rate reaches the permitted rate. PASS is lost before, and FAIL shown after: these two
 changes are the interval, each with the confidence of the requirement. Weights say nothing where they are equivalent to
 fewer than 30 cases.
@@ -22,31 +18,23 @@ fewer than 30 cases.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from jaxtyping import Float64
-from scipy.special import ndtr, ndtri, rel_entr
+from scipy.special import rel_entr
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.json_numbers import Number
-from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.sampling.dispersions import Choice
 from marsyard.reports.case_evidence import CaseEvidence
 from marsyard.reports.decision import collect_evidence
+from marsyard.reports.dispersion_changes import Change, Kind, Quantity, draw_coordinates, list_changes, sign_of
 from marsyard.reports.sampling_design import SamplingDesign
-from marsyard.reports.statistics.weighted import (
-    MIN_EFFECTIVE,
-    Changes,
-    Crossing,
-    WeightedRates,
-    find_crossing,
-    weighted_rates,
-)
+from marsyard.reports.statistics.weighted import Crossing, WeightedRates, find_crossing, weighted_rates
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import ESTIMATE, Verdict
 from marsyard.reports.wording import format_fraction, number, percent
@@ -55,24 +43,10 @@ from marsyard.scenarios.columns import split_unit, to_words
 if TYPE_CHECKING:
     from marsyard.scenarios.interface import Scenario
 
+#: Statements hold for each change, but not for several at once.
+_ONE = "one change at a time"
 #: Name of the parameter of a change of all dispersions at once.
 ALL_DISPERSIONS = "all dispersions"
-#: Number of evaluated sizes of a change; between them, rates are interpolated.
-_STEPS = 41
-#: Nodes of the quadrature of means and standard deviations of dispersions.
-_NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(31)
-
-
-class Kind(StrEnum):
-    """Kind of a change, see above; VALUE: another value of a parameter that the campaign does not disperse."""
-
-    MEAN_UP = "mean up"
-    MEAN_DOWN = "mean down"
-    WIDER = "wider"
-    NARROWER = "narrower"
-    MORE_FREQUENT = "more frequent"
-    DIVERGENCE = "divergence"
-    VALUE = "value"
 
 
 class Outcome(StrEnum):
@@ -103,7 +77,7 @@ class Robustness:
       indicator of a value of `choice`, or the magnitude of the value of a parameter that is not dispersed. A
       divergence r is expressed by the shift sqrt(2 r) of one normal dispersion, which has this divergence
     - passes_at, fails_at: `assumed` after the changes `lower` and `change`
-    - change: change to FAIL in assumed spreads
+    - change: change to FAIL in assumed spreads; in standard deviations of z if mean or variance can be infinite
     - lower, upper: PASS holds below the change `lower`, FAIL is shown above `upper`, each at `confidence`
     - reach: largest change about which the cases say something
     - effective_cases: effective number of cases (terrains if they are shared) at `change`, or at `reach` without it
@@ -167,23 +141,6 @@ class Robustness:
         return f"{self.name} {self.format_value(value, change)}{f' ({notes})' if notes else ''}"
 
 
-@dataclass(frozen=True)
-class _Change:
-    """Changes of one kind: sizes in assumed spreads, from 0, and the weights of the cases.
-
-    - efficiency: expected effective number of cases per case; that of a sample is too large for heavy-tailed weights
-    - max_weights: largest possible weight; 0 if it is infinite
-    - value: index of the value of `choice`
-    """
-
-    kind: Kind
-    sizes: Changes
-    weights: Float64[np.ndarray, "changes n"]
-    efficiency: Changes
-    max_weights: Changes | float = 0.0
-    value: int = 0
-
-
 def evaluate_robustness(
     run: StoredRun, verdicts: Sequence[Verdict], sampling: SamplingDesign
 ) -> tuple[Robustness, ...]:
@@ -203,13 +160,16 @@ def evaluate_robustness(
         for item in met
         if (cases := collect_evidence(frame, requirements[item.requirement_id], sampling, has_own_terrains=True))
     ]
-    records = [_divergence(verdict) for verdict in met]
+    records = [_divergence(*item) for item in evidence]
     if campaign is not None and campaign.drawn_paths:
-        coordinates = draw_coordinates(campaign, frame["case"].to_numpy(dtype=np.int64))
+        case_numbers = frame["case"].to_numpy(dtype=np.int64)
+        coordinates = draw_coordinates(campaign, case_numbers)
         for index, path in enumerate(campaign.drawn_paths):
-            dispersion = campaign.marginals[path]
-            for change in _list_changes(dispersion, coordinates[:, index]):
-                records += [_find_change(path, dispersion, change, *item) for item in evidence]
+            quantity = Quantity.of(campaign, path, int(case_numbers[0]))
+            for change in list_changes(quantity.dispersion, coordinates[:, index]):
+                if (sizes := quantity.sizes(change)) is not None:
+                    scaled = replace(change, sizes=sizes)
+                    records += [_find_change(path, quantity, scaled, *item) for item in evidence]
     order = {verdict.requirement_id: index for index, verdict in enumerate(met)}
     return tuple(sorted(records, key=lambda item: (order[item.requirement], sort_key(item))))
 
@@ -247,21 +207,12 @@ def read_campaign(run: StoredRun) -> Campaign | None:
     return campaign
 
 
-def draw_coordinates(
-    campaign: Campaign, cases: Float64[np.ndarray, " n"] | Any
-) -> Float64[np.ndarray, "n dispersions"]:
-    """Compute the standard normal variables of the random dispersions of cases, after the correlation of groups."""
-    draws = (campaign.probabilities(int(case)) or {} for case in cases)
-    uniform = np.array([[values[path] for path in campaign.drawn_paths] for values in draws])
-    return np.asarray(ndtri(np.clip(uniform, MIN_DRAW, MAX_DRAW)))
-
-
-def _rates(verdict: Verdict, cases: CaseEvidence, change: _Change) -> WeightedRates:
-    """Compute the failure rates of a requirement under changes, with the confidence of the bounds of its verdict."""
+def _rates(verdict: Verdict, cases: CaseEvidence, change: Change) -> WeightedRates:
+    """Compute failure rates of a requirement under changes, with bounds at least as wide as those of its verdict."""
     member = cases.member
     groups = cases.groups[member] if cases.groups is not None and cases.clustered else None
     largest = 1 if groups is None else int(np.bincount(groups).max())
-    return weighted_rates(
+    rates = weighted_rates(
         change.weights[:, member],
         ~cases.success[member],
         groups,
@@ -269,44 +220,27 @@ def _rates(verdict: Verdict, cases: CaseEvidence, change: _Change) -> WeightedRa
         change.max_weights * largest,
         change.efficiency,
     )
+    lower, upper = 1.0 - verdict.upper, 1.0 - verdict.lower
+    return replace(
+        rates,
+        lower=rates.lower * min(lower / rates.lower[0], 1.0) if rates.lower[0] > 0.0 else rates.lower,
+        upper=np.minimum(rates.upper * max(upper / rates.upper[0], 1.0), 1.0),
+    )
 
 
-def _list_changes(dispersion: Any, z: Float64[np.ndarray, " n"]) -> Iterator[_Change]:
-    """List the changes of a dispersion up to those whose expected number of effective cases is 30."""
-    steps, fraction = np.linspace(0.0, 1.0, _STEPS), MIN_EFFECTIVE / z.size
-    if fraction >= 1.0:
-        return
-    if isinstance(dispersion, Choice):
-        limits = np.cumsum(dispersion.weights or np.ones(len(dispersion.values)))
-        indices = np.minimum(np.searchsorted(limits / limits[-1], ndtr(z), side="right"), limits.size - 1)
-        for index, probability in enumerate(np.diff(limits, prepend=0.0) / limits[-1] if limits.size > 1 else ()):
-            others, ratio = 1.0 - steps, steps / probability
-            weights = others[:, None] + ratio[:, None] * (indices == index)
-            # E w^2 = (1 - a)^2 + 2 a (1 - a) + a^2 / P
-            efficiency = 1.0 / (1.0 - steps**2 + steps**2 / probability)
-            sizes = steps * math.sqrt((1.0 - probability) / probability)
-            yield _Change(Kind.MORE_FREQUENT, sizes, weights, efficiency, others + ratio, index)
-        return
-    shifts = steps * math.sqrt(-math.log(fraction))
-    for kind, sign in ((Kind.MEAN_UP, 1.0), (Kind.MEAN_DOWN, -1.0)):
-        weights = np.exp(sign * shifts[:, None] * z - 0.5 * shifts[:, None] ** 2)
-        yield _Change(kind, shifts, weights, np.exp(-(shifts**2)))
-    # E w^2 = 1 / (s sqrt(2 - s^2)), infinite from s^2 = 2
-    root = math.sqrt(1.0 - fraction**2)
-    for kind, limit in ((Kind.WIDER, math.sqrt(1.0 + root)), (Kind.NARROWER, math.sqrt(1.0 - root))):
-        scales = 1.0 + steps * (limit - 1.0)
-        weights = np.exp(0.5 * z**2 * (1.0 - scales[:, None] ** -2)) / scales[:, None]
-        yield _Change(kind, np.abs(scales - 1.0), weights, scales * np.sqrt(np.maximum(2.0 - scales**2, 0.0)))
-
-
-def _find_change(path: str, dispersion: Any, change: _Change, verdict: Verdict, cases: CaseEvidence) -> Robustness:
+def _find_change(path: str, quantity: Quantity, change: Change, verdict: Verdict, cases: CaseEvidence) -> Robustness:
     """Find the smallest change of one kind of a dispersion that turns PASS into FAIL."""
     rates, by_rate = _rates(verdict, cases, change), verdict.decide_by == ESTIMATE
     crossing = find_crossing(change.sizes, rates, 1.0 - verdict.probability, decides_by_rate=by_rate)
-    assumed, passes_at, fails_at = (
-        _quantity(dispersion, change, size) for size in (0.0, crossing.lower, crossing.change)
-    )
-    is_choice = isinstance(dispersion, Choice)
+    dispersion, is_choice = quantity.dispersion, isinstance(quantity.dispersion, Choice)
+    if is_choice:
+        weights = dispersion.weights or [1.0] * len(dispersion.values)
+        assumed = weights[change.value] / sum(weights)
+        spread = math.sqrt(assumed * (1.0 - assumed))
+    else:
+        mean, spread = quantity.declared if quantity.is_absolute else (math.nan, math.nan)
+        assumed = mean if change.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN) else spread
+    step = sign_of(change.kind) * spread
     is_complete = is_choice and crossing.reach == float(change.sizes[-1])
     return Robustness(
         verdict.requirement_id,
@@ -314,40 +248,14 @@ def _find_change(path: str, dispersion: Any, change: _Change, verdict: Verdict, 
         change.kind,
         "" if is_choice else split_unit(path)[1] if dispersion.unit is None else dispersion.unit,
         assumed=assumed,
-        spread=math.sqrt(assumed * (1.0 - assumed)) if is_choice else _moments(dispersion, 0.0, 1.0)[1],
-        passes_at=passes_at,
-        fails_at=fails_at,
+        spread=spread,
+        passes_at=assumed + step * crossing.lower,
+        fails_at=assumed + step * crossing.change,
         confidence=verdict.confidence,
         outcome=Outcome.of(crossing, is_complete=is_complete),
         value=str(dispersion.values[change.value]) if is_choice else "",
         **asdict(crossing),
     )
-
-
-def _quantity(dispersion: Any, change: _Change, size: float) -> float:
-    """Return mean, standard deviation or probability of a dispersion after a change of a size; NaN if unknown."""
-    if isinstance(dispersion, Choice):
-        weights = dispersion.weights or [1.0] * len(dispersion.values)
-        probability = weights[change.value] / sum(weights)
-        return probability + size * math.sqrt(probability * (1.0 - probability))
-    signed = -size if change.kind in (Kind.MEAN_DOWN, Kind.NARROWER) else size
-    if change.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN):
-        return _moments(dispersion, signed, 1.0)[0]
-    return _moments(dispersion, 0.0, 1.0 + signed)[1]
-
-
-def _moments(dispersion: Any, shift: float, scale: float) -> tuple[float, float]:
-    """Compute mean and standard deviation of a dispersion whose standard normal variable is shifted and scaled.
-
-    NaN if its parameters are formulas.
-    """
-    if dispersion.formulas or math.isnan(shift + scale):
-        return math.nan, math.nan
-    draws = np.clip(ndtr(shift + scale * _NODES), MIN_DRAW, MAX_DRAW)
-    values = np.array([float(dispersion.quantile(draw)) for draw in draws.tolist()])
-    weights = _NODE_WEIGHTS / _NODE_WEIGHTS.sum()
-    mean = float(weights @ values)
-    return mean, math.sqrt(float(weights @ (values - mean) ** 2))
 
 
 def binary_divergence(rate: float, reference: float) -> float:
@@ -357,13 +265,32 @@ def binary_divergence(rate: float, reference: float) -> float:
     return 0.0 if rate <= reference else float(rel_entr(rate, reference) + rel_entr(1.0 - rate, 1.0 - reference))
 
 
-def _divergence(verdict: Verdict) -> Robustness:
-    """Find the divergence of all dispersions that turns PASS into FAIL, from the verdict's own bounds."""
-    permitted = 1.0 - verdict.probability
-    radii = [binary_divergence(permitted, 1.0 - rate) for rate in (verdict.estimate, verdict.lower, verdict.upper)]
+def population_divergence(rate: float, reference: float, member_rate: float) -> float:
+    """Compute the smallest divergence of the distribution of all cases that changes the failure rate of a population.
+
+    - rate, reference: failure rates in the population after and before the change
+    - member_rate: fraction of all cases that belong to the population, before the change
+    """
+    divergence = binary_divergence(rate, reference)
+    is_bounded = math.isfinite(divergence) and member_rate < 1.0
+    return -math.log1p(member_rate * math.expm1(-divergence)) if is_bounded else divergence
+
+
+def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:
+    """Find the divergence of all dispersions that turns PASS into FAIL, from the bounds without a change."""
+    none = Change(Kind.DIVERGENCE, np.zeros(1), np.ones((1, cases.member.size)), np.ones(1))
+    rates, permitted = _rates(verdict, cases, none), 1.0 - verdict.probability
+    groups = cases.groups if cases.clustered else None
+    # rate of the population among all cases, of which each bound is the worse one
+    confidences = verdict.bounds_confidence, verdict.upper_confidence
+    members = weighted_rates(none.weights, cases.member, groups, confidences)
+    if verdict.population == "all":
+        members = WeightedRates(*(np.ones(1),) * 4)
+    pairs = ((rates.estimate, members.estimate), (rates.upper, members.lower), (rates.lower, members.upper))
+    radii = [population_divergence(permitted, float(rate[0]), float(member[0])) for rate, member in pairs]
     change, lower, upper = (math.sqrt(2.0 * radius) if math.isfinite(radius) else math.nan for radius in radii)
     lower = change if verdict.decide_by == ESTIMATE else lower or math.nan  # 0 without PASS
-    crossing = Crossing(change, lower, upper, math.nan, float(verdict.n))
+    crossing = Crossing(change, lower, upper, math.nan, float(rates.effective_units[0]))
     outcome = Outcome.of(crossing, is_complete=False)
     return Robustness(
         verdict.requirement_id, ALL_DISPERSIONS, Kind.DIVERGENCE, "nat", assumed=0.0, spread=1.0,
@@ -389,9 +316,13 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
         if item.fail_text and item is not ball:
             nearest.setdefault(item.parameter, item)
     changes = "; ".join(item.fail_text for item in [*nearest.values()][:max_changes])
+    by_rate = verdict.decide_by == ESTIMATE
     # a calibration excludes PASS
     word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"
-    word = "Met by the rate" if verdict.decide_by == ESTIMATE else word
-    reach = f"{word} ({format_fraction(verdict.confidence)} confidence, one change at a time) {', '.join(ranges)}."
-    nearest_text = f"Nearest changes to FAIL: {changes or 'unknown, because too few cases fail'}."
-    return f"{reach if ranges else 'These cases do not show PASS.'} {nearest_text}"
+    confidence = f"{format_fraction(verdict.confidence)} confidence"
+    word = f"Met by the rate (no confidence, {_ONE})" if by_rate else f"{word} ({confidence}, {_ONE})"
+    reach = f"{word} {', '.join(ranges)}." if ranges else "These cases do not show PASS."
+    examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)
+    by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
+    chance = f" (of {examined} examined, of which at most {by_chance} appear by chance on average)" if by_chance else ""
+    return f"{reach} Nearest changes to FAIL{chance}: {changes or 'unknown, because too few cases fail'}."

@@ -11,7 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from marsyard.campaigns.studies.results import ROBUST
-from marsyard.reports.robustness import ALL_DISPERSIONS, Kind, Outcome, Robustness, sort_key
+from marsyard.reports.dispersion_changes import Kind
+from marsyard.reports.robustness import ALL_DISPERSIONS, Outcome, Robustness, sort_key
 from marsyard.reports.section import MARKERS, MUTED, SERIES, Block, Grid, Section, in_page_style, new_axes, svg_figure
 from marsyard.reports.variants import VariantVerdict
 from marsyard.reports.verdicts import Status

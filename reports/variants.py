@@ -21,8 +21,9 @@ from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVariant
 from marsyard.reports import rates
 from marsyard.reports.decision import collect_evidence
+from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.requirement_cases import compute_margins
-from marsyard.reports.robustness import Kind, Outcome, Robustness, select_met
+from marsyard.reports.robustness import Outcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run

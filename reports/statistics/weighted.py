@@ -70,17 +70,19 @@ def weighted_rates(
     """
     unit, failing = _sum_groups(weights, groups), _sum_groups(weights * failure, groups)
     units = unit.shape[1]
+    is_known = unit.sum(axis=1) > _MIN_PARAMETER  # small weights are rounded to 0
+    unit = np.where(is_known[:, None], unit, 1.0)
     scale = units / unit.sum(axis=1)
     total, square = scale * failing.sum(axis=1), scale**2 * (failing**2).sum(axis=1)
     rate = (total / units)[:, None]
     ratio_square = scale**2 * ((failing - rate * unit) ** 2).sum(axis=1)
     square = np.maximum(square, ratio_square / np.maximum(1.0 - rate[:, 0], 1.0 / units))
     largest = scale * np.maximum(unit.max(axis=1), max_weights)
-    has_failure = square > 0.0  # small weights are rounded to 0
+    has_failure = square > 0.0
     counted = np.where(has_failure, total, 1.0), np.where(has_failure, square, 1.0)
     lower = np.where(has_failure, _bound(*counted, units, 1.0 - confidences[0]), 0.0)
     upper = _bound(total + largest, square + largest**2, units, confidences[1])
-    effective = units**2 / (scale**2 * (unit**2).sum(axis=1))
+    effective = is_known * units**2 / (scale**2 * (unit**2).sum(axis=1))
     return WeightedRates(total / units, lower, np.minimum(upper, 1.0), np.minimum(effective, efficiency * effective[0]))
 
 

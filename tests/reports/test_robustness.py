@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,18 @@ import numpy as np
 import pandas as pd
 import pytest
 from scipy import optimize
-from scipy.stats import norm
+from scipy.stats import norm, truncnorm
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.reports import robustness as module
 from marsyard.reports.decision import evaluate_requirements
+from marsyard.reports.dispersion_changes import Change, Kind, Quantity, list_changes
 from marsyard.reports.robustness import (
     ALL_DISPERSIONS,
-    Kind,
     Outcome,
     Robustness,
     binary_divergence,
     evaluate_robustness,
+    population_divergence,
     robustness_text,
 )
 from marsyard.reports.sampling_design import read_sampling_design
@@ -49,6 +50,7 @@ kind = {{ distribution = "choice", values = ["plain", "rough"], weights = [9.0, 
 [[requirements]]
 id = "LOAD"
 metric = "is_safe"
+population = "{population}"
 probability = {probability}
 confidence = 0.9
 """
@@ -57,11 +59,11 @@ Fails = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def evaluate(
-    folder: Path, cases: int, probability: float, fails: Fails, **changes: Any
+    folder: Path, cases: int, probability: float, fails: Fails, population: str = "all", **changes: Any
 ) -> tuple[list[Verdict], dict[tuple[str, Kind], Robustness], tuple[Robustness, ...]]:
     """Evaluate cases of a limit state; `fails` are functions of both loads as standard normal numbers, and of kind."""
     path = folder / "campaign.toml"
-    path.write_text(CAMPAIGN.format(cases=cases, probability=probability))
+    path.write_text(CAMPAIGN.format(cases=cases, probability=probability, population=population))
     campaign = load_campaign(str(path))
     rows = [{"case": case, "outcome": "VALID", "answered": True, **campaign.draws(case)} for case in range(cases)]
     frame = pd.DataFrame(rows)
@@ -91,7 +93,7 @@ LIMIT_STATES: dict[Kind, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
 def find_crossings(z: np.ndarray) -> dict[Kind, Crossing]:
     """Find the changes to FAIL, of more than 5 % of failures, of the limit states."""
     crossings = {}
-    for change in module._list_changes(None, z):
+    for change in list_changes(None, z):
         fails = LIMIT_STATES[change.kind][0](z)
         rates = weighted_rates(change.weights, fails, None, (0.9, 0.9), efficiency=change.efficiency)
         crossings[change.kind] = find_crossing(change.sizes, rates, 0.05)
@@ -137,13 +139,91 @@ def test_changes_have_the_units_of_the_parameters(tmp_path: Path) -> None:
     assert wider.passes_at == pytest.approx(2.0 * (1.0 + wider.lower))
     down = records["loads.1", Kind.MEAN_DOWN]
     assert down.spread == pytest.approx(20.0 / math.sqrt(12.0), rel=1e-3)
-    # a bounded range stays the same: the mean of Phi(z - d) is Phi(-d / sqrt(2)) for a standard normal z
-    assert down.passes_at == pytest.approx(20.0 + 20.0 * norm.cdf(-down.lower / math.sqrt(2.0)), rel=1e-3)
+    assert down.passes_at == pytest.approx(30.0 - down.spread * down.lower, rel=1e-3)
     assert up.outcome is down.outcome is Outcome.FOUND
     # the other direction does not lead to FAIL within the reach of the cases
     other = records["loads.0", Kind.MEAN_DOWN]
     assert other.outcome is Outcome.REFUSED
     assert math.isnan(other.change)
+
+
+#: A campaign with dispersions of one parameter, without cases.
+DISPERSION = """
+name = "changes"
+scenario = "tests.campaigns.studies.limit_state:LimitStateScenario"
+cases = 10
+seed = 3
+
+[dispersions]
+"loads.0" = {distribution}
+{others}
+"""
+
+
+def quantity_of(folder: Path, distribution: str, others: str = "") -> Quantity:
+    """Return the quantity of a dispersion."""
+    path = folder / "campaign.toml"
+    path.write_text(DISPERSION.format(distribution=distribution, others=others))
+    return Quantity.of(load_campaign(str(path)), "loads.0", 0)
+
+
+def sizes_of(quantity: Quantity, kind: Kind, change: float) -> float:
+    """Return the size of a shift of z, or of a change of its standard deviation."""
+    sizes = quantity.sizes(Change(kind, np.array([0.0, change]), np.ones((2, 1)), np.ones(2)))
+    assert sizes is not None
+    return float(sizes[1])
+
+
+def test_sizes_of_a_bounded_dispersion_are_those_of_its_mean_and_spread(tmp_path: Path) -> None:
+    """Phi(z) has the mean Phi(d / sqrt(2)) for N(d, 1), and the variance asin(s^2 / (1 + s^2)) / 2 pi for N(0, s^2).
+
+    A shift of 2 is one of 1.46 standard deviations, and a factor of 1.3 one of 1.14: PASS must not be claimed for more.
+    """
+    uniform = quantity_of(tmp_path, '{ distribution = "uniform", low = -3.0, high = 7.0 }')
+    assert uniform.declared == pytest.approx((2.0, 10.0 / math.sqrt(12.0)), rel=1e-5)
+    mean = (norm.cdf(2.0 / math.sqrt(2.0)) - 0.5) * math.sqrt(12.0)
+    assert sizes_of(uniform, Kind.MEAN_UP, 2.0) == pytest.approx(mean, rel=1e-4)
+    assert sizes_of(uniform, Kind.MEAN_DOWN, 2.0) == pytest.approx(mean, rel=1e-4)
+    for kind, scale in ((Kind.WIDER, 1.3), (Kind.NARROWER, 0.6)):
+        deviation = math.sqrt(12.0 * math.asin(scale**2 / (1.0 + scale**2)) / (2.0 * math.pi))
+        assert sizes_of(uniform, kind, abs(scale - 1.0)) == pytest.approx(abs(deviation - 1.0), rel=1e-4)
+
+
+def test_sizes_of_a_normal_dispersion_are_those_of_z(tmp_path: Path) -> None:
+    normal = quantity_of(tmp_path, '{ distribution = "normal", mean = 4.0, sd = 0.1 }')
+    assert normal.declared == pytest.approx((4.0, 0.1), rel=1e-6)
+    for kind, size in ((Kind.MEAN_UP, 1.3), (Kind.MEAN_DOWN, 0.2), (Kind.WIDER, 0.4), (Kind.NARROWER, 0.9)):
+        assert sizes_of(normal, kind, size) == pytest.approx(size, rel=1e-5)
+
+
+def test_sizes_of_truncated_discrete_and_heavy_tailed_dispersions(tmp_path: Path) -> None:
+    """Moments of SciPy's distributions; the sizes are those of integrals over the shifted density."""
+    truncated = quantity_of(tmp_path, '{ distribution = "normal", mean = 1.0, sd = 2.0, truncate = [0.0, 2.0] }')
+    exact = truncnorm(-0.5, 0.5, loc=1.0, scale=2.0)
+    assert truncated.declared == pytest.approx((exact.mean(), exact.std()), rel=1e-4)
+    counts = quantity_of(tmp_path, '{ distribution = "poisson", mu = 2.0 }')
+    # jumps between two nodes, 0.01 apart, have an error of 0.2 % of the density
+    assert counts.declared == pytest.approx((2.0, math.sqrt(2.0)), rel=3e-3)
+    lognormal = quantity_of(tmp_path, '{ distribution = "lognorm", s = 1.0 }')
+    assert lognormal.declared == pytest.approx((math.exp(0.5), math.exp(0.5) * math.sqrt(math.e - 1.0)), rel=1e-4)
+    # exp(z + d) has the mean exp(d + 1 / 2)
+    assert sizes_of(lognormal, Kind.MEAN_UP, 0.5) == pytest.approx(math.expm1(0.5) / math.sqrt(math.e - 1.0), rel=1e-4)
+    cauchy = quantity_of(tmp_path, '{ distribution = "cauchy" }')
+    assert np.isnan(cauchy.declared).all()
+    assert sizes_of(cauchy, Kind.MEAN_UP, 0.7) == 0.7
+    # scaling z does not change two values with equal probabilities
+    coin = quantity_of(tmp_path, '{ distribution = "bernoulli", p = 0.5 }')
+    assert coin.sizes(Change(Kind.WIDER, np.array([0.0, 0.2]), np.ones((2, 1)), np.ones(2))) is None
+
+
+def test_sizes_of_a_formula_are_those_of_one_case(tmp_path: Path) -> None:
+    """A uniform range around another load: relative sizes are those of any uniform range, absolute ones are unknown."""
+    formula = '{ distribution = "uniform", low = "loads[1] - 2.0", high = "loads[1] + 2.0" }'
+    other = '"loads.1" = { distribution = "normal", mean = 50.0, sd = 3.0 }'
+    quantity = quantity_of(tmp_path, formula, other)
+    assert not quantity.is_absolute
+    mean = (norm.cdf(2.0 / math.sqrt(2.0)) - 0.5) * math.sqrt(12.0)
+    assert sizes_of(quantity, Kind.MEAN_UP, 2.0) == pytest.approx(mean, rel=1e-4)
 
 
 def test_probability_of_a_value(tmp_path: Path) -> None:
@@ -200,6 +280,31 @@ def test_divergence_of_all_dispersions() -> None:
     assert binary_divergence(0.01, 0.0) == math.inf
 
 
+def test_divergence_of_a_population_is_smaller_than_that_of_all_cases() -> None:
+    """Half of all cases belong to a population, of which 4 % fail; permitted are 10 %.
+
+    The smallest divergence for which the mean of f = failure - 0.1 member reaches 0 is the maximum of -log E exp(t f).
+    """
+    member, rate, permitted = 0.5, 0.04, 0.1
+    probabilities = np.array([member * rate, member * (1.0 - rate), 1.0 - member])
+    scores = np.array([1.0 - permitted, -permitted, 0.0])
+    tilt = np.linspace(0.0, 5.0, 5001)
+    smallest = float((-np.log(np.exp(tilt[:, None] * scores) @ probabilities)).max())
+    assert population_divergence(permitted, rate, member) == pytest.approx(smallest, rel=1e-5)
+    assert population_divergence(permitted, rate, member) < 0.51 * binary_divergence(permitted, rate)
+    assert population_divergence(permitted, rate, 1.0) == binary_divergence(permitted, rate)
+
+
+def test_divergence_of_a_population_is_that_of_all_cases(tmp_path: Path) -> None:
+    """A third of the cases answers: PASS is claimed for a third of the divergence within the answers, or less."""
+    answered = np.arange(900) % 3 == 0
+    fails = lambda first, second, kind: first > 2.3  # noqa: E731
+    verdicts, records, _ = evaluate(tmp_path, 900, 0.95, fails, population="valid", answered=answered)
+    item = records[ALL_DISPERSIONS, Kind.DIVERGENCE]
+    assert verdicts[0].n == 300
+    assert 0.0 < item.passes_at < 0.34 * binary_divergence(0.05, 1.0 - verdicts[0].lower)
+
+
 def test_divergence_follows_from_the_bounds_of_the_verdict(tmp_path: Path) -> None:
     verdicts, records, _ = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
     item = records[ALL_DISPERSIONS, Kind.DIVERGENCE]
@@ -238,9 +343,20 @@ def test_pass_at_no_change_is_that_of_the_verdict(tmp_path: Path, failures: int)
     else:
         is_pass = verdicts[0].status is Status.PASS
         assert {item.lower > 0.0 for item in records.values()} == {is_pass}
-        assert is_pass or "These cases do not show PASS. Nearest changes to FAIL: " in robustness_text(
-            verdicts[0], all_
-        )
+        assert is_pass or "These cases do not show PASS. Nearest changes to FAIL" in robustness_text(verdicts[0], all_)
+
+
+def test_shared_terrains_widen_the_bounds_as_in_the_verdict(tmp_path: Path) -> None:
+    """Pairs of failures on few terrains: PASS is not claimed under a change if the verdict has no PASS."""
+    terrains = np.arange(600) // 3
+    for failures in range(2, 24, 3):
+        is_failed = np.arange(600) < failures
+        verdicts, records, _ = evaluate(tmp_path, 600, 0.95, partial(_given, is_failed), terrain=terrains)
+        assert {item.lower > 0.0 for item in records.values()} <= {verdicts[0].status is Status.PASS}, failures
+
+
+def _given(failed: np.ndarray, *_: np.ndarray) -> np.ndarray:
+    return failed
 
 
 @pytest.mark.parametrize("failures", [0, 2, 6])
@@ -269,9 +385,8 @@ def test_unfinished_cases_are_failures(tmp_path: Path) -> None:
 
 def test_rows_with_other_draws_are_not_weighted(tmp_path: Path) -> None:
     """If the rows do not contain the values that the definition draws, only the divergence remains."""
-    _, _, records = evaluate(
-        tmp_path, 300, 0.9, lambda first, second, kind: first > 9.0, **{"loads.0": np.linspace(0.0, 20.0, 300)}
-    )
+    draws: dict[str, Any] = {"loads.0": np.linspace(0.0, 20.0, 300)}
+    _, _, records = evaluate(tmp_path, 300, 0.9, lambda first, second, kind: first > 9.0, **draws)
     assert [item.kind for item in records] == [Kind.DIVERGENCE]
 
 
@@ -283,7 +398,7 @@ def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
     assert "any change of all dispersions up to a divergence of 0.0" in text
     wider, up = records["loads.0", Kind.WIDER], records["loads.0", Kind.MEAN_UP]
     nearest = wider if wider.change < up.change else up
-    assert f"Nearest changes to FAIL: {nearest.fail_text}" in text
+    assert f"by chance on average): {nearest.fail_text}" in text
     assert " assumed; PASS up to " in nearest.fail_text
 
 
@@ -303,6 +418,19 @@ def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:
     assert records["loads.0", Kind.MEAN_UP].effective_cases >= 30.0
     assert math.isnan(records["loads.0", Kind.WIDER].upper)
     assert "standard deviation of loads 0" not in robustness_text(verdicts[0], all_records)
+
+
+def test_rate_has_no_confidence(tmp_path: Path) -> None:
+    """A requirement that is evaluated by its observed rate has a reach, but not at a confidence."""
+    verdicts, _, records = evaluate(tmp_path, 400, 0.95, lambda first, second, kind: first > 2.2)
+    text = robustness_text(replace(verdicts[0], decide_by="estimate", status=Status.MET_BY_RATE), records)
+    assert text.startswith("Met by the rate (no confidence, one change at a time) for a shift of ")
+
+
+def test_chance_is_stated(tmp_path: Path) -> None:
+    """Ten changes of three dispersions at 90 %: one of them can show FAIL by chance."""
+    verdicts, _, records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
+    assert "(of 10 examined, of which at most 1 appear by chance on average)" in robustness_text(verdicts[0], records)
 
 
 @pytest.mark.slow

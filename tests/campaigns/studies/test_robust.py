@@ -28,8 +28,9 @@ from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.robust import choose_cases, start_robust
 from marsyard.cli.app import app
+from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.robustness import Kind, Outcome
+from marsyard.reports.robustness import Outcome
 from marsyard.reports.variants import RobustStudy, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
@@ -164,7 +165,7 @@ def test_command_writes_report_and_table(run: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "Change to FAIL: LOAD" in result.output
     assert "LOAD: PASS holds (90 % confidence, one change at a time) " in result.output
-    assert "Nearest changes to FAIL: beta " in result.output
+    assert "on average): beta " in result.output
     data = json.loads((run / "report.json").read_text())
     record_ = next(item for item in data["robustness"] if item["kind"] == "value" and item["requirement"] == "LOAD")
     keys = {"requirement", "parameter", "unit", "assumed", "spread", "change", "lower", "upper", "effective_cases"}
@@ -207,7 +208,7 @@ def test_interrupted_study_resumes_with_the_same_rows(run: Path, tmp_path: Path)
     assert [{k: v for k, v in row.items() if k not in times} for row in read_case_rows(whole)] == [
         {k: v for k, v in row.items() if k not in times} for row in reference
     ]
-    assert "Nearest changes to FAIL: beta " in result.output
+    assert "on average): beta " in result.output
 
 
 def test_changed_rows_of_a_study_are_found(run: Path) -> None:

@@ -48,6 +48,11 @@ def test_unobserved_cases_with_large_weights_widen_the_upper_bound() -> None:
     assert wide.upper[0] == pytest.approx(10.0 * plain.upper[0])
 
 
+def test_weights_that_are_all_rounded_to_zero_say_nothing() -> None:
+    rates = weighted_rates(np.array([np.ones(60), np.full(60, 1e-300)]), np.zeros(60, dtype=np.bool_), None, (0.9, 0.9))
+    assert rates.effective_units.tolist() == [60.0, 0.0]
+
+
 #: Failures among standard normal numbers z, after which the mean moves to d: the rate is then the limit.
 REGIONS: dict[str, Callable[[np.ndarray, float, float, np.random.Generator], Bool[np.ndarray, " n"]]] = {
     "in the direction of the change": lambda z, d, limit, rng: z > stats.norm.isf(limit) + d,
