@@ -28,9 +28,10 @@ from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.robust import choose_cases, start_robust
 from marsyard.cli.app import app
+from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.robustness import Outcome
+from marsyard.reports.robustness import Outcome, reach_text
 from marsyard.reports.variants import RobustStudy, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
@@ -85,6 +86,18 @@ def test_change_of_a_fixed_parameter(run: Path) -> None:
     assert item.lower < item.change < item.upper
     assert item.passes_at == pytest.approx(BETA * (1.0 - item.lower))
     assert (item.unit, item.spread, item.assumed) == ("", BETA, BETA)
+
+
+def test_dashboard_states_how_far_a_verdict_reaches(run: Path, tmp_path: Path) -> None:
+    """Index, its data for the filters, and the campaign's page contain the smallest change that loses the PASS."""
+    site = tmp_path / "site"
+    assert write_site(site, [run]).problems == []
+    evaluation = evaluate_run(run)
+    texts = [reach_text(verdict, evaluation.robustness) for verdict in evaluation.verdicts]
+    text = texts[0]
+    assert text.startswith("holds up to 0.")
+    assert (site / "index.html").read_text().count(text) == 2 * texts.count(text)
+    assert text in next((site / "c").glob("*/index.html")).read_text()
 
 
 def test_choice_of_cases_represents_all_cases() -> None:
