@@ -339,5 +339,9 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     reach = f"{word} {', '.join(ranges)}." if ranges else "These cases do not show PASS."
     examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)
     by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
-    chance = f" (of {examined} examined, of which at most {by_chance} appear by chance on average)" if by_chance else ""
+    chance = (
+        f" (of {examined} examined, of which at most {by_chance} appear by chance on average)"
+        if by_chance and changes
+        else ""
+    )
     return f"{reach} Nearest changes to FAIL{chance}: {changes or 'unknown, because too few cases fail'}."
