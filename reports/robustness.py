@@ -207,7 +207,7 @@ def read_campaign(run: StoredRun) -> Campaign | None:
     return campaign
 
 
-def _rates(verdict: Verdict, cases: CaseEvidence, change: Change) -> WeightedRates:
+def change_rates(verdict: Verdict, cases: CaseEvidence, change: Change) -> WeightedRates:
     """Compute failure rates of a requirement under changes, with bounds at least as wide as those of its verdict."""
     member = cases.member
     groups = cases.groups[member] if cases.groups is not None and cases.clustered else None
@@ -230,7 +230,7 @@ def _rates(verdict: Verdict, cases: CaseEvidence, change: Change) -> WeightedRat
 
 def _find_change(path: str, quantity: Quantity, change: Change, verdict: Verdict, cases: CaseEvidence) -> Robustness:
     """Find the smallest change of one kind of a dispersion that turns PASS into FAIL."""
-    rates, by_rate = _rates(verdict, cases, change), verdict.decide_by == ESTIMATE
+    rates, by_rate = change_rates(verdict, cases, change), verdict.decide_by == ESTIMATE
     crossing = find_crossing(change.sizes, rates, 1.0 - verdict.probability, decides_by_rate=by_rate)
     dispersion, is_choice = quantity.dispersion, isinstance(quantity.dispersion, Choice)
     if is_choice:
@@ -279,7 +279,7 @@ def population_divergence(rate: float, reference: float, member_rate: float) -> 
 def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:
     """Find the divergence of all dispersions that turns PASS into FAIL, from the bounds without a change."""
     none = Change(Kind.DIVERGENCE, np.zeros(1), np.ones((1, cases.member.size)), np.ones(1))
-    rates, permitted = _rates(verdict, cases, none), 1.0 - verdict.probability
+    rates, permitted = change_rates(verdict, cases, none), 1.0 - verdict.probability
     groups = cases.groups if cases.clustered else None
     # rate of the population among all cases, of which each bound is the worse one
     confidences = verdict.bounds_confidence, verdict.upper_confidence
@@ -297,6 +297,21 @@ def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:
         passes_at=0.5 * lower**2, fails_at=0.5 * change**2, confidence=verdict.confidence, outcome=outcome,
         **asdict(crossing),
     )  # fmt: skip
+
+
+def reach_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
+    """Describe the smallest change of one distribution up to which a verdict is met; empty if it is not, or unknown."""
+    changes = [
+        item
+        for item in records
+        if item.requirement == verdict.requirement_id and item.kind not in (Kind.DIVERGENCE, Kind.VALUE)
+    ]
+    # unknown changes (NaN) of an evaluation by rate are larger than those of others
+    known = [item for item in changes if item.lower > 0.0]
+    if not known or not verdict.status.is_met:
+        return ""
+    nearest = min(known, key=lambda item: item.lower)
+    return f"holds up to {number(nearest.lower)} spreads ({nearest.name}, {nearest.kind})"
 
 
 def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes: int = 3) -> str:
@@ -324,5 +339,9 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     reach = f"{word} {', '.join(ranges)}." if ranges else "These cases do not show PASS."
     examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)
     by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
-    chance = f" (of {examined} examined, of which at most {by_chance} appear by chance on average)" if by_chance else ""
+    chance = (
+        f" (of {examined} examined, of which at most {by_chance} appear by chance on average)"
+        if by_chance and changes
+        else ""
+    )
     return f"{reach} Nearest changes to FAIL{chance}: {changes or 'unknown, because too few cases fail'}."

@@ -29,6 +29,7 @@ from benchmarks.validation import (
     rare_checks,
     rare_verdicts,
     reference_checks,
+    robust_checks,
     sampling_checks,
     sky_checks,
     soak,
@@ -56,6 +57,7 @@ CHECKS = (
     *difference_checks.CHECKS,
     *rare_checks.CHECKS,
     *rare_verdicts.CHECKS,
+    *robust_checks.CHECKS,
     *controls.CHECKS,
 )
 

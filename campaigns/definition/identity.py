@@ -165,8 +165,13 @@ def find_scenario(name: object) -> Scenario | None:
 
 def definition_hash(definition: CampaignDefinition) -> str:
     """Compute the hash of the definition keys that determine the cases."""
-    values = definition.model_dump(mode="json", exclude=set(_KEYS_WITHOUT_EFFECT))
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    return stored_definition_hash(definition.model_dump(mode="json"))
+
+
+def stored_definition_hash(values: Mapping[str, Any]) -> str:
+    """Compute `definition_hash` of a definition in a record, also of one that another version wrote."""
+    with_effect = {name: value for name, value in values.items() if name not in _KEYS_WITHOUT_EFFECT}
+    return hashlib.sha256(json.dumps(with_effect, sort_keys=True).encode()).hexdigest()
 
 
 @cache

@@ -72,7 +72,7 @@ def _verify(folder: Path, signers: Path | None) -> None:
 
     result = verify_package(folder, signers)
     for note in result.notes:
-        typer.echo(f"verified: {note}" if not note.startswith("no signature") else note)
+        typer.echo(f"checked: {note}" if not note.startswith("no signature") else note)
     for problem in result.problems:
         typer.echo(f"problem: {problem}")
     if result.problems:

@@ -105,7 +105,7 @@ class AssuredRun:
     - folder: folder in the package, relative to it
     - report, data: content of `report.json`, read, and as JSON
     - record: content of `campaign.json`
-    - head: last head of the chain of hashes of the rows
+    - head, identity: last head of the chain of hashes of the rows, and the hash of the definition in its first one
     - confirmations, record_head: entries of the claim in its record of confirmations, and the hash of the record
     """
 
@@ -114,6 +114,7 @@ class AssuredRun:
     data: Mapping[str, Any]
     record: Mapping[str, Any]
     head: str
+    identity: str
     confirmations: Sequence[Confirmation] = ()
     record_head: str = ""
 

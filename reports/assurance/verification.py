@@ -14,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from marsyard.campaigns.definition.identity import stored_definition_hash
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.store.confirmations import find_own_entry, read_record
 from marsyard.reports.assurance.case import AssuredRun, build_case
@@ -139,6 +140,9 @@ def _describe_program(manifest: Mapping[str, Any]) -> str:
 def _verify_run(run: AssuredRun, evaluation: Evaluation, record: Path, is_same_program: bool) -> Iterator[str]:
     """Verify that record and verdicts agree with the rows, and for the same program further numbers of the report."""
     evidence = run.report.evidence
+    # the chain of the rows begins with the hash of the definition
+    if run.identity != stored_definition_hash(run.definition):
+        yield f"{run.folder}/campaign.json: the definition is not the one with which the rows were stored"
     if evidence.is_confirmation and evidence.record:
         entry = find_own_entry(read_record(record), evidence)
         if entry is None:

@@ -15,6 +15,7 @@ from marsyard.campaigns.store.record import reject_links
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
+from marsyard.reports.robustness import Robustness, reach_text
 from marsyard.reports.signature import is_own_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.traceability import format_tested_algorithms
@@ -299,9 +300,10 @@ def evidence_text(verdict: Verdict) -> str:
     return f"{text}; over all cases {all_cases.failures:,} of {all_cases.n:,}"
 
 
-def basis_text(verdict: Verdict) -> str:
-    """Describe that a verdict is based on the observed rate; empty for a verdict at a confidence."""
-    return "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
+def basis_text(verdict: Verdict, robustness: Sequence[Robustness]) -> str:
+    """Describe that a verdict is based on the observed rate, and how far it reaches; may be empty."""
+    by_rate = "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
+    return "; ".join(filter(None, (by_rate, reach_text(verdict, robustness))))
 
 
 def margin_text(verdict: Verdict) -> str:

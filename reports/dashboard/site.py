@@ -137,7 +137,7 @@ def _create_filter_data(rows: Sequence[RequirementRow]) -> dict[str, Any]:
                 "rate": cell.verdict.estimate if math.isfinite(cell.verdict.estimate) else None,
                 "required": cell.verdict.probability if math.isfinite(cell.verdict.probability) else None,
                 "rate_text": percent(cell.verdict.estimate),
-                "basis": basis_text(cell.verdict),
+                "basis": basis_text(cell.verdict, cell.entry.report.robustness),
             }
             for cell in row.all_cells
         ]

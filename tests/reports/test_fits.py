@@ -1,17 +1,19 @@
 """Tests of the register of fitted constants."""
 
+import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import BaseModel
 
-import marsyard
 from marsyard.reports.fits import Constant, fit_note, fitted_data, read_register
+from marsyard.reports.validation_rows import RowKind, read_checks
 from marsyard.scenarios.imports import import_object
 
-PACKAGE = Path(marsyard.__file__).parent
+PACKAGE = Path(__file__).parents[2]
 
 
 def _read_value_in_force(where: str) -> Any:
@@ -65,3 +67,36 @@ def test_values_called_calibrated_in_the_code_are_registered() -> None:
         "change_k", "averaging_after_s",
     }  # fmt: skip
     assert "spirit-descent" in fitted_data()
+
+
+def list_fitted_tables() -> Iterator[str]:
+    """Yield ``FILE:TABLE`` of each table of the packaged TOML files with a comment on fitted values."""
+    for path in sorted(path for folder in ("sim", "scenarios") for path in (PACKAGE / folder).rglob("*.toml")):
+        lines, table = path.read_text(encoding="utf-8").splitlines(), ""
+        for number, line in enumerate(lines):
+            if line.startswith("["):
+                table = line.strip("[] ")
+            elif line.startswith("#") and re.search(r"\bfitted\b|calibrated to", line, re.IGNORECASE):
+                following = next((item for item in lines[number:] if not item.startswith("#")), "")
+                name = following.strip("[] ") if following.startswith("[") else table
+                yield f"{path.relative_to(PACKAGE).as_posix()}:{name}"
+
+
+def test_tables_with_fitted_values_are_registered() -> None:
+    places = [constant.where for constant in read_register()]
+    tables = [
+        table
+        for table in list_fitted_tables()
+        if not table.split(":")[0].endswith(("variants.toml", "requirements.toml"))
+    ]
+    assert len(tables) >= 5
+    assert [table for table in tables if not any(place.startswith(table.split("[")[0]) for place in places)] == []
+
+
+def test_comparisons_with_data_of_fits_are_no_validation() -> None:
+    """Data of validation rows are registered, or are those to which no constant was fitted."""
+    rows = [row for check in read_checks().values() for row in check.rows if row.conditions.data]
+    predicted = {"dimes-templates", "sky-images", "hazard-images"}
+    assert {row.conditions.data for row in rows} <= fitted_data() | predicted
+    for row in rows:
+        assert row.kind is (RowKind.VALIDATION if row.conditions.data in predicted else RowKind.FIT), row.claim

@@ -29,12 +29,14 @@ from marsyard.reports.robustness import (
     binary_divergence,
     evaluate_robustness,
     population_divergence,
+    reach_text,
     robustness_text,
 )
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.weighted import Crossing, find_crossing, weighted_rates
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.wording import number
 
 CAMPAIGN = """
 name = "limit-state"
@@ -425,6 +427,17 @@ def test_rate_has_no_confidence(tmp_path: Path) -> None:
     verdicts, _, records = evaluate(tmp_path, 400, 0.95, lambda first, second, kind: first > 2.2)
     text = robustness_text(replace(verdicts[0], decide_by="estimate", status=Status.MET_BY_RATE), records)
     assert text.startswith("Met by the rate (no confidence, one change at a time) for a shift of ")
+
+
+def test_reach_is_the_smallest_change_that_loses_the_verdict(tmp_path: Path) -> None:
+    verdicts, records, all_records = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
+    distributions = {key: item.lower for key, item in records.items() if key[1] is not Kind.DIVERGENCE}
+    key = min(distributions, key=lambda name: distributions[name])
+    text = reach_text(verdicts[0], all_records)
+    assert text == f"holds up to {number(distributions[key])} spreads ({records[key].name}, {key[1]})"
+    assert "loads 0" in text
+    assert reach_text(verdicts[0], [item for item in all_records if item.kind is Kind.DIVERGENCE]) == ""
+    assert reach_text(replace(verdicts[0], status=Status.INSUFFICIENT), all_records) == ""
 
 
 def test_chance_is_stated(tmp_path: Path) -> None:

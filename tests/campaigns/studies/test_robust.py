@@ -28,9 +28,10 @@ from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.studies.robust import choose_cases, start_robust
 from marsyard.cli.app import app
+from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.robustness import Outcome
+from marsyard.reports.robustness import Outcome, reach_text
 from marsyard.reports.variants import RobustStudy, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
@@ -85,6 +86,18 @@ def test_change_of_a_fixed_parameter(run: Path) -> None:
     assert item.lower < item.change < item.upper
     assert item.passes_at == pytest.approx(BETA * (1.0 - item.lower))
     assert (item.unit, item.spread, item.assumed) == ("", BETA, BETA)
+
+
+def test_dashboard_states_how_far_a_verdict_reaches(run: Path, tmp_path: Path) -> None:
+    """Index, its data for the filters, and the campaign's page contain the smallest change that loses the PASS."""
+    site = tmp_path / "site"
+    assert write_site(site, [run]).problems == []
+    evaluation = evaluate_run(run)
+    texts = [reach_text(verdict, evaluation.robustness) for verdict in evaluation.verdicts]
+    text = texts[0]
+    assert text.startswith("holds up to 0.")
+    assert (site / "index.html").read_text().count(text) == 2 * texts.count(text)
+    assert text in next((site / "c").glob("*/index.html")).read_text()
 
 
 def test_choice_of_cases_represents_all_cases() -> None:
@@ -165,7 +178,7 @@ def test_command_writes_report_and_table(run: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "Change to FAIL: LOAD" in result.output
     assert "LOAD: PASS holds (90 % confidence, one change at a time) " in result.output
-    assert "Nearest changes to FAIL: beta " in result.output
+    assert "on average): beta " in result.output
     data = json.loads((run / "report.json").read_text())
     record_ = next(item for item in data["robustness"] if item["kind"] == "value" and item["requirement"] == "LOAD")
     keys = {"requirement", "parameter", "unit", "assumed", "spread", "change", "lower", "upper", "effective_cases"}
@@ -208,7 +221,7 @@ def test_interrupted_study_resumes_with_the_same_rows(run: Path, tmp_path: Path)
     assert [{k: v for k, v in row.items() if k not in times} for row in read_case_rows(whole)] == [
         {k: v for k, v in row.items() if k not in times} for row in reference
     ]
-    assert "Nearest changes to FAIL: beta " in result.output
+    assert "on average): beta " in result.output
 
 
 def test_changed_rows_of_a_study_are_found(run: Path) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from marsyard.campaigns.definition.identity import stored_definition_hash
 from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, write_table
 from tests.reports.synthetic_run import VELOCITY, make_rows, synthetic_record
@@ -18,7 +19,7 @@ def write_stored_run(directory: Path, cases: int = 240, **changes: Any) -> Path:
     directory.mkdir(parents=True)
     record = synthetic_record(frame, [{**VELOCITY, "source": "the paper; the rate is assumed"}])
     (directory / "campaign.json").write_text(json.dumps(record | changes))
-    create_store(directory / ROWS_FILE, {"campaign": "synthetic"})
+    create_store(directory / ROWS_FILE, {"identity": stored_definition_hash(record["definition"])})
     with RowStore(directory / ROWS_FILE) as store:
         store.add([{str(name): value for name, value in row.items()} for row in frame.to_dict("records")])
         write_table(directory / TABLE_FILE, store)

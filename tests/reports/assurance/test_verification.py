@@ -117,6 +117,13 @@ def change_requirement(folder: Path) -> None:
     path.write_text(path.read_text().replace('"probability": 0.99', '"probability": 0.9'))
 
 
+def change_definition(folder: Path) -> None:
+    path = folder / RUN / "campaign.json"
+    record = json.loads(path.read_text())
+    record["definition"]["seed"] += 1
+    path.write_text(json.dumps(record))
+
+
 def test_package_verifies(package: Path) -> None:
     result = verify_package(package)
     assert result.problems == ()
@@ -137,6 +144,7 @@ def test_package_verifies(package: Path) -> None:
         (change_drawing, "case.svg: the content does not follow"),
         (change_page, "index.html: the content does not follow"),
         (change_validation_row, "index.html: the content does not follow"),
+        (change_definition, f"{RUN}/campaign.json: the definition is not the one with which the rows were stored"),
         (
             change_requirement,
             f"{RUN}/report.json: DIMES-VEL does not follow from the rows: probability 0.99, from the rows",
