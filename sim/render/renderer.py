@@ -33,7 +33,7 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import Backend, RenderingError
-from marsyard.sim.render.device import Float, Float64, Int32, UInt32, description
+from marsyard.sim.render.device import UInt32, description
 from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
@@ -65,17 +65,6 @@ _TRIM_THRESHOLD_BYTES = 1 << 30
 _TRIM_INTERVAL_SCENES = 16
 #: Number of rays along each side of an image (probe rays) that determine the visible ground.
 _PROBES = 9
-
-
-def edge_pixels(
-    radiance: Float32[np.ndarray, "rows columns"],
-    distance: Float64Array[np.ndarray, "rows columns"],
-    body: Int32Array[np.ndarray, "rows columns"],
-) -> Int64[np.ndarray, "pixels"]:
-    """Flat indices of the pixels on both sides of visible edges."""
-    rows, columns = radiance.shape
-    layers = (to_device(Float, radiance), to_device(Float64, distance), to_device(Int32, body))
-    return np.flatnonzero(to_host(mark_edges(*layers, UInt32(columns), UInt32(rows))))
 
 
 def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> Rays:
@@ -150,7 +139,7 @@ class _Tracer:
     def smooth_edges(self, image: ShadedImage, hits: Hits, radiance: Float32[np.ndarray, "pixels"]) -> None:
         """Replace the radiance of pixels at edges by the mean of several rays."""
         columns, rows = map(UInt32, self.rays.size)
-        pixels = np.flatnonzero(to_host(mark_edges(image.radiance, hits.distance, image.body, columns, rows)))
+        pixels = np.flatnonzero(to_host(mark_edges(image, hits.distance, columns, rows)))
         if len(pixels) > 0:
             rays, subpixel_hits = self.trace_subpixels(pixels, hits)
             subpixel_radiance = to_host(self.shade_hits(rays, subpixel_hits).radiance)
