@@ -34,7 +34,7 @@ from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import Backend, RenderingError
 from marsyard.sim.render.device import UInt32, description
-from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
+from marsyard.sim.render.edges import mark_edges
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
 from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Pose, Rays, Views, trace_primary_rays
@@ -43,6 +43,7 @@ from marsyard.sim.render.scene import Scene
 from marsyard.sim.render.shading import Light, ShadedImage, shade
 from marsyard.sim.render.shadows import Occluders, visible_sun
 from marsyard.sim.render.spline import Terrain
+from marsyard.sim.render.subpixels import split_rays, trace_subpixel_rays
 from marsyard.sim.render.triangles import Hierarchy
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import Level
