@@ -22,7 +22,6 @@ from benchmarks.validation.scenes import (
     tile_view,
 )
 from marsyard.reports.validation_rows import Conditions
-from marsyard.sim.render.renderer import edge_pixels
 from marsyard.sim.terrain.sites import sites
 
 #: Limit of the control (bias of the estimator itself, `run_control`) with the option --quick: images of 16 samples per
@@ -158,7 +157,7 @@ def _measure_edge_error(view: View) -> tuple[float, float, int]:
     """
     single_ray_view = replace(view, scene=replace(view.scene, edge_rays=1))
     one_ray, several_rays = render(renderer(), single_ray_view), render(renderer(), view)
-    edges = edge_pixels(one_ray.radiance, one_ray.range_m, one_ray.body)
+    edges = np.flatnonzero(one_ray.radiance != several_rays.radiance)
     reference = supersample(renderer(), replace(single_ray_view, footprint=float(CONTROL_SAMPLES)), CONTROL_SAMPLES)
     one_ray_error, several_rays_error = (
         float(np.sqrt(np.mean((frame.radiance - reference).ravel()[edges] ** 2)) / reference.mean())

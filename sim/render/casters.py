@@ -28,6 +28,7 @@ from marsyard.sim.render.device import (
     Matrix3f64,
     UInt32,
 )
+from marsyard.sim.render.triangles import is_inside
 
 #: Minimum u, v and s, then maximum u, v and s, of items.
 Bounds = FloatArray[np.ndarray, "items 6"]
@@ -71,14 +72,14 @@ class Grids:
         )
         column, row, count = u * per_metre.x, v * per_metre.y, Float(side)
         # bounds have a margin: a ray on the border hits nothing
-        is_inside = active & (column >= 0.0) & (row >= 0.0) & (column < count) & (row < count)
-        first = dr.gather(UInt32, self.first_cell, grid, is_inside)
-        return first + UInt32(Int32(row) * side + Int32(column)), is_inside
+        in_grid = active & (column >= 0.0) & (row >= 0.0) & (column < count) & (row < count)
+        first = dr.gather(UInt32, self.first_cell, grid, in_grid)
+        return first + UInt32(Int32(row) * side + Int32(column)), in_grid
 
     def list_range(self, grid: Values, u: Values, v: Values, active: Values) -> tuple[Values, Values]:
         """Return first and end index in `items` of the cell at a position; equal if it is outside the grid."""
-        cell, is_inside = self.find_cell(grid, u, v, active)
-        return dr.gather(UInt32, self.starts, cell, is_inside), dr.gather(UInt32, self.starts, cell + 1, is_inside)
+        cell, in_grid = self.find_cell(grid, u, v, active)
+        return dr.gather(UInt32, self.starts, cell, in_grid), dr.gather(UInt32, self.starts, cell + 1, in_grid)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,31 +243,31 @@ def are_occluded(casters: Casters, position: Values, active: Values) -> Values:
     u, v, s = casters.axes @ position
     # the coarse grid lists bodies; its cell is the number of the fine grid
     coarse, fine, bodies = casters.coarse, casters.fine, casters.bodies
-    cell, is_inside = coarse.find_cell(UInt32(0), *coarse.locate(UInt32(0), u, v, active), active)
-    first, end = fine.list_range(cell, *fine.locate(cell, u, v, is_inside), is_inside)
+    cell, in_grid = coarse.find_cell(UInt32(0), *coarse.locate(UInt32(0), u, v, active), active)
+    first, end = fine.list_range(cell, *fine.locate(cell, u, v, in_grid), in_grid)
 
-    def test_body(k: Values, is_hidden: Values, is_active: Values) -> tuple[Values, Values, Values]:
-        body = dr.gather(UInt32, fine.items, k, is_active)
-        below_top = Float(s - dr.gather(Float64, casters.body_top, body, is_active))
-        is_below = is_active & (below_top <= 0.0)
+    def test_body(entry: Values, is_hidden: Values, is_active: Values) -> tuple[Values, Values, Values]:
+        body = dr.gather(UInt32, fine.items, entry, is_active)
+        s_above_top = Float(s - dr.gather(Float64, casters.body_top, body, is_active))
+        is_below = is_active & (s_above_top <= 0.0)
         local_u, local_v = bodies.locate(body, u, v, is_below)
         start, stop = bodies.list_range(body, local_u, local_v, is_below)
 
-        def test_triangle(m: Values, is_hidden: Values, is_tested: Values) -> tuple[Values, Values, Values]:
-            n = dr.gather(UInt32, bodies.items, m, is_tested)
-            second, third, plane = (
+        def test_triangle(member: Values, is_hidden: Values, is_tested: Values) -> tuple[Values, Values, Values]:
+            first_function = 3 * dr.gather(UInt32, bodies.items, member, is_tested)
+            second, third, plane_s = (
                 function.x + function.y * local_u + function.z * local_v
-                for function in (dr.gather(Array4f, casters.functions, 3 * n + k, is_tested) for k in range(3))
+                for function in (dr.gather(Array4f, casters.functions, first_function + k, is_tested) for k in range(3))
             )
-            is_hidden |= is_tested & (second >= 0.0) & (third >= 0.0) & (second + third <= 1.0) & (plane > below_top)
-            return m + 1, is_hidden, is_tested & ~is_hidden & (m + 1 < stop)
+            is_hidden |= is_tested & is_inside(second, third, 0.0) & (plane_s > s_above_top)
+            return member + 1, is_hidden, is_tested & ~is_hidden & (member + 1 < stop)
 
         _, is_hidden, _ = dr.while_loop(
             (UInt32(start), is_hidden, is_below & (start < stop)),
-            lambda m, is_hidden, is_tested: is_tested,
+            lambda member, is_hidden, is_tested: is_tested,
             test_triangle,
         )
-        return k + 1, is_hidden, is_active & ~is_hidden & (k + 1 < end)
+        return entry + 1, is_hidden, is_active & ~is_hidden & (entry + 1 < end)
 
-    state = (UInt32(first), Bool(False), is_inside & (first < end))
-    return dr.while_loop(state, lambda k, is_hidden, is_active: is_active, test_body)[1]
+    state = (UInt32(first), Bool(False), in_grid & (first < end))
+    return dr.while_loop(state, lambda entry, is_hidden, is_active: is_active, test_body)[1]

@@ -16,7 +16,7 @@ from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.arrays import Values, to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.device import Array3f, Array3f64, Float, UInt32
-from marsyard.sim.render.edges import pixel_angles
+from marsyard.sim.render.pixel_grid import pixel_angles
 from marsyard.sim.render.primary import Rays
 from marsyard.sim.render.scene import Cone
 

@@ -33,8 +33,8 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import Backend, RenderingError
-from marsyard.sim.render.device import Float, Float64, Int32, UInt32, description
-from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
+from marsyard.sim.render.device import UInt32, description
+from marsyard.sim.render.edges import mark_edges
 from marsyard.sim.render.ground import Extent
 from marsyard.sim.render.kernels.views import build_mesh, spans_in_hull
 from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Pose, Rays, Views, trace_primary_rays
@@ -43,6 +43,7 @@ from marsyard.sim.render.scene import Scene
 from marsyard.sim.render.shading import Light, ShadedImage, shade
 from marsyard.sim.render.shadows import Occluders, visible_sun
 from marsyard.sim.render.spline import Terrain
+from marsyard.sim.render.subpixels import split_rays, trace_subpixel_rays
 from marsyard.sim.render.triangles import Hierarchy
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import Level
@@ -65,17 +66,6 @@ _TRIM_THRESHOLD_BYTES = 1 << 30
 _TRIM_INTERVAL_SCENES = 16
 #: Number of rays along each side of an image (probe rays) that determine the visible ground.
 _PROBES = 9
-
-
-def edge_pixels(
-    radiance: Float32[np.ndarray, "rows columns"],
-    distance: Float64Array[np.ndarray, "rows columns"],
-    body: Int32Array[np.ndarray, "rows columns"],
-) -> Int64[np.ndarray, "pixels"]:
-    """Flat indices of the pixels on both sides of visible edges."""
-    rows, columns = radiance.shape
-    layers = (to_device(Float, radiance), to_device(Float64, distance), to_device(Int32, body))
-    return np.flatnonzero(to_host(mark_edges(*layers, UInt32(columns), UInt32(rows))))
 
 
 def supersample_rays(rays: PixelRays, pixels: Int64[np.ndarray, "pixels"], side: int) -> Rays:
@@ -150,7 +140,7 @@ class _Tracer:
     def smooth_edges(self, image: ShadedImage, hits: Hits, radiance: Float32[np.ndarray, "pixels"]) -> None:
         """Replace the radiance of pixels at edges by the mean of several rays."""
         columns, rows = map(UInt32, self.rays.size)
-        pixels = np.flatnonzero(to_host(mark_edges(image.radiance, hits.distance, image.body, columns, rows)))
+        pixels = np.flatnonzero(to_host(mark_edges(image, hits.distance, columns, rows)))
         if len(pixels) > 0:
             rays, subpixel_hits = self.trace_subpixels(pixels, hits)
             subpixel_radiance = to_host(self.shade_hits(rays, subpixel_hits).radiance)

@@ -59,11 +59,15 @@ class Materials:
 
 @dataclass(frozen=True, eq=False)
 class ShadedImage:
-    """Radiance factor, body number (or `GROUND`, `SKY`) and unit normal in world axes of each pixel."""
+    """Radiance factor, body number (or `GROUND`, `SKY`) and unit normal in world axes of each pixel.
+
+    `sun_fraction` is the fraction of the sun's disc that ground and objects leave visible (`shadows.visible_sun`).
+    """
 
     radiance: Values
     body: Values
     normal: Values
+    sun_fraction: Values
 
 
 @dataclass(eq=False)
@@ -116,10 +120,7 @@ def dust_cover(normal_z: Values) -> Values:
 def shade(
     terrain: Terrain, pose: Pose, rays: Rays, hits: Hits, light: Light, sun_fraction: Values, materials: Materials
 ) -> ShadedImage:
-    """Compute radiance factor, body and normal of every pixel.
-
-    `sun_fraction` is the fraction of the sun's disc that ground and objects leave visible (`shadows.visible_sun`).
-    """
+    """Compute radiance factor, body and normal of every pixel; `sun_fraction` is that of `ShadedImage`."""
     points = locate(rays, pose, hits)
     is_object, is_ground = points.is_object, points.is_ground
     ground = _sample_ground(terrain, points, hits.level)
@@ -162,7 +163,8 @@ def shade(
     angles = Angles.of(normal, points.direction, light.sun)
     textures = materials.ground_texture, materials.object_texture
     albedo *= dr.exp(log_relative_albedo(*textures, is_object, points.position, texture_footprint, strength))
-    fraction = sun_fraction
+    # a copy: products in place would change the fraction that is returned
+    fraction = Float(sun_fraction)
     if light.caster_diameter is not None:
         radius = 0.5 * light.caster_diameter / hits.distance
         fraction *= where(
@@ -184,4 +186,4 @@ def shade(
         blocked = light.obstructions.hide_sky(points.position, is_ground, is_object)
     radiance = albedo * light.law.radiance(angles, normal, fraction, blocked)
     radiance = where(~is_surface, lambda: Float(light.sky_radiance(points.direction, rays.pixel_angles)), radiance)
-    return ShadedImage(radiance, body, smooth_normal)
+    return ShadedImage(radiance, body, smooth_normal, sun_fraction)
