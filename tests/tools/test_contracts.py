@@ -48,7 +48,7 @@ def test_no_circular_imports() -> None:
 def test_every_parameter_is_read() -> None:
     """A parameter of the user that no code reads would have no effect. It may be read by a name in a string."""
     names = set()
-    folders = [ROOT / name for name in ("sim", "algorithms", "scenarios", "marsyard")]
+    folders = [ROOT / name for name in ("sim", "algorithms", "scenarios", "campaigns", "reports", "marsyard")]
     for path in (path for folder in folders for path in folder.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_bytes())):
             if isinstance(node, ast.Attribute):
