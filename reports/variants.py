@@ -25,6 +25,7 @@ from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.requirement_cases import compute_margins
 from marsyard.reports.robustness import Outcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
+from marsyard.reports.statistics.clusters import ClusteredCases
 from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
@@ -34,6 +35,8 @@ from marsyard.scenarios.columns import split_unit
 _STEPS = 61
 #: Margin that replaces infinite ones, which cannot be interpolated.
 _LARGE = 1e9
+#: Smallest divisor.
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -107,10 +110,14 @@ def _evaluate(
     if evidence is None or not evidence.with_unfinished.n:
         return None
     member, success = evidence.with_unfinished.member, evidence.with_unfinished.success
-    result = weighted_rates(
-        study.weights[None, member], ~success[member], _groups(frame, member), (verdict.confidence, verdict.confidence)
-    )
+    groups, confidences = _groups(frame, member), _confidences(verdict)
+    result = weighted_rates(study.weights[None, member], ~success[member], groups, confidences)
     estimate, lower, upper = (float(values[0]) for values in (result.estimate, result.lower, result.upper))
+    if groups is not None:  # at least as wide as the bounds of equal weights that hold for any correlation
+        exact = ClusteredCases.of(success[member], groups)
+        equal = weighted_rates(np.ones((1, groups.size)), ~success[member], groups, confidences)
+        upper = min(upper * max(exact.max_failure_rate(1.0 - confidences[1]) / float(equal.upper[0]), 1.0), 1.0)
+        lower *= min(exact.min_failure_rate(1.0 - confidences[0]) / max(float(equal.lower[0]), _TINY), 1.0)
     permitted = 1.0 - verdict.probability
     status = Status.PASS if upper <= permitted else Status.FAIL if lower > permitted else Status.INSUFFICIENT
     if verdict.decide_by == ESTIMATE and status is not Status.PASS:
@@ -119,6 +126,13 @@ def _evaluate(
         variant.name, variant.title, verdict.requirement_id, status, estimate, lower, upper, permitted,
         int(member.sum()), float(result.effective_units[0]),
     )  # fmt: skip
+
+
+def _confidences(verdict: Verdict) -> tuple[float, float]:
+    """Return the confidences of lower and upper bounds of failure rates: those of the verdict if it has bounds."""
+    bounds = verdict.upper_confidence, verdict.bounds_confidence
+    lower, upper = (verdict.confidence if math.isnan(value) else value for value in bounds)
+    return lower, upper
 
 
 def _to_requirement(verdict: Verdict) -> Mapping[str, Any]:
@@ -168,7 +182,7 @@ def _find_step(
     weights = study.weights * ((margins[nearest] < math.inf) | failure)
     result = weighted_rates(
         weights, failure, _groups(study.base, np.ones(len(study.base), dtype=np.bool_)),
-        (verdict.confidence, verdict.confidence),
+        _confidences(verdict),
     )  # fmt: skip
     spread = abs(assumed) or abs(farthest)
     by_rate = verdict.decide_by == ESTIMATE
