@@ -164,6 +164,19 @@ def test_bounds_of_variants_allow_for_shared_terrains_and_repeated_looks() -> No
     assert 0.0 < result.lower <= exact.min_failure_rate(0.03) * 1.001
 
 
+def test_steps_allow_for_shared_terrains() -> None:
+    """Pairs of failures on 100 terrains widen the interval of the change, as they widen the bounds of a verdict."""
+    margins = np.array([np.where(np.arange(300) < failures, -1.0, 1.0) for failures in (4, 40)])
+    verdict = Verdict("OK", "", "ok", math.nan, 0.9, 0.9, "all")
+    crossings = []
+    for terrain in (np.arange(300), np.arange(300) // 3):
+        rows = pd.DataFrame({"case": np.arange(300), "terrain": terrain})
+        crossings.append(_find_step(RobustStudy([], rows, np.ones(300)), verdict, "beta", [1.0, 2.0], margins))
+    single, shared = crossings
+    assert shared.lower < single.lower
+    assert not shared.upper <= single.upper
+
+
 VARIANTS = (
     SystemVariant(name="noisy", title="twice the noise", values={"noise": 0.5}, source="test"),
     SystemVariant(name="weak", title="a lower limit", factors={"beta": 0.3}, source="test"),
