@@ -7,7 +7,7 @@ parameter, the margin of each case is interpolated.
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.requirement_cases import compute_margins
 from marsyard.reports.robustness import Outcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
+from marsyard.reports.statistics.clusters import ClusteredCases
 from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
@@ -32,6 +33,8 @@ from marsyard.scenarios.columns import split_unit
 _STEPS = 61
 #: Margin that replaces infinite ones, which cannot be interpolated.
 _LARGE = 1e9
+#: Smallest divisor.
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
@@ -105,10 +108,11 @@ def _evaluate(
     if evidence is None or not evidence.with_unfinished.n:
         return None
     member, success = evidence.with_unfinished.member, evidence.with_unfinished.success
-    result = weighted_rates(
-        study.weights[None, member], ~success[member], _groups(frame, member), (verdict.confidence, verdict.confidence)
-    )
+    groups, confidences = _groups(frame, member), _confidences(verdict)
+    result = weighted_rates(study.weights[None, member], ~success[member], groups, confidences)
     estimate, lower, upper = (float(values[0]) for values in (result.estimate, result.lower, result.upper))
+    factors = _widen(success[member], groups, confidences)
+    lower, upper = lower * factors[0], min(upper * factors[1], 1.0)
     permitted = 1.0 - verdict.probability
     status = Status.PASS if upper <= permitted else Status.FAIL if lower > permitted else Status.INSUFFICIENT
     if verdict.decide_by == ESTIMATE and status is not Status.PASS:
@@ -117,6 +121,28 @@ def _evaluate(
         variant.name, variant.title, verdict.requirement_id, status, estimate, lower, upper, permitted,
         int(member.sum()), float(result.effective_units[0]),
     )  # fmt: skip
+
+
+def _confidences(verdict: Verdict) -> tuple[float, float]:
+    """Return the confidences of lower and upper bounds of failure rates: those of the verdict if it has bounds."""
+    bounds = verdict.upper_confidence, verdict.bounds_confidence
+    lower, upper = (verdict.confidence if math.isnan(value) else value for value in bounds)
+    return lower, upper
+
+
+def _widen(
+    success: Bool[np.ndarray, " m"], groups: Int[np.ndarray, " m"] | None, confidences: tuple[float, float]
+) -> tuple[float, float]:
+    """Return factors of both bounds, so that they are at least as wide as those that hold for any correlation.
+
+    The factors are those of equal weights; 1 without shared terrains.
+    """
+    if groups is None:
+        return 1.0, 1.0
+    exact = ClusteredCases.of(success, groups)
+    equal = weighted_rates(np.ones((1, groups.size)), ~success, groups, confidences)
+    lower, upper = exact.min_failure_rate(1.0 - confidences[0]), exact.max_failure_rate(1.0 - confidences[1])
+    return min(lower / max(float(equal.lower[0]), _TINY), 1.0), max(upper / float(equal.upper[0]), 1.0)
 
 
 def _to_requirement(verdict: Verdict) -> Mapping[str, Any]:
@@ -164,10 +190,11 @@ def _find_step(
     failure = np.array([np.interp(grid, positions, column) < 0.0 for column in finite.T]).T
     nearest = np.abs(grid[:, None] - positions).argmin(axis=1)
     weights = study.weights * ((margins[nearest] < math.inf) | failure)
-    result = weighted_rates(
-        weights, failure, _groups(study.base, np.ones(len(study.base), dtype=np.bool_)),
-        (verdict.confidence, verdict.confidence),
-    )  # fmt: skip
+    groups, confidences = _groups(study.base, np.ones(len(study.base), dtype=np.bool_)), _confidences(verdict)
+    result = weighted_rates(weights, failure, groups, confidences)
+    # the factors of both ends and of the middle of the range
+    factors = np.array([_widen(~failure[step], groups, confidences) for step in (0, _STEPS // 2, _STEPS - 1)])
+    result = replace(result, lower=result.lower * factors[:, 0].min(), upper=result.upper * factors[:, 1].max())
     spread = abs(assumed) or abs(farthest)
     by_rate = verdict.decide_by == ESTIMATE
     crossing = find_crossing(grid / spread, result, 1.0 - verdict.probability, decides_by_rate=by_rate)

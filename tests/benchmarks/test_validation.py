@@ -32,6 +32,7 @@ REASONS_FOR_WIDE_LIMITS = {
     "false PASS": "the guaranteed error rate",
     "false FAIL": "the guaranteed error rate",
     "rare violations, false": "the guaranteed error rate",
+    "change to FAIL": "the guaranteed accuracy; the standard deviation of the estimate is 2 to 3 %",
     "nights with a false alarm": "the guaranteed rate",
     "refused templates": "the 95 % confidence interval of 1 in 4 templates of flight images",
 }

@@ -26,13 +26,15 @@ from marsyard.campaigns.running.engine import run_campaign
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.sampling.study_points import StudyPoint
 from marsyard.campaigns.store import record
+from marsyard.campaigns.studies.results import RobustVariant
 from marsyard.campaigns.studies.robust import choose_cases, start_robust
 from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.dispersion_changes import Kind
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.robustness import Outcome, reach_text
-from marsyard.reports.variants import RobustStudy, _find_step
+from marsyard.reports.statistics.clusters import ClusteredCases
+from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.terrain import Site
@@ -147,6 +149,32 @@ def test_interval_of_few_cases_covers_the_change() -> None:
     assert np.mean([item.upper >= exact for item in records]) >= 0.9 - 2.5 * 0.021
     assert np.median([item.change for item in records]) == pytest.approx(exact, rel=0.1)
     assert all(math.isnan(item.lower) for item in records)
+
+
+def test_bounds_of_variants_allow_for_shared_terrains_and_repeated_looks() -> None:
+    """Pairs of failures on 100 terrains: the bounds are those of a verdict, at the confidence of its look."""
+    rows = pd.DataFrame({"case": np.arange(300), "outcome": "VALID", "answered": True, "ok": np.arange(300) >= 8})
+    rows["terrain"] = np.arange(300) // 3
+    verdict = Verdict("OK", "", "ok", math.nan, 0.95, 0.9, "all", bounds_confidence=0.95, upper_confidence=0.97)
+    study = RobustStudy([], rows, np.ones(300))
+    result = _evaluate(study, RobustVariant("v", "V", {}), rows, verdict)
+    exact = ClusteredCases.of(rows["ok"].to_numpy(), rows["terrain"].to_numpy())
+    assert result is not None
+    assert result.upper == pytest.approx(exact.max_failure_rate(0.05), rel=1e-3)
+    assert 0.0 < result.lower <= exact.min_failure_rate(0.03) * 1.001
+
+
+def test_steps_allow_for_shared_terrains() -> None:
+    """Pairs of failures on 100 terrains widen the interval of the change, as they widen the bounds of a verdict."""
+    margins = np.array([np.where(np.arange(300) < failures, -1.0, 1.0) for failures in (4, 40)])
+    verdict = Verdict("OK", "", "ok", math.nan, 0.9, 0.9, "all")
+    crossings = []
+    for terrain in (np.arange(300), np.arange(300) // 3):
+        rows = pd.DataFrame({"case": np.arange(300), "terrain": terrain})
+        crossings.append(_find_step(RobustStudy([], rows, np.ones(300)), verdict, "beta", [1.0, 2.0], margins))
+    single, shared = crossings
+    assert shared.lower < single.lower
+    assert not shared.upper <= single.upper
 
 
 VARIANTS = (
