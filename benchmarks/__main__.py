@@ -11,7 +11,19 @@ from importlib.metadata import version
 
 import cv2
 
-from benchmarks import descent, engine, estimators, hda, images, localisation, renderers, reporting, starting, vtt
+from benchmarks import (
+    descent,
+    engine,
+    estimators,
+    hda,
+    images,
+    localisation,
+    project,
+    renderers,
+    reporting,
+    starting,
+    vtt,
+)
 from benchmarks.check import reference_workload
 from benchmarks.page import PAGE, REFERENCE, RESULTS, is_within_limit, scale_value, write_page
 from benchmarks.timing import Measurement, core_seconds
@@ -44,6 +56,7 @@ def main() -> None:
         *engine.measure(),
         *starting.measure(5),
         *reporting.measure(),
+        *project.measure(),
     ]
     reference_ms = next(row.median for row in measurements if row.name == REFERENCE)
     heads = f"{'median':>8}{'min':>8}{'max':>8}{'scaled':>8}"

@@ -119,7 +119,7 @@ def measure(repeats: int = 3) -> list[Measurement]:
         Measurement(
             "engine: speed-up by two workers, rendered cases (ratio)",
             [measure_speed_up() for _ in range(repeats)],
-            minimum=1.85,
+            minimum=1.9,
         ),
         Measurement(
             "dimes-gusev on two workers (cases per wall s)",

@@ -155,4 +155,4 @@ def measure_cases(cases: int) -> Measurement:
         campaign.scenario.run(campaign.parameters(number), campaign.streams(number))
 
     times = [time for number in range(cases) for time in core_seconds(partial(run_case, number), 1)]
-    return Measurement("hda-hazardous case: flight, 2 frames, map, landing, truth", times, limit=0.7)
+    return Measurement("hda-hazardous case: flight, 2 frames, map, landing, truth", times, limit=0.6)

@@ -19,7 +19,7 @@ RESULTS = Path(__file__).parent / "results" / "benchmarks.json"
 #: Name of the measurement of the reference workload, and its time on the machine of the limits, ms.
 REFERENCE, REFERENCE_MS = "reference workload of make bench-check (ms)", 4.2
 #: Units, at the end of a name, of quantities that do not depend on the speed of the machine, and of rates.
-_FIXED_UNITS, _RATE_UNITS = ("GB", "MB", "%", "ratio"), ("cases per wall s",)
+_FIXED_UNITS, _RATE_UNITS = ("GB", "MB", "%", "ratio", "min"), ("cases per wall s",)
 _UNIT = re.compile(r"\(([^()]*)\)$")
 
 
@@ -49,24 +49,29 @@ def write_page(record: Mapping[str, Any]) -> None:
     """Write the page; `record` is the content of `benchmarks.json`."""
     figures = record["figures"]
     reference_ms = figures[REFERENCE]["median"]
-    rows = ["| quantity (core-s unless another unit is given) | limit | median | scaled | |", "|---|---|---|---|---|"]
+    head = "| quantity (core-s unless another unit is given) |"
+    limits = [f"{head} limit | median | scaled | verdict |", "|---|---|---|---|---|"]
+    others = [f"{head} median | scaled |", "|---|---|---|"]
     for name, row in figures.items():
         scaled = scale_value(name, row["median"], reference_ms)
         is_met = is_within_limit(row["limit"], row["median"] if scaled is None else scaled)
-        verdict = {True: "met", False: "**missed**", None: ""}[is_met]
-        scaled_text = "" if scaled is None else f"{scaled:.3g}"
-        rows.append(f"| {name} | {row['limit']} | {row['median']:.3g} | {scaled_text} | {verdict} |")
+        values = f"{row['median']:.3g} | {'' if scaled is None else f'{scaled:.3g}'} |"
+        if is_met is None:
+            others.append(f"| {name} | {values}")
+        else:
+            limits.append(f"| {name} | {row['limit']} | {values} {'met' if is_met else '**missed**'} |")
     machine = record["machine"]
     conditions = f"{record['measured'][:10]}, {machine['cores']} cores of {machine['processor']}, {record['gl']}"
-    values = {
-        "measurements": "\n".join(rows),
+    texts = {
+        "limits": "\n".join(limits),
+        "comparison": "\n".join(others),
         "machine": conditions,
         "reference": f"{REFERENCE_MS:g}",
         "measured reference": f"{reference_ms:.3g}",
         "factor": f"{reference_ms / REFERENCE_MS:.2g}",
     }
     text = TEMPLATE.read_text(encoding="utf-8")
-    for key, value in values.items():
+    for key, value in texts.items():
         text = text.replace(f"{{{key}}}", value)
     PAGE.write_text(text, encoding="utf-8")
 

@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from playwright.sync_api import Page, expect, sync_playwright
@@ -23,6 +24,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 from benchmarks.timing import Measurement
 from marsyard.campaigns.definition.requirements import shipped_requirements
 from marsyard.campaigns.store.record import SCHEMA
+from marsyard.reports.campaign import write_report
 from marsyard.reports.signature import sign_report
 
 #: Number of random columns that are added, so that a row has as many columns (99) as one of `dimes-gusev`.
@@ -43,8 +45,9 @@ class Cost:
 def measure(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Measurement]:
     """Measure reports and dashboards, in core-seconds where possible, because these do not depend on other programs."""
     with TemporaryDirectory() as folder:
-        large, small = (synthetic_campaign(Path(folder, f"of-{count}"), count) for count in (cases, 24))
-        large_cost, small_cost = (run_marsyard("report", str(run)) for run in (large, small))
+        large, medium, small = (synthetic_campaign(Path(folder, f"of-{count}"), count) for count in (cases, 1_000, 24))
+        large_cost, medium_cost, small_cost = (run_marsyard("report", str(run)) for run in (large, medium, small))
+        page_with_images = write_report(_write_campaign_with_images(Path(folder, "loc-light"), 300))
         page = large / "report.html"
         site = _copy_campaigns(Path(folder, "many"), small, campaigns)
         first_cost = run_marsyard("dashboard", str(site.parent / "runs"), "--out", str(site))
@@ -60,7 +63,13 @@ def measure(cases: int = 1_000_000, campaigns: int = 1_000) -> list[Measurement]
             Measurement(
                 f"report of {cases:,} cases: time to open the page and show a tooltip (wall s)", tooltip_s, limit=3.0
             ),
+            Measurement("report of 1,000 cases", [medium_cost.core_s], limit=6.0),
             Measurement("report of 24 cases", [small_cost.core_s], limit=8.0),
+            Measurement(
+                "report of loc-light, 300 cases: size of the HTML page (MB)",
+                [page_with_images.stat().st_size / 1e6],
+                limit=5.0,
+            ),
             Measurement(f"dashboard of {campaigns:,} campaigns", [first_cost.core_s], limit=20.0),
             Measurement(
                 f"dashboard of {campaigns:,} campaigns: second call, no campaign changed", [second_cost.core_s]
@@ -90,6 +99,24 @@ def synthetic_campaign(directory: Path, cases: int, seed: int = 1, site: str = "
     if writer is not None:
         writer.close()
     (directory / "campaign.json").write_text(json.dumps(_make_record(cases, seed, site)), encoding="utf-8")
+    return directory
+
+
+def _write_campaign_with_images(directory: Path, cases: int, rendered: int = 8) -> Path:
+    """Run descents of `loc-light` and store the products of all; add rows with other numbers to a number of cases."""
+    options = ["--set", "retain.products=all", "--jobs", "1", "--out", str(directory)]
+    run_marsyard("run", "loc-light", "-n", str(rendered), *options)
+    rows = pd.read_parquet(directory / "cases.parquet")
+    many = pd.concat([rows] * -(-cases // rendered), ignore_index=True).head(cases)
+    noise = np.random.default_rng(1).normal(1.0, 0.2, (cases, 1))
+    numbers = many.select_dtypes("float64").columns
+    many[numbers] *= noise
+    many["case"] = np.arange(cases)
+    many.to_parquet(directory / "cases.parquet")
+    record = json.loads((directory / "campaign.json").read_text())
+    record |= {"cases": cases, "cases_finished": cases}
+    (directory / "campaign.json").write_text(json.dumps(record), encoding="utf-8")
+    (directory / "cases.sqlite").unlink()
     return directory
 
 

@@ -124,8 +124,8 @@ def measure_runs(repeats: int) -> list[Measurement]:
         return Measurement(name, elapsed_s, limit=limit)
 
     return [
-        measure_run("rover run from 10 m to 2 m with 34 rendered images", values, 1.5),
-        measure_run("the same with rendered visual odometry and terrain maps", navigated, 3.0),
+        measure_run("rover run from 10 m to 2 m with 34 rendered images", values, 1.3),
+        measure_run("the same with rendered visual odometry and terrain maps", navigated, 2.6),
     ]
 
 

@@ -1,5 +1,6 @@
 """Style of the figures of reports: colours, markers, the page's matplotlib style, and SVG in the page's theme."""
 
+import base64
 import functools
 import io
 import re
@@ -10,8 +11,10 @@ from html import escape
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
+import cv2
 import matplotlib as mpl
 import matplotlib.style
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -36,6 +39,10 @@ BARS: Mapping[str, Mapping[str, Any]] = {
 MAX_VECTOR_POINTS = 800
 #: Dots per inch of elements drawn as pixels: twice the resolution of a screen.
 RASTER_DPI = 160
+#: Images that matplotlib writes into an SVG. From this size they are photographs; plots and maps of cells are smaller.
+_EMBEDDED_PNG, _MIN_COMPRESSED_BYTES = re.compile(r"data:image/png;base64,([\w+/=\s]+)"), 64_000
+#: Quality of compressed images (assumed: artefacts are below the noise of the detectors).
+_WEBP_QUALITY = 70
 _STYLE_FILE = Path(__file__).parent / "templates" / "page.mplstyle"
 _STYLE: Any = mpl.rc_params_from_file(_STYLE_FILE, use_default_template=False)
 
@@ -76,7 +83,7 @@ def svg_markup(figure: Figure, key: str, description: str) -> str:
     with _page_style(**{"svg.hashsalt": key, "svg.fonttype": "none"}):
         figure.savefig(buffer, format="svg", dpi=RASTER_DPI, metadata=metadata)
     markup = buffer.getvalue()
-    body = markup[markup.index("<svg") :]
+    body = _EMBEDDED_PNG.sub(_compress_image, markup[markup.index("<svg") :])
     view_box = re.search(r'viewBox="[^"]*"', body)
     content = re.sub(r' id="([^"]*)"', rf' id="{key}-\1"', body[body.index(">") + 1 :])
     content = re.sub(r'(href="|url\()#', rf"\1#{key}-", content)
@@ -87,6 +94,16 @@ def svg_markup(figure: Figure, key: str, description: str) -> str:
         'xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">'
     )
     return head + content.strip()
+
+
+def _compress_image(embedded: re.Match[str]) -> str:
+    """Compress a large image of an SVG, with its transparency, to about a quarter; the run stores the exact image."""
+    png = base64.b64decode(embedded[1])
+    if len(png) < _MIN_COMPRESSED_BYTES:
+        return embedded[0]
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    _, webp = cv2.imencode(".webp", image, [cv2.IMWRITE_WEBP_QUALITY, _WEBP_QUALITY])
+    return f"data:image/webp;base64,{base64.b64encode(webp.tobytes()).decode()}"
 
 
 def hide_frame(axes: Axes) -> None:

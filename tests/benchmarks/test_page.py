@@ -42,6 +42,7 @@ def test_page_shows_scaled_values_and_verdicts(tmp_path: Path, monkeypatch: pyte
         "fast": {"median": 1.0, "limit": "<= 0.6"},
         "slow": {"median": 1.0, "limit": "<= 0.4"},
         "memory (GB)": {"median": 1.0, "limit": "<= 0.6"},
+        "other program": {"median": 3.0, "limit": ""},
     }
     machine = {"cores": 2, "processor": "x86_64"}
     page.write_page({"measured": "2026-11-28T19:15:02", "machine": machine, "gl": "llvmpipe", "figures": figures})
@@ -50,6 +51,16 @@ def test_page_shows_scaled_values_and_verdicts(tmp_path: Path, monkeypatch: pyte
     assert "| slow | <= 0.4 | 1 | 0.5 | **missed** |" in text
     assert "| memory (GB) | <= 0.6 | 1 |  | **missed** |" in text
     assert "run times are about 2 times as long" in text
+    # rows without a limit are in a table of their own
+    limits, comparison = text.split("### For comparison")
+    assert "| other program | 3 | 1.5 |" in comparison
+    assert f"| {REFERENCE} | 8.4 | 4.2 |" in comparison
+    assert all(line.endswith(("| met |", "| **missed** |", "| verdict |", "|---|")) for line in _table(limits))
+
+
+def _table(text: str) -> list[str]:
+    """Return the lines of the last table."""
+    return [line for line in text.split("## Measurements")[1].splitlines() if line.startswith("|")]
 
 
 def test_published_page_is_that_of_the_stored_results(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

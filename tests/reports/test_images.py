@@ -1,10 +1,16 @@
 """Tests of the view of images with marks."""
 
+import base64
+import io
+import re
+
+import cv2
 import numpy as np
 import pytest
 from matplotlib.text import Annotation
 
 from marsyard.reports.images import Mark, Panel, box, draw_images, draw_panels, square
+from marsyard.reports.section import RASTER_DPI, svg_markup
 from tests.reports.drawn_marks import find_boxes
 
 RED = "#ff0000"
@@ -49,3 +55,24 @@ def test_images_are_stretched_between_quantiles(side: int, interpolation: str) -
     # 1 % of the values are black and 1 % white
     np.testing.assert_allclose([(grey == 0).mean(), (grey == 255).mean()], 0.012, atol=0.004)
     assert image.get_interpolation() == interpolation
+
+
+@pytest.mark.parametrize("is_large", [True, False])
+def test_large_images_of_pages_are_compressed(is_large: bool) -> None:
+    rng = np.random.default_rng(3)
+    levels = np.linspace(0.0, 200.0, 512) + rng.normal(0.0, 8.0, (512, 512))
+    side = 512 if is_large else 64
+    figure = draw_panels([[Panel(levels[:side, :side])]], (3.2, 3.2))
+    markup = svg_markup(figure, "key", "image")
+    ((kind, text),) = re.findall(r"data:image/(\w+);base64,([\w+/=\s]+)", markup)
+    assert kind == ("webp" if is_large else "png")
+    data = base64.b64decode(text)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=RASTER_DPI)
+    if is_large:
+        assert len(data) < 0.4 * len(buffer.getvalue())
+        # compression smooths the noise of 8 of 200 levels, and moves no level
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE).astype(np.float64)
+        columns = image[20:-20].mean(axis=0)
+        expected = np.interp(np.linspace(0.0, 1.0, columns.size), np.linspace(0.0, 1.0, 512), levels.mean(axis=0))
+        assert np.corrcoef(columns[20:-20], expected[20:-20])[0, 1] > 0.999

@@ -1,0 +1,212 @@
+"""Tables of results in README and pages, from the stored `report.json` of runs: ``python docs/results.py [RUN...]``.
+
+A run folder is stored as `benchmarks/results/reports/CAMPAIGN.json` (with ``NAME=FOLDER`` under another name), and the
+hash of its rows in `rows.sha256`. The tables are written between two comments:
+
+    <!-- results: CAMPAIGN... -->       verdicts, robust verdicts and evidence; a sentence first names what fails
+    <!-- comparison: CAMPAIGN... -->    all algorithms of each run
+    <!-- end -->
+
+With ``--check`` nothing is written. The exit code is 1 if a page has other tables, if a stored run is of other sources
+than the present ones, or if a sentence that names one stored campaign contains a number that neither its report nor its
+campaign file contains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
+from marsyard.reports.robustness import robustness_text
+from marsyard.reports.verdicts import Status
+from marsyard.reports.wording import NOTHING, label, number, percent
+from marsyard.scenarios.systems import catalogue
+
+ROOT = Path(__file__).parents[1]
+STORED = ROOT / "benchmarks" / "results" / "reports"
+HASHES = "rows.sha256"
+PAGES = ("README.md", "docs/dimes.md", "docs/vtt.md", "docs/hda.md", "docs/localisation.md")
+#: Folders whose sources determine the rows and verdicts of a run.
+SOURCES = ("sim", "algorithms", "scenarios", "campaigns", "reports")
+_BLOCK = re.compile(r"(<!-- (results|comparison): ([a-z0-9 -]+?) -->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_NUMBER = re.compile(r"(?<![\w.,-])\d[\d,]*(?:\.\d+)?(?![\w-])")
+Reports = Mapping[str, CampaignReport]
+
+
+def store_run(name: str, run: Path, folder: Path = STORED) -> None:
+    """Store the report of a run, and the SHA-256 of its rows in the form of `sha256sum`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(run / REPORT_JSON, folder / f"{name}.json")
+    digest = hashlib.sha256((run / "cases.parquet").read_bytes()).hexdigest()
+    path = folder / HASHES
+    lines = path.read_text().splitlines() if path.exists() else []
+    kept = [line for line in lines if not line.endswith(f"  {name}.parquet")]
+    path.write_text("\n".join(sorted([*kept, f"{digest}  {name}.parquet"], key=lambda line: line[66:])) + "\n")
+
+
+def read_stored(folder: Path = STORED) -> dict[str, CampaignReport]:
+    """Read the stored reports by name; raises ValueError for one of another layout."""
+    reports = {path.stem: read_report(path.read_text()) for path in sorted(folder.glob("*.json"))}
+    for name, report in reports.items():
+        if report is None:
+            raise ValueError(f"{name}.json has another layout: run `marsyard report` on its folder, and store it again")
+    return {name: report for name, report in reports.items() if report is not None}
+
+
+def fill_page(text: str, reports: Reports) -> str:
+    """Return a page with the tables of the reports."""
+    make = {"results": format_results, "comparison": format_comparison}
+
+    def fill(match: re.Match[str]) -> str:
+        names = match[3].split()
+        missing = ", ".join(f"`{name}`" for name in names if name not in reports)
+        note = f"No run of the present program is stored of {missing}.\n\n" if missing else ""
+        body = make[match[2]]({name: reports[name] for name in names if name in reports})
+        return f"{match[1]}\n{body}{note}{match[5]}"
+
+    return _BLOCK.sub(fill, text)
+
+
+def format_results(reports: Reports) -> str:
+    """Format the verdicts of campaigns, and first the requirements that failed."""
+    if not reports:
+        return ""
+    failed, rows, reaches = [], [], []
+    for name, report in reports.items():
+        for verdict in report.verdicts:
+            count = f"{verdict.failures} of {verdict.n}"
+            if verdict.status is Status.FAIL:
+                failed.append(f"`{name}` fails {verdict.requirement_id} ({count} cases)")
+            bounds = f"{percent(verdict.lower)} to {percent(verdict.upper)}"
+            evidence = f"{report.evidence.title}, {report.cases:,} cases, {describe_tree(report)}"
+            cells = (f"`{name}`", f"`{report.algorithm_details[0].name}`" if report.algorithm_details else NOTHING)
+            rows.append([*cells, verdict.requirement_id, f"**{verdict.status}**", count, bounds, evidence])
+            reach = robustness_text(verdict, report.robustness)
+            reaches += [f"- `{name}`, {verdict.requirement_id}: {reach}"] if reach else []
+    head = ["campaign", "algorithm", "requirement", "verdict", "failed", "bounds of the success rate", "evidence"]
+    sentence = f"**{'; '.join(failed)}.**" if failed else "No requirement of these runs is FAIL."
+    text = f"{sentence}\n\n{_format_table(head, rows)}\n"
+    robust = "\n".join(reaches)
+    return f"{text}Robust verdicts ([how far a PASS reaches](ROBUST)):\n\n{robust}\n\n" if robust else text
+
+
+def format_comparison(reports: Reports) -> str:
+    """Format all algorithms of the runs: answers, successes, and errors in the unit of the page's metric."""
+    rows = []
+    for name, report in reports.items():
+        for entry in report.sections.get("algorithms", {}).get("algorithms", ()):
+            errors = [NOTHING if entry[key] is None else number(entry[key]) for key in ("median", "p95")]
+            counts = [f"{entry[key]:,}" for key in ("cases", "answered", "succeeded")]
+            tree = f"{report.evidence.title}, {describe_tree(report)}"
+            rows.append([f"`{name}`", f"`{entry['name']}`", *counts, *errors, tree])
+    if not rows:
+        return ""
+    metric = label(next(iter(reports.values())).metric or "")
+    head = ["run", "algorithm", "cases", "answered", "succeeded", f"{metric}: median", "95 % quantile", "evidence"]
+    return _format_table(head, rows) + "\n"
+
+
+def describe_tree(report: CampaignReport) -> str:
+    """Return the commit of a run."""
+    return f"commit {report.git_commit[:8]}" if isinstance(report.git_commit, str) else "unknown commit"
+
+
+def _format_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows)) + "\n"
+
+
+def find_contradictions(text: str, reports: Mapping[str, Any], sources: Mapping[str, str]) -> Iterator[str]:
+    """Yield the sentences that name one stored campaign, with the numbers that are in neither report nor sources.
+
+    A whole number agrees with an equal value of the report; a percentage, and a number with decimals, with a value that
+    rounds to it. Generated tables and code blocks are left out. That a number agrees does not show that it is the right
+    one of the report.
+    """
+    prose = re.sub(r"```.*?```|^ {4}.*?$", "", _BLOCK.sub("", text), flags=re.DOTALL | re.MULTILINE)
+    for sentence in re.split(r"(?<=[.:;])\s+(?=[A-Z`|])", " ".join(prose.split())):
+        names = [name for name in re.findall(r"`([a-z0-9-]+)`", sentence) if name in reports]
+        if len(set(names)) != 1:
+            continue
+        values = [*_leaves(reports[names[0]])]
+        known = {word.replace(",", "") for word in _NUMBER.findall(sources.get(names[0], ""))}
+        unknown = [
+            match[0]
+            for match in _NUMBER.finditer(sentence)
+            if match[0].replace(",", "") not in known
+            and not _agrees(match[0].replace(",", ""), sentence[match.end() :].startswith(" %"), values)
+        ]
+        if unknown:
+            yield f"{', '.join(unknown)} not in the report of {names[0]}: {sentence}"
+
+
+def _agrees(word: str, is_percentage: bool, values: Sequence[float]) -> bool:
+    """Whether a value equals a whole number, or rounds to a percentage or a number with the same decimals."""
+    decimals, scale = -int(Decimal(word).as_tuple().exponent), 100.0 if is_percentage else 1.0
+    tolerance = 0.5000001 * 10.0**-decimals if decimals or is_percentage else 0.0
+    return any(abs(abs(scale * value) - float(word)) <= tolerance for value in values)
+
+
+def _leaves(value: Any) -> Iterator[float]:
+    """Yield the numbers of a JSON value."""
+    if isinstance(value, dict | list):
+        for entry in value.values() if isinstance(value, dict) else value:
+            yield from _leaves(entry)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield float(value)
+
+
+def check(reports: Reports) -> list[str]:
+    """Return the faults of the pages and of the stored runs."""
+    faults = []
+    for name, report in reports.items():
+        command = ["git", "-C", str(ROOT), "diff", "--quiet", str(report.git_commit), "--", *SOURCES]
+        if subprocess.run(command, capture_output=True, check=False).returncode:  # noqa: S603
+            faults.append(f"{name}: its sources ({describe_tree(report)}) are not the present ones: run it again")
+    values = {name: json.loads((STORED / f"{name}.json").read_text()) for name in reports}
+    files = {name: path.read_text() for name, path in catalogue().items()}
+    sources = {name: files.get(report.campaign, "") for name, report in reports.items()}
+    for page in PAGES:
+        text = (ROOT / page).read_text()
+        if write_links(page, fill_page(text, reports)) != text:
+            faults.append(f"{page}: other tables than those of the stored runs: run `python docs/results.py`")
+        faults += [f"{page}: {fault}" for fault in find_contradictions(text, values, sources)]
+    return faults
+
+
+def write_links(page: str, text: str) -> str:
+    """Complete the links of a page."""
+    return text.replace("(ROBUST)", f"({'' if page.startswith('docs/') else 'docs/'}robustness.md)")
+
+
+def main() -> int:
+    """Store runs, and write or check the pages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="*", metavar="[NAME=]RUN", help="folders of runs to store")
+    parser.add_argument("--check", action="store_true", help="report faults, and write nothing")
+    options = parser.parse_args()
+    if options.check:
+        faults = check(read_stored())
+        print("\n".join(faults))
+        return int(bool(faults))
+    for word in options.runs:
+        name, _, folder = word.rpartition("=")
+        run = Path(folder)
+        store_run(name or json.loads((run / REPORT_JSON).read_text())["campaign"], run)
+    for page in PAGES:
+        path = ROOT / page
+        path.write_text(write_links(page, fill_page(path.read_text(), read_stored())))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
