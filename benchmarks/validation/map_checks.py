@@ -36,6 +36,7 @@ _COPY_PX = 800
 MAP_SUN_DEG, LANDING_SUN_DEG, TURN_DEG = (278.0, 40.0), (257.0, 39.7), 120.0
 #: Times of the images after the start at 4.2 km, s: heights of about 4.1, 3.2 and 2.3 km.
 _FIRST_S, _INTERVAL_S, _IMAGES = 0.5, 10.0, 3
+MAP_INTERPOLATION = cv2.INTER_LINEAR
 SUNS = "suns 16 deg apart"
 #: All sites, and the one that resembles the flown one.
 SITES, FLOWN_SITE = ("crater-floor", "dunes", "highland", "plain"), "crater-floor"
@@ -84,7 +85,7 @@ def compare_on_map(site: str, seed: int, turn_deg: float) -> list[MapStatistics]
     product, camera = descent.measurements.map_product, true_camera(parameters.camera)
     side = round(len(product.appearance) * product.pixel_m / PIXEL_M)
     # row 0 of the map product is in the south
-    mapped = cv2.resize(product.appearance[::-1], (side, side), interpolation=cv2.INTER_AREA).astype(np.float64)
+    mapped = cv2.resize(product.appearance[::-1], (side, side), interpolation=MAP_INTERPOLATION).astype(np.float64)
     rows = []
     for image, state in zip(descent.images, descent.image_states, strict=True):
         x, y, z = state.position_m.tolist()
