@@ -27,6 +27,7 @@ CENTRE = np.array([700.0, 1150.0])
 EXACT = MapParameters(
     side_px=SIDE_PX,
     signal_to_noise=1e12,
+    aperture_px=1.0,
     nyquist_mtf=1.0,
     bits=None,
     registration_sd_m=0.0,
