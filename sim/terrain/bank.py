@@ -54,13 +54,15 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     albedo = FractalField.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
     contrast = p.albedo_contrast * float(np.exp(p.contrast_spread * substream(rng, "contrast").standard_normal()))
     craters = draw_craters(p, substream(rng, "craters"))
+    # equal random modes: hollows are dark, and crests bright, at all scales
+    albedo_rng = substream(rng, "relief" if p.albedo_follows_relief else "albedo")
     if p.units is None:
         height = relief.draw_field(substream(rng, "relief"), relief_m)
-        log_albedo = albedo.draw_field(substream(rng, "albedo"), contrast)
+        log_albedo = albedo.draw_field(albedo_rng, contrast)
         fine = ground = TerrainGround(height, log_albedo, p.spacing_m)
     else:
         height, fine_relief = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
-        log_albedo, fine_albedo = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
+        log_albedo, fine_albedo = albedo.draw_split_field(albedo_rng, contrast, p.fine_below_m)
         ground = TerrainGround(height, log_albedo, p.spacing_m)
         fine = TerrainGround(fine_relief, fine_albedo, p.spacing_m)
     dtm = None
