@@ -208,6 +208,15 @@ def test_posts_smooth_the_elevation(world: LocalisationWorld) -> None:
     np.testing.assert_allclose(displacement, 0.0, atol=0.05)
 
 
+def test_map_resolves_what_its_aperture_averages(world: LocalisationWorld) -> None:
+    """A smaller aperture resolves finer relief and texture: more contrast between neighbouring pixels."""
+    contrasts = []
+    for aperture_px in (1.0, 0.3):
+        appearance = _make_map(world, aperture_px=aperture_px)[0].appearance
+        contrasts.append(float(np.diff(appearance, axis=1).std() / appearance.mean()))
+    assert contrasts[1] > 1.05 * contrasts[0]
+
+
 def test_blur_has_the_transfer_at_the_nyquist_frequency() -> None:
     stripes = np.tile(np.array([1.0, -1.0], dtype=np.float32), (32, 16))
     # tolerance: truncation of the sampled kernel, whose transfer includes aliases (largest at the Nyquist frequency)
