@@ -84,7 +84,9 @@ class MapParameters(Parameters):
     nyquist_mtf: Annotated[
         float,
         bounded_field(
-            0.01, 1.0, "MTF of optics, motion and processing, without the aperture, at one cycle per two pixels; assumed"
+            0.01,
+            1.0,
+            "MTF of optics, motion and processing, without the aperture, at one cycle per two pixels; assumed",
         ),
     ] = 0.33
     bits: Annotated[int | None, Field(ge=6, le=16, description="bits of a pixel; None: not quantised")] = 8

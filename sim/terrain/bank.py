@@ -14,9 +14,9 @@ from jaxtyping import Float32
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
+from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream
 from marsyard.sim.terrain.landforms.kernels.shapes import interleave_samples
-from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
@@ -102,10 +102,7 @@ def _add_fine_ground(
     if relief_log_albedo:
         log_albedo = ground.log_albedo
         log_albedo += np.float32(relief_log_albedo / fine.height.std(dtype=np.float64)) * fine.height
-    for total, part, factor in (
-        (ground.height, fine.height, ROUGHNESS),
-        (ground.log_albedo, fine.log_albedo, TEXTURE),
-    ):
+    for total, part, factor in ((ground.height, fine.height, ROUGHNESS), (ground.log_albedo, fine.log_albedo, TEXTURE)):
         total += part * refine(np.ascontiguousarray(factors[..., factor]), ground.side)
 
 

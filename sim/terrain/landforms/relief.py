@@ -14,13 +14,7 @@ from pydantic import Field
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, refine, resample
 from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
-from marsyard.sim.terrain.landforms.kernels.shapes import (
-    Bedforms,
-    add_dunes,
-    cut_channels,
-    raise_cones,
-    stamp_lobes,
-)
+from marsyard.sim.terrain.landforms.kernels.shapes import Bedforms, add_dunes, cut_channels, raise_cones, stamp_lobes
 
 SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.

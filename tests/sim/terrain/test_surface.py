@@ -8,8 +8,6 @@ from scipy.ndimage import map_coordinates
 
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
-from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels.shapes import EJECTA_OPACITY, stamp_craters
 from marsyard.sim.terrain.landforms.craters import (
     DEGRADED_DEPTH,
     FRESH_DEPTH,
@@ -19,6 +17,8 @@ from marsyard.sim.terrain.landforms.craters import (
     draw_craters,
     outline_tables,
 )
+from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
+from marsyard.sim.terrain.landforms.kernels.shapes import EJECTA_OPACITY, stamp_craters
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +42,7 @@ def test_height_matches_scipy_spline(surface: Surface, positions: tuple[np.ndarr
         control = surface.levels[level][..., channel].astype(np.float64)
         expected = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
         assert_allclose(actual, expected, atol=1e-12)
+
 
 #: Tables of a round outline without rays.
 ROUND = (np.zeros((1, 4)), np.zeros((1, 4)))
