@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from matplotlib.text import Annotation
 
+from marsyard.reports.figure_style import RASTER_DPI, svg_markup
 from marsyard.reports.images import Mark, Panel, box, draw_images, draw_panels, square
-from marsyard.reports.section import RASTER_DPI, svg_markup
 from tests.reports.drawn_marks import find_boxes
 
 RED = "#ff0000"
