@@ -17,7 +17,7 @@ DESCENT_STAGES: Stages = {
     "flight": (("descent/flight.py", "create_flight"),),
     "mesh and OpenGL": (("render/renderer.py", "_draw_views"),),
     "ray intersection": (("render/renderer.py", "trace_pixels"),),
-    "shadow of the ground": (("render/scene.py", "ground_shadow"),),
+    "shadow of the ground": (("render/ground_shadow.py", "compute_ground_shadow"),),
     "shading": (("render/renderer.py", "shade_hits"),),
     "rays in edge pixels": (("render/renderer.py", "trace_subpixels"),),
     "detector": (("sensor/detector.py", "draw"), ("sensor/detector.py", "expose"), ("sensor/optics.py", "from_camera")),

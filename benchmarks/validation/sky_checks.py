@@ -1,4 +1,4 @@
-"""Check of the sky that a rover and rocks hide from the ground, against ray casting of their triangles."""
+"""Checks of the sky that a rover, rocks and relief hide from the ground, by casting rays."""
 
 from __future__ import annotations
 
@@ -19,13 +19,17 @@ from marsyard.sim.render.arrays import to_host, vectors_to_device
 from marsyard.sim.render.device import Array3f64, Bool
 from marsyard.sim.render.rover import rover_objects
 from marsyard.sim.sensor.mast import MER_MAST
-from marsyard.sim.terrain import RockField, RockParameters, Surface
+from marsyard.sim.terrain import RockField, RockParameters, Surface, TerrainParameters, sites, synthesise
 
 #: Maximum RMS differences of the hidden fraction of the sky: wheels, legs, mast and arm are not part of a rover's
 #: shelter, and rocks are no half spheroids. About twice the measured values.
 LIMITS = {"a rover": 0.1, "rocks": 0.06}
 #: Side of the level ground, metres, and half width of the compared area around its middle.
 SIDE_M, HALF_WIDTH_M = 64, 1.5
+#: Sites whose relief hides a part of the sky.
+SITES = ("gusev", "meridiani", "heli-hazardous")
+#: Maximum distance of the relief that hides the sky, metres, and seed of the terrains.
+HORIZON_M, FIRST_SEED = 30.0, 3920
 
 
 def _draw_directions(log2_count: int) -> Float64[np.ndarray, "n 3"]:
@@ -71,4 +75,40 @@ def compare_hidden_sky(quick: bool) -> Iterator[Measure]:
         yield Measure(claim, float(np.sqrt(np.mean(difference**2))), "", LIMITS[name], how)
 
 
-CHECKS = (Check("sky", "Light", compare_hidden_sky, conditions=(Conditions("*", (*MAST, *LANDING)),)),)
+def measure_horizons(terrain: TerrainParameters, points: int) -> Float64[np.ndarray, "points"]:
+    """Compute the fraction of the irradiance of a uniform sky that relief hides from random points of a terrain.
+
+    Without relief a point sees the sky above its tangent plane. The horizon is the maximum elevation of the terrain up
+    to `HORIZON_M` in 32 azimuths; the irradiance below an elevation h is in proportion to sin(h)**2.
+    """
+    surface, rng = synthesise(terrain, np.random.default_rng(FIRST_SEED)), np.random.default_rng(8)
+    x, y = rng.uniform(0.0, terrain.samples * terrain.spacing_m, (2, points))
+    z, step, hidden = surface.height(x, y), terrain.spacing_m, np.zeros(points)
+    azimuths = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
+    for east, north in zip(np.cos(azimuths), np.sin(azimuths), strict=True):
+        slopes = [(surface.height(x + r * east, y + r * north) - z) / r for r in np.geomspace(step, HORIZON_M, 60)]
+        ahead, behind = (surface.height(x + s * step * east, y + s * step * north) for s in (1.0, -1.0))
+        tangent = np.maximum((ahead - behind) / (2.0 * step), 0.0)
+        horizon, plane = (np.arctan(slope) for slope in (np.maximum(np.max(slopes, axis=0), tangent), tangent))
+        hidden += (np.sin(horizon) ** 2 - np.sin(plane) ** 2) / len(azimuths)
+    return hidden
+
+
+def report_horizons(quick: bool) -> Iterator[Measure]:
+    """Report the light of the sky that relief hides from the ground, which images do not contain."""
+    points = 500 if quick else 4000
+    for name in SITES:
+        hidden = measure_horizons(sites()[name].terrain("ground"), points)
+        how = f"{points} points, horizons up to {HORIZON_M:g} m; 95 % have less than {np.quantile(hidden, 0.95):.1%}"
+        yield Measure(f"light of the sky that relief hides, ground of {name}", float(hidden.mean()), "", None, how)
+
+
+CHECKS = (
+    Check("sky", "Light", compare_hidden_sky, conditions=(Conditions("*", (*MAST, *LANDING)),)),
+    Check(
+        "sky-relief",
+        "Light",
+        report_horizons,
+        conditions=tuple(Conditions(f"*{name}", (*MAST, *LANDING), site=(name,)) for name in SITES),
+    ),
+)

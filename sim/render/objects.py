@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32, Int64
 
 from marsyard.sim.render.arrays import Values, vectors_to_device
+from marsyard.sim.render.cones import spheres_in_cone
 from marsyard.sim.render.device import Array3f64
 from marsyard.sim.render.triangles import Hierarchy, body_bounds, bounding_spheres, morton_codes
 
@@ -206,20 +207,6 @@ class Objects:
     @cached_property
     def _morton_order(self) -> Int64[np.ndarray, "triangles"]:
         return np.argsort(morton_codes(self.triangles), kind="stable")
-
-
-def spheres_in_cone(
-    spheres: Float64[np.ndarray, "bodies 4"],
-    apex: Float64[np.ndarray, "3"],
-    axis: Float64[np.ndarray, "3"],
-    half_angle_rad: float,
-) -> Bool[np.ndarray, "bodies"]:
-    """Select the spheres that intersect a cone."""
-    offset, radius = spheres[:, :3] - apex, spheres[:, 3]
-    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-9)
-    off_axis = np.arccos(np.clip(offset @ axis / distance, -1.0, 1.0))
-    angular_radius = np.where(distance <= radius, np.pi, np.arcsin(np.clip(radius / distance, 0.0, 1.0)))
-    return np.asarray(off_axis <= half_angle_rad + angular_radius)
 
 
 def may_cast_shadow(

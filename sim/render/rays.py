@@ -15,10 +15,10 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.arrays import Values, to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
+from marsyard.sim.render.cones import Cone
 from marsyard.sim.render.device import Array3f, Array3f64, Float, UInt32
 from marsyard.sim.render.pixel_grid import pixel_angles
 from marsyard.sim.render.primary import Rays
-from marsyard.sim.render.scene import Cone
 
 #: Sizes of the pinhole views, samples along a side. A camera uses the smallest view that is at least `_SPARE_PX` larger
 #: than its image (or than the quarter of its image that the view covers), otherwise the largest view. For 1024 x 1024

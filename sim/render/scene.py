@@ -1,4 +1,4 @@
-"""Scene for the renderer: ground, objects and light, with the ground's shadow and bounds of the objects' shadows."""
+"""Scene for the renderer: ground, objects and light, with cached results that images of it share."""
 
 from __future__ import annotations
 
@@ -8,48 +8,36 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool as BoolArray
 from jaxtyping import Float64 as FloatArray
 from scipy.ndimage import binary_dilation
 from scipy.optimize import brentq
 
 from marsyard.sim.render.arrays import to_device, vectors_to_device
 from marsyard.sim.render.casters import Casters, list_casters
-from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.cones import Bounds, Cone, Spheres, ground_in_cones, potentially_visible, spheres_in_cone
+from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32
 from marsyard.sim.render.ground import Extent
-from marsyard.sim.render.kernels.sweep import height_range, heights_in_rows, max_rises, sweep_shadow
-from marsyard.sim.render.objects import Objects, spheres_in_cone
+from marsyard.sim.render.ground_shadow import compute_ground_shadow, is_sun_above_slopes, slope_bounds
+from marsyard.sim.render.kernels.sweep import height_range
+from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.pebbles import PebbleField
 from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture
 from marsyard.sim.render.shading import Light, Materials
 from marsyard.sim.render.shadows import ObjectSurfaces, Occluders
 from marsyard.sim.render.skylight import MOUND_RANGE, Mounds, Obstructions, Shelter
 from marsyard.sim.render.spline import Terrain
-from marsyard.sim.render.sunlight import Footprint, Grid, GroundShadow
+from marsyard.sim.render.sunlight import Footprint, GroundShadow
 from marsyard.sim.render.texture import MicroRelief, RoughGround
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.sites import SitePebbles
-from marsyard.sim.terrain.surface import UNIFORM, empty_aligned
+from marsyard.sim.terrain.surface import UNIFORM
 
 #: Rounding error of a mean of heights of a few km in single precision, metres.
 ROUNDING_M = 0.01
 NO_TEXTURE = Texture()
 NO_RELIEF = MicroRelief(1.0, np.empty(0), UNIFORM, 0.0)
-#: Cone: apex in world axes, unit vector along the axis, and half angle in radians.
-Cone = tuple[FloatArray[np.ndarray, "3"], FloatArray[np.ndarray, "3"], float]
-#: Centre and radius of a bounding sphere of each body, metres.
-Spheres = FloatArray[np.ndarray, "bodies 4"]
 #: Maximum number of cells along a side of a shadow footprint (`shadow_footprint`).
 MAX_CELLS = 512
-#: Minimum and maximum x, then y, metres.
-Bounds = tuple[float, float, float, float]
-#: Maximum number of samples along a side of the grid on which the ground's shadow is computed.
-SHADOW_SIDE = 4096
-#: Number of directions along the rim of a cone whose convex hull bounds the ground in the cone, and the fraction by
-#: which the hull is enlarged.
-_RIM_DIRECTIONS, _MARGIN = 64, 0.01
-#: Additional samples at each border of a grid that covers only the visible ground, for interpolation and rounding.
-_BORDER_SAMPLES = 4
 
 
 @dataclass(frozen=True)
@@ -196,7 +184,7 @@ class Scene:
         """Shadow of the ground; None if all ground is lit, or the sun is not up."""
         if not self.ground_shadows or self.sun.direction[2] <= 0.0 or is_sun_above_slopes(self.sun, self.max_slopes):
             return None
-        return ground_shadow(self.surface, self.sun, self.height_range_m, self.visible_m)
+        return compute_ground_shadow(self.surface, self.sun, self.height_range_m, self.visible_m)
 
     @cached_property
     def footprint(self) -> Footprint | None:
@@ -317,109 +305,3 @@ def casters_towards(objects: Objects, sun: Sun) -> Casters | None:
     # the kernel's rays are exactly parallel to the third axis
     axes = np.stack([first_axis, np.cross(direction, first_axis), direction])
     return list_casters(objects.corners, objects.first_triangle, axes)
-
-
-def potentially_visible(
-    spheres: Spheres, sun: FloatArray[np.ndarray, "3"], min_height_m: float, cone: Cone
-) -> BoolArray[np.ndarray, "bodies"]:
-    """Select the bodies that are visible in a cone, or that may cast a visible shadow.
-
-    The shadow of a body is inside a cylinder with the body's radius, from its centre away from the sun to the lowest
-    ground. A sphere that contains the body and this cylinder is tested against the cone. There are no shadows if the
-    sun is not above the horizon.
-    """
-    tops = np.maximum(spheres[:, 2] + spheres[:, 3] - min_height_m, 0.0)
-    half_lengths = 0.5 * tops / sun[2] if sun[2] > 0.0 else np.zeros(len(spheres))
-    enclosing = np.column_stack([spheres[:, :3] - half_lengths[:, None] * sun, spheres[:, 3] + half_lengths])
-    return spheres_in_cone(enclosing, *cone)
-
-
-def slope_bounds(surface: Surface, sun: Sun) -> tuple[float, float]:
-    """Compute upper bounds of the slope along x and y; infinite if ground may hide part of the sun."""
-    east, north, _ = np.abs(sun.direction)
-    rises = max_rises(surface.levels[0], _lower_edge_rise(sun) * surface.spacing_m, float(east), float(north))
-    return rises[0] / surface.spacing_m, rises[1] / surface.spacing_m
-
-
-def is_sun_above_slopes(sun: Sun, max_slopes: tuple[float, float]) -> bool:
-    """Return whether the whole disc of the sun is visible from all ground with at most these slopes along x and y.
-
-    No line between two points of the ground is then as steep as the rays to the lower edge of the disc.
-    """
-    east, north, _ = np.abs(sun.direction)
-    return bool(max_slopes[0] * east + max_slopes[1] * north < _lower_edge_rise(sun))
-
-
-def _lower_edge_rise(sun: Sun) -> float:
-    """Rise of a ray to the lower edge of the sun's disc, per unit length of the ray to its centre."""
-    horizontal = float(np.hypot(sun.direction[0], sun.direction[1]))
-    elevation = np.arctan2(sun.direction[2], horizontal) - sun.angular_radius_rad
-    return horizontal * float(np.tan(max(elevation, 0.0)))
-
-
-def ground_shadow(
-    surface: Surface, sun: Sun, height_range_m: tuple[float, float], visible_m: Bounds | None = None
-) -> GroundShadow | None:
-    """Compute the shadow of the ground by a sweep along the axis nearest to the sun's azimuth; the sun must be up.
-
-    `visible_m` contains minimum and maximum x, then y, of the ground whose shadow is needed; None for all ground. The
-    grid of the shadow is that of a terrain level. If it covers a part of the ground only, its period is shorter.
-    Returns None for a sun in the zenith.
-    """
-    level = int(np.argmax([samples.shape[0] <= SHADOW_SIDE for samples in surface.levels]))
-    field, spacing = surface.levels[level], surface.spacing_m * 2.0**level
-    east, north, up = (float(component) for component in sun.direction)
-    along_x = abs(east) > abs(north)
-    along, across = (east, north) if along_x else (north, east)
-    if along == 0.0:
-        return None
-    # from one row to the next towards the sun, a ray rises by `drop` metres and moves by `shift` columns
-    drop, shift = spacing * up / abs(along), across / abs(along)
-    rows = columns = np.arange(len(field))
-    max_rows = int(min(np.ceil((height_range_m[1] - height_range_m[0]) / drop) + 1, len(field)))
-    if visible_m is not None:
-        # rows of the longest path towards the sun, as many rows for shadows that fall on its end, and 10 % of both
-        path_rows = 2.2 * max_rows + _BORDER_SAMPLES
-        path = spacing * path_rows * np.array([np.sign(along), shift] if along_x else [shift, np.sign(along)])
-        bounds = np.reshape(visible_m, (2, 2)) + np.stack([np.minimum(path, 0.0), np.maximum(path, 0.0)], axis=1)
-        first = np.floor(bounds[:, 0] / spacing).astype(int) - _BORDER_SAMPLES
-        last = np.ceil(bounds[:, 1] / spacing).astype(int) + _BORDER_SAMPLES
-        # the period of the grid is a power of two: sample k is entry k modulo the period
-        count = 1 << int((last - first).max()).bit_length()
-        if count < len(field):
-            entries = np.arange(count)
-            columns, rows = ((start + ((entries - start) & (count - 1))) & (len(field) - 1) for start in first)
-    height = heights_in_rows(field, rows, columns, along_x)
-    shadow_height, caster_distance = (empty_aligned(height.shape, kind) for kind in (np.float32, np.uint8))
-    sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows, shadow_height, caster_distance)
-    return GroundShadow(
-        Grid.of(shadow_height, 1.0 / spacing, share=True),
-        Grid.of(caster_distance, 1.0 / spacing, share=True),
-        along_x,
-        Float64(spacing),
-        UInt32(level),
-        Float64(spacing / abs(along)),
-        Float64(np.hypot(east, north)),
-        Float64(height_range_m[1]),
-    )
-
-
-def ground_in_cones(cones: Sequence[Cone], min_height_m: float) -> Bounds | None:
-    """Return the x and y bounds of all points in the cones at or above `min_height_m`; None if they are unbounded."""
-    azimuths = np.linspace(0.0, 2.0 * np.pi, _RIM_DIRECTIONS, endpoint=False)
-    points = []
-    for apex, axis, half_angle_rad in cones:
-        first_axis = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-        first_axis /= np.linalg.norm(first_axis)
-        second_axis = np.cross(axis, first_axis)
-        perpendicular = np.cos(azimuths)[:, None] * first_axis + np.sin(azimuths)[:, None] * second_axis
-        rim = np.cos(half_angle_rad) * axis + np.sin(half_angle_rad) * perpendicular
-        if half_angle_rad >= 0.5 * np.pi or np.any(rim[:, 2] >= -1e-6):
-            return None
-        ends = apex + ((min_height_m - apex[2]) / rim[:, 2])[:, None] * rim
-        points.append(np.vstack([apex, ends])[:, :2])
-    hull = np.concatenate(points)
-    low, high = hull.min(axis=0), hull.max(axis=0)
-    margin = _MARGIN * (high - low)
-    (west, south), (east, north) = low - margin, high + margin
-    return float(west), float(east), float(south), float(north)

@@ -13,9 +13,11 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import compiled, to_host, vectors_to_device
 from marsyard.sim.render.casters import Casters, are_occluded
+from marsyard.sim.render.cones import ground_in_cones
 from marsyard.sim.render.device import Array3f64, Bool
+from marsyard.sim.render.ground_shadow import compute_ground_shadow, is_sun_above_slopes, slope_bounds
 from marsyard.sim.render.kernels.sweep import height_range
-from marsyard.sim.render.scene import casters_towards, ground_in_cones, ground_shadow, is_sun_above_slopes, slope_bounds
+from marsyard.sim.render.scene import casters_towards
 from marsyard.sim.render.sunlight import GroundShadow
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
@@ -189,7 +191,10 @@ def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
     heights = height_range(terrain.levels[0])
     area_m = (-40.0, 60.0, 700.0, 760.0)
-    full_shadow, area_shadow = (ground_shadow(terrain, sun, heights), ground_shadow(terrain, sun, heights, area_m))
+    full_shadow, area_shadow = (
+        compute_ground_shadow(terrain, sun, heights),
+        compute_ground_shadow(terrain, sun, heights, area_m),
+    )
     assert full_shadow is not None
     assert area_shadow is not None
     full_grid, area_grid = (_grid_values(shadow) for shadow in (full_shadow, area_shadow))
@@ -230,7 +235,7 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     # Below this elevation the ground may hide part of the sun; the bounds are infinite.
     assert slope_bounds(terrain, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow; the tolerance covers rounding.
-    shadow = ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
+    shadow = compute_ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
     assert shadow is not None
     heights = terrain.levels[to_host(shadow.level)[0]][..., 0]
     assert np.all(_grid_values(shadow) < (heights.T if shadow.along_x else heights) + 1e-3)
