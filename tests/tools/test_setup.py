@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.reports.statistics.proportions import minimum_sample_size
+
 ROOT = Path(__file__).resolve().parents[2]
 #: All shell scripts of the repository.
 SCRIPTS = sorted([*(ROOT / "tools").glob("*.sh"), ROOT / ".ci" / "run"])
@@ -141,6 +144,15 @@ def test_demo_succeeds_if_the_campaign_was_run(checkout: Path, status: int, expe
         assert (checkout / last_line.split()[-1]).is_file()
     else:
         assert f"exit code {status}" in result.stderr
+
+
+def test_demo_has_enough_cases_to_decide_a_requirement() -> None:
+    text = next(script for script in SCRIPTS if script.name == "demo.sh").read_text()
+    (cases,) = map(int, re.findall(r'-n "\$\{CASES:-(\d+)\}"', text))
+    requirements = load_campaign("dimes-smoke").definition.requirements
+    needed = {entry.id: minimum_sample_size(entry.probability, entry.confidence, 0) for entry in requirements}
+    # 45 cases without a failure show a rate of 95 % at 90 % confidence: 0.95^45 < 0.1
+    assert needed["DIMES-AVAIL"] == 45 <= cases < needed["DIMES-VEL"]
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
