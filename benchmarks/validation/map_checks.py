@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float64
 
-from benchmarks.validation.flight_checks import copy_image
+from benchmarks.validation.flight_checks import FIRST_SEED, copy_image
 from benchmarks.validation.image_statistics import MapStatistics, compute_map_statistics
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.validation_rows import Conditions
@@ -36,8 +36,6 @@ _COPY_PX = 800
 MAP_SUN_DEG, LANDING_SUN_DEG, TURN_DEG = (278.0, 40.0), (257.0, 39.7), 120.0
 #: Times of the images after the start at 4.2 km, s: heights of about 4.1, 3.2 and 2.3 km.
 _FIRST_S, _INTERVAL_S, _IMAGES = 0.5, 10.0, 3
-#: First seed of terrains and images, which was not used in development.
-FIRST_SEED = 1100
 SUNS = "suns 16 deg apart"
 #: All sites, and the one that resembles the flown one.
 SITES, FLOWN_SITE = ("crater-floor", "dunes", "highland", "plain"), "crater-floor"
