@@ -19,7 +19,7 @@ from marsyard.reports.section import SvgFigure, svg_figure
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import NOTHING
 
-#: Number of selected cases of each group (largest errors, no answer, random); a case has up to half a megabyte of images.
+#: Number of selected cases of each group (largest errors, no answer, random); a case has at most 0.5 MB of images.
 CASES_PER_GROUP = 2
 #: Maximum number of violations that the gallery shows.
 MAX_SHOWN_VIOLATIONS = 6

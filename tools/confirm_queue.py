@@ -4,7 +4,7 @@ A line of the list contains a campaign, its number of cases and of worker proces
 of confirmations is committed after each campaign. A repeated call skips complete campaigns, resumes interrupted ones,
 and repeats those without a folder with the seeds of their entry in the record. All campaigns run on one source tree:
 the program stops if tracked files have changes, or if the log (``queue.log``) was begun on another tree. Exit code: 0
-if all campaigns are complete, whatever their verdicts; 1 if one is not; 2 for invalid input.
+if all campaigns are complete, for any verdict; 1 if one is not; 2 for invalid input.
 """
 
 from __future__ import annotations
