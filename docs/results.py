@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -87,11 +88,12 @@ def format_results(reports: Reports) -> str:
             count = f"{verdict.failures} of {verdict.n}"
             if verdict.status is Status.FAIL:
                 failed.append(f"`{name}` fails {verdict.requirement_id} ({count} cases)")
-            bounds = f"{percent(verdict.lower)} to {percent(verdict.upper)}"
+            has_bounds = not math.isnan(verdict.lower)
+            bounds = f"{percent(verdict.lower)} to {percent(verdict.upper)}" if has_bounds else NOTHING
             evidence = f"{report.evidence.title}, {report.cases:,} cases, {describe_tree(report)}"
             cells = (f"`{name}`", f"`{report.algorithm_details[0].name}`" if report.algorithm_details else NOTHING)
             rows.append([*cells, verdict.requirement_id, f"**{verdict.status}**", count, bounds, evidence])
-            reach = robustness_text(verdict, report.robustness)
+            reach = robustness_text(verdict, report.robustness) if verdict.status.is_met else ""
             reaches += [f"- `{name}`, {verdict.requirement_id}: {reach}"] if reach else []
     head = ["campaign", "algorithm", "requirement", "verdict", "failed", "bounds of the success rate", "evidence"]
     sentence = f"**{'; '.join(failed)}.**" if failed else "No requirement of these runs is FAIL."

@@ -24,4 +24,4 @@ def watch() -> RecordingWatch:
 def failing_campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run `FAILING_CASES` and return the campaign folder. Tests must not change the folder."""
     folder = tmp_path_factory.mktemp("campaign")
-    return run(write_campaign(folder, FAILING_CASES), folder / "failing_campaign", RecordingWatch())
+    return run(write_campaign(folder, FAILING_CASES), folder / "failing_campaign", RecordingWatch(), jobs=2)

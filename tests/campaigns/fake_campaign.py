@@ -77,7 +77,7 @@ class RecordingWatch:
         self.notes.append(text)
 
 
-def run(path: Path, directory: Path, watch: RecordingWatch, *overrides: str, jobs: int = 2) -> Path:
+def run(path: Path, directory: Path, watch: RecordingWatch, *overrides: str, jobs: int = 1) -> Path:
     """Run a campaign file with overrides of its keys; return the campaign folder."""
     run_campaign(load_campaign(str(path), overrides), directory, ExecutorConfig(jobs), watch)
     return directory

@@ -19,7 +19,6 @@ from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.cache import CacheWarning
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain.bank import IMPORTED_TERRAIN
 
 
 class Wind(BaseModel):
@@ -124,6 +123,9 @@ class FakeScenario:
 
     def terrain_identities(self, parameters: FakeParameters, case: int) -> tuple[str, ...]:
         if parameters.is_imported:
+            # not at the top: each of hundreds of worker processes would import the terrain models
+            from marsyard.sim.terrain.bank import IMPORTED_TERRAIN
+
             return (f"{IMPORTED_TERRAIN} file",)
         return (f"{parameters.bank_seed} {parameters.terrain}",)
 

@@ -7,7 +7,7 @@ import pytest
 
 from docs import results
 from marsyard.reports.campaign import write_report
-from tests.reports.synthetic_run import make_rows, write_run
+from tests.reports.synthetic_run import VELOCITY, make_rows, write_run
 
 PAGE = """# Page
 
@@ -28,7 +28,11 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frame["velocity_error_m_s"] = [1.0] * 28 + [9.0] * 11 + [float("nan")]
     frame["answered"] = [True] * 39 + [False]
     other = frame.rename(columns=lambda name: f"other.{name}")[["other.outcome", "other.answered"]]
-    run = write_run(folder / "run", frame.assign(**other, **{"other.velocity_error_m_s": [2.0] * 39 + [float("nan")]}))
+    loose = {**VELOCITY, "id": "LOOSE", "bound": 20.0, "probability": 0.8}
+    requirements = (VELOCITY, loose)
+    run = write_run(
+        folder / "run", frame.assign(**other, **{"other.velocity_error_m_s": [2.0] * 39 + [float("nan")]}), requirements
+    )
     write_report(run)
     results.store_run("dimes-a", run, folder / "stored")
     results.store_run("dimes-a", run, folder / "stored")  # replaces it
@@ -47,6 +51,10 @@ def test_page_has_the_verdicts_of_stored_runs_and_names_missing_ones(stored: Pat
     assert (cells[0], *cells[2:6]) == ("`dimes-a`", "DIMES-VEL", "**FAIL**", "11 of 39", bounds)
     assert cells[6] == "exploration, 40 cases, commit 01234567"
     assert "No run of the present program is stored of `dimes-b`." in lines
+    # the reach of the requirement that passes, and of no other
+    (reach,) = [line for line in lines if line.startswith("- `dimes-a`")]
+    assert reach.startswith("- `dimes-a`, LOOSE: PASS holds (90 % confidence, one change at a time) for ")
+    assert "Robust verdicts ([how far a PASS reaches](ROBUST)):" in lines
     (row,) = [line for line in lines if "`other`" in line]
     assert [cell.strip() for cell in row.strip("|").split("|")][2:7] == ["40", "39", "39", "2.000", "2.000"]
     assert "an old table" not in text

@@ -85,7 +85,7 @@ def _check_page(text: str, page: PageParser) -> None:
     assert "iframe" not in page.tags
     assert page.handlers == []
     for reference in page.references:
-        assert reference.startswith(("#", "data:image/png;base64,"))
+        assert reference.startswith(("#", "data:image/png;base64,", "data:image/webp;base64,"))
         assert not reference.startswith("#") or reference[1:] in page.ids
     for target in re.findall(r"url\(([^)]*)\)", text):
         assert target.strip("'\"")[1:] in page.ids

@@ -35,7 +35,7 @@ def test_run_killed_at_its_start_can_be_restarted(
     create_store(directory / ROWS_FILE, {"identity": "killed run"})
     with pytest.raises(StoreError, match="a run was stopped before its first case: start it again with --out"):
         resume_campaign(directory, ExecutorConfig(1), watch)
-    run(campaign_file(), directory, watch, "cases=2", jobs=1)
+    run(campaign_file(), directory, watch, "cases=2")
     assert len(read_case_rows(directory)) == 2
     # a store with rows is never overwritten, even if its record is missing
     (directory / "campaign.json").unlink()
@@ -43,7 +43,7 @@ def test_run_killed_at_its_start_can_be_restarted(
         path = directory / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     with pytest.raises(StoreError, match=r"contains a campaign \(cases.sqlite\)"):
-        run(campaign_file(), directory, watch, "cases=2", jobs=1)
+        run(campaign_file(), directory, watch, "cases=2")
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ def test_campaign_with_failing_cases_finishes(
     assert rows[5]["error"] == "the worker process died: SIGABRT (-6)"
     assert "fake_scenario.py" in rows[5]["traceback"]
     # no column differs with one worker, without the failing cases, and for single replayed cases
-    single_worker_rows = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch, jobs=1))
+    single_worker_rows = read_case_rows(run(campaign_file(FAILING_CASES), tmp_path / "single", watch))
     assert [differing_columns(*pair) for pair in zip(rows, single_worker_rows, strict=True)] == [()] * 12
     rows_without_faults = read_case_rows(run(campaign_file("unanswered_cases = [2]"), tmp_path / "no-faults", watch))
     for case in (0, 1, 2, 4, 7, 8, 9, 10, 11):

@@ -152,7 +152,7 @@ def test_changes_of_the_worker_process_are_reported(
     failing_campaign: Path, campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch
 ) -> None:
     path = campaign_file("state_changing_cases = [1, 7]\nforking_cases = [4]\nunanswered_cases = [2]")
-    rows = read_case_rows(run(path, tmp_path / "run", watch, "retain.showcase=none"))
+    rows = read_case_rows(run(path, tmp_path / "run", watch, "retain.showcase=none", jobs=2))
     assert sorted(watch.notes) == [
         "case 1 changed its worker process: the working folder",
         "case 4 changed its worker process: child processes that are still running (python)",
@@ -178,7 +178,7 @@ def test_failing_cases_do_not_affect_other_cases(
     parameters = "\n".join(f"{name} = [{case}]" for name, (case, _) in faults.items())
     limits = "[limits]\ncase_time_s = 4\nmemory_gb = 0.25\noutput_mb = 0.1"
     path = campaign_file(f"{parameters}\nunanswered_cases = [2]", extra_tables=limits)
-    rows = read_case_rows(run(path, tmp_path / "hostile", watch, "retain.showcase=none"))
+    rows = read_case_rows(run(path, tmp_path / "hostile", watch, "retain.showcase=none", jobs=2))
     expected = dict(faults.values())
     outcomes = {row["case"]: row["outcome"] for row in rows if row["outcome"] not in ("VALID", "SILENT")}
     assert outcomes == expected
@@ -224,7 +224,7 @@ def _kill_and_resume(path: Path, directory: Path, cases: int, n_kills: int, rng:
 def test_resumed_campaign_has_the_same_rows(campaign_file: CampaignFile, tmp_path: Path, watch: RecordingWatch) -> None:
     path = campaign_file("sleep_s = 0.02", requirement="")
     assert _kill_and_resume(path, tmp_path / "killed", 150, 1, np.random.default_rng(8)) >= 1
-    expected_rows = read_case_rows(run(path, tmp_path / "run", watch, "cases=150", "retain.showcase=none"))
+    expected_rows = read_case_rows(run(path, tmp_path / "run", watch, "cases=150", "retain.showcase=none", jobs=2))
     resumed_rows = read_case_rows(tmp_path / "killed")
     assert [differing_columns(*pair) for pair in zip(resumed_rows, expected_rows, strict=True)] == [()] * 150
     first, *later = record.read(tmp_path / "killed")["sessions"]
