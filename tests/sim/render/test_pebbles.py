@@ -74,6 +74,25 @@ def test_pebbles_move_with_the_ground_and_keep_its_mean_brightness(renderer: Ren
     assert np.corrcoef(first[:, 45:].ravel(), second[:, 5:-40].ravel())[0, 1] > 0.99
 
 
+@pytest.mark.parametrize("elevation_deg", [25.0, 50.0])
+def test_one_ray_per_pixel_sees_the_mean_over_its_footprint(renderer: Renderer, elevation_deg: float) -> None:
+    """Pebbles of one to ten pixels, compared with the means of 36 rays."""
+    sun = Sun(direction(0.5 * np.pi, np.radians(elevation_deg)))
+    scene = Scene(
+        flat_ground(64, 1.0), (8.0, 8.0), sun, LAMBERT, pebbles=SitePebbles(coverage=0.25, log_albedo_sd=0.25), **MESH
+    )
+    pose, factor = rigid(Rotation.identity(), np.array([8.0, 8.0, 1.5])), 6
+    images = [
+        renderer.render(scene, PixelRays.from_camera(Cahv.from_field_of_view(0.4, (side, side), **DOWN)), pose).radiance
+        for side in (280, 280 * factor)
+    ]
+    mean = images[1].reshape(280, factor, 280, factor).mean(axis=(1, 3))
+    # the ratio is 1.2 for ramps that do not preserve the outline's area and normals of the pixel's centre
+    assert images[0].std() / mean.std() == pytest.approx(1.0, abs=0.1)
+    assert images[0].mean() / mean.mean() == pytest.approx(1.0, abs=0.02)
+    assert np.corrcoef(images[0].ravel(), mean.ravel())[0, 1] > 0.9
+
+
 def test_dust_lies_on_level_faces_of_rocks_only(renderer: Renderer) -> None:
     level = np.array([[8.0, 8.0, 0.4], [8.4, 8.0, 0.4], [8.4, 8.4, 0.4], [8.0, 8.4, 0.4]])
     steep = np.array([[7.0, 8.0, 0.3], [7.05, 8.0, 1.0], [7.05, 8.4, 1.0], [7.0, 8.4, 0.3]])
