@@ -10,12 +10,13 @@ from pathlib import Path
 from weakref import WeakValueDictionary
 
 import numpy as np
+from jaxtyping import Float32
 
 from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
+from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream
 from marsyard.sim.terrain.landforms.kernels.shapes import interleave_samples
-from marsyard.sim.terrain.landforms.relief import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.units import FACTOR_STEP
 from marsyard.sim.terrain.parameters import LANDFORMS, TerrainParameters
 from marsyard.sim.terrain.rocks.field import RockField
@@ -53,27 +54,29 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
     albedo = FractalField.power_law(p.samples, p.spacing_m, p.albedo_hurst, p.outer_scale_m)
     contrast = p.albedo_contrast * float(np.exp(p.contrast_spread * substream(rng, "contrast").standard_normal()))
     craters = draw_craters(p, substream(rng, "craters"))
-    factors = UNIFORM
+    # equal random modes: hollows are dark, and crests bright, at all scales
+    albedo_rng = substream(rng, "relief" if p.albedo_follows_relief else "albedo")
     if p.units is None:
         height = relief.draw_field(substream(rng, "relief"), relief_m)
-        log_albedo = albedo.draw_field(substream(rng, "albedo"), contrast)
-        ground = TerrainGround(height, log_albedo, p.spacing_m)
+        log_albedo = albedo.draw_field(albedo_rng, contrast)
+        fine = ground = TerrainGround(height, log_albedo, p.spacing_m)
     else:
         height, fine_relief = relief.draw_split_field(substream(rng, "relief"), relief_m, p.fine_below_m)
-        log_albedo, fine_albedo = albedo.draw_split_field(substream(rng, "albedo"), contrast, p.fine_below_m)
+        log_albedo, fine_albedo = albedo.draw_split_field(albedo_rng, contrast, p.fine_below_m)
         ground = TerrainGround(height, log_albedo, p.spacing_m)
-        factors = p.units.apply(ground, craters, substream(rng, "units"))
-        height += fine_relief * refine(np.ascontiguousarray(factors[..., ROUGHNESS]), ground.side)
-        log_albedo += fine_albedo * refine(np.ascontiguousarray(factors[..., TEXTURE]), ground.side)
-        log_albedo += np.float32(p.relief_log_albedo / fine_relief.std(dtype=np.float64)) * fine_relief
+        fine = TerrainGround(fine_relief, fine_albedo, p.spacing_m)
     dtm = None
     if p.source is not None:
         dtm = embed(p.source, ground.side, ground.spacing_m)
-        detail = extract_fine_detail(ground, dtm) if p.source.roughen else None
+        detail = extract_fine_detail(fine, dtm) if p.source.roughen else None
     for name in LANDFORMS:
         landform = getattr(p, name)
         if landform is not None:
             landform.apply(ground, substream(rng, name))
+    factors = UNIFORM
+    if p.units is not None:
+        factors = p.units.apply(ground, craters, substream(rng, "units"))
+        _add_fine_ground(ground, fine, factors, p.relief_log_albedo)
     if len(craters):
         add_craters(ground, craters)
     if p.drifts is not None:
@@ -87,6 +90,20 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
         ground.height, relative_albedo, p.albedo / float(relative_albedo.mean(dtype=np.float64)), samples
     )
     return Surface.from_pyramid(pyramid, ground.spacing_m, factors)
+
+
+def _add_fine_ground(
+    ground: TerrainGround, fine: TerrainGround, factors: Float32[np.ndarray, "side side 3"], relief_log_albedo: float
+) -> None:
+    """Add fine relief and albedo, scaled by the factors of the surface units, and albedo by the height of the relief.
+
+    `relief_log_albedo` is the log albedo of ground that is one standard deviation of the fine relief higher.
+    """
+    if relief_log_albedo:
+        log_albedo = ground.log_albedo
+        log_albedo += np.float32(relief_log_albedo / fine.height.std(dtype=np.float64)) * fine.height
+    for total, part, factor in ((ground.height, fine.height, ROUGHNESS), (ground.log_albedo, fine.log_albedo, TEXTURE)):
+        total += part * refine(np.ascontiguousarray(factors[..., factor]), ground.side)
 
 
 @cache

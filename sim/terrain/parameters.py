@@ -52,6 +52,9 @@ class TerrainParameters(Parameters):
         float,
         Field(ge=-0.5, lt=1.0, description="Hurst exponent of the fractal albedo; 0: equal variance in all octaves"),
     ] = 0.0
+    albedo_follows_relief: Annotated[
+        bool, Field(description="whether sand darkens the hollows of the fractal relief, and leaves its crests bright")
+    ] = False
     relief_log_albedo: Annotated[
         float, bounded_field(-1.0, 1.0, "log albedo of ground one SD of the fine relief above its surroundings")
     ] = 0.0

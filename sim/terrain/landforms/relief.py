@@ -1,9 +1,9 @@
-"""Landforms: dunes, lava flows, swells, ramps, impact craters, gullies, and the fans and playa of a desert basin."""
+"""Landforms: dunes, lava flows, swells, ramps, gullies, and the fans and playa of a desert basin."""
 
 from __future__ import annotations
 
 from itertools import product
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy  # scipy.signal is slow to import: it is loaded at its first use
@@ -14,37 +14,13 @@ from pydantic import Field
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, refine, resample
 from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
-from marsyard.sim.terrain.landforms.kernels.shapes import (
-    Bedforms,
-    add_dunes,
-    cut_channels,
-    raise_cones,
-    stamp_craters,
-    stamp_lobes,
-)
-
-if TYPE_CHECKING:
-    from marsyard.sim.terrain.parameters import TerrainParameters
+from marsyard.sim.terrain.landforms.kernels.shapes import Bedforms, add_dunes, cut_channels, raise_cones, stamp_lobes
 
 SAMPLES_ON_SLIP_FACE = 2.1  #: Minimum number of samples along the slope of a slip face.
 CRENULATION = 0.28  #: RMS displacement of a lobe's outline, in half widths.
 #: RMS of a two-dimensional cubic B-spline divided by that of its control values, if these are independent. The mean
 #: square has the factor 151/315 along each axis: the integral of the squared basis function.
 SPLINE_OF_NOISE_RMS = 151.0 / 315.0
-RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
-EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
-#: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
-#: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
-FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
-#: Height of the rim crest above the surroundings of a fresh crater, divided by the diameter (Pike 1977).
-FRESH_RIM = 0.04
-SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
-DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
-DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
-FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
-SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
-#: RMS amplitude of the lobes of an outline (two, three, five and eight), in radii: together 7 %.
-OUTLINE_RMS = (0.045, 0.04, 0.03, 0.015)
 APEX_ROUNDING = 0.06  #: Rounding of a fan's apex, as a fraction of its radius.
 CONE_DETAIL = 1.0 / 50.0  #: Scale of the smallest detail of the fans' broad shape, as a fraction of their radius.
 Channels = Float64[np.ndarray, "channels"]  #: One value per channel.
@@ -212,71 +188,6 @@ class Ramp(Parameters):
         profile = profile * ground.spacing_m * np.tan(np.radians(self.slope_deg))
         profile = (profile - profile.mean()).astype(np.float32)
         np.add(ground.height, profile[None, :] if self.uphill == "east" else profile[:, None], out=ground.height)
-
-
-def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 21"]:
-    """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
-
-    Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
-    `crater_knee_m` (saturation, Hartmann 1984: -1.83) and ``D**-crater_steep_exponent`` above it (production function,
-    Hartmann 2005). Outlines deviate from circles by `OUTLINE_RMS`. Sand, dark on Mars, fills the inner part of some
-    craters, and dust that the impact has brought up or that the rim retains brightens the ejecta of most.
-
-    Diffusion wears craters: the depth of a Gaussian bowl is ``1 / (1 + t)`` of the initial one after the time t, in
-    units that are proportional to the square of the diameter. A crater vanishes at `DEGRADED_DEPTH`. Saturation is the
-    balance of new and vanished craters: below the knee the ages are uniform up to that of the vanishing crater, above
-    it up to that of the ground, so that large craters are fresher.
-    """
-    p = parameters
-    min_m, max_m = p.crater_diameter_min_m, p.crater_diameter_max_m
-    if max_m <= min_m:
-        limit = f"crater_diameter_min_m, {min_m:g}"
-        raise ValueError(f"crater_diameter_max_m is {max_m:g}; it must be larger than {limit}")
-    period = p.samples * p.spacing_m
-    count = int(rng.poisson(p.craters_per_km2 * (period / 1000.0) ** 2))
-    knee = min(max(p.crater_knee_m, min_m), max_m)
-    knee_fraction = (knee / min_m) ** -p.crater_exponent  # fraction of craters larger than the knee
-    fraction = rng.uniform(knee_fraction * (max_m / knee) ** -p.crater_steep_exponent, 1.0, count)
-    below_knee = min_m * fraction ** (-1.0 / p.crater_exponent)
-    above_knee = knee * (fraction / knee_fraction) ** (-1.0 / p.crater_steep_exponent)
-    diameter = np.sort(np.where(fraction > knee_fraction, below_knee, above_knee))[::-1]
-    age = (FRESH_DEPTH / DEGRADED_DEPTH - 1.0) * rng.uniform(0.0, 1.0, count) * np.minimum(knee / diameter, 1.0) ** 2
-    freshness = 1.0 / (1.0 + age)
-    position = rng.uniform(0.0, period, (count, 2))
-    # the sharper rim wears faster than the bowl: as the square (assumed)
-    rim = diameter * FRESH_RIM * freshness**2
-    depth = diameter * FRESH_DEPTH * freshness - rim
-    rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * freshness)
-    fill = DEEPEST_FILL * (1.0 - freshness)
-    # small craters shelter less sand, and throw out less material of other brightness
-    size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
-    ejecta_log_albedo = p.crater_ejecta_contrast * size_factor * rng.gamma(3.0, 1.0 / 3.0, count)
-    ejecta_log_albedo *= np.where(rng.uniform(size=count) < DARK_EJECTA, -1.0, 1.0)
-    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * size_factor
-    fill_log_albedo = np.where(
-        has_sand,
-        p.crater_sand_log_albedo * rng.uniform(0.5, 1.5, count),
-        p.crater_floor_contrast * rng.standard_normal(count),
-    )
-    # spread of sand and of its asymmetry between craters (assumed)
-    fill_radius = rng.uniform(SMALLEST_FILL, LARGEST_FILL, count)
-    lee = 0.3 * rng.standard_normal((count, 2))
-    outline = rng.standard_normal((count, 8)) * np.repeat(OUTLINE_RMS, 2)
-    phase = rng.uniform(0.0, 2.0 * np.pi, count)
-    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
-    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, phase])
-
-
-def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 21"]) -> None:
-    """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
-    octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
-    layer = None
-    for step in range(int(octave.max(initial=0.0)), -1, -1):
-        grid = ground.coarser(ground.spacing_m * 2.0**step) if step else ground
-        if layer is not None:
-            grid.add(layer)
-        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, craters[octave == step], EJECTA_EXTENT_RADII)
-        layer = grid
 
 
 def draw_channels(

@@ -13,9 +13,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 from numpy.random import Generator
 from pydantic import Field
+from scipy.ndimage import gaussian_filter
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
-from marsyard.sim.terrain.landforms.ground import Grid, Spectrum, TerrainGround
+from marsyard.sim.terrain.landforms.ground import Grid, Spectrum, TerrainGround, refine
 from marsyard.sim.terrain.landforms.kernels.shapes import cut_channels, scale_roughness, stamp_streaks
 from marsyard.sim.terrain.landforms.relief import draw_channels
 from marsyard.sim.terrain.surface import ROCKS, ROUGHNESS
@@ -26,6 +27,20 @@ FACTOR_STEP = 4
 OUTLINE_HURST = 0.6
 #: Iterations of the fit of the units' areas, and maximum number of samples along each side for this fit.
 _FIT_STEPS, _FIT_SIDE = 40, 128
+
+
+def compute_relative_height(ground: TerrainGround, largest_m: float) -> Grid:
+    """Compute the height above the mean of the surroundings, metres: positive on crests, negative in valleys.
+
+    The mean is weighted by a Gaussian with a standard deviation of a quarter of `largest_m`. The grid is that of the
+    factors.
+    """
+    height = ground.height[::FACTOR_STEP, ::FACTOR_STEP]
+    deviation = 0.25 * largest_m * len(height) / ground.period_m
+    # the mean is smooth: samples every half standard deviation are enough
+    step = 2 ** max(int(np.log2(0.5 * deviation)), 0)
+    mean = gaussian_filter(height[::step, ::step], deviation / step, mode="wrap")
+    return np.asarray(height - refine(mean, len(height)))
 
 
 class SurfaceUnit(Parameters):
@@ -45,8 +60,8 @@ class SurfaceUnit(Parameters):
 class SurfaceUnits(Parameters):
     """A map of surface units. The ground belongs to the unit with the largest random field.
 
-    The field of a unit increases with the height of the coarse relief times the unit's `elevation`, so that its borders
-    follow this relief: both have the standard deviation 1.
+    The field of a unit increases with the height above the surroundings (see `compute_relative_height`) times the
+    unit's `elevation`, so that its borders follow valleys, crests and scarps: both have the standard deviation 1.
     The areas vary from terrain to terrain by a Dirichlet distribution around the expected fractions.
     """
 
@@ -92,8 +107,8 @@ class SurfaceUnits(Parameters):
         fields = np.stack([spectrum.draw_field(rng, 1.0) for _ in units], axis=-1)
         elevation = np.array([unit.elevation for unit in units], dtype=np.float32)
         if elevation.any():
-            height = ground.height[::FACTOR_STEP, ::FACTOR_STEP]
-            fields += ((height - height.mean()) / max(float(height.std()), 1e-6))[..., None] * elevation
+            height = compute_relative_height(ground, self.largest_m)
+            fields += (height / max(float(height.std()), 1e-6))[..., None] * elevation
         membership = self._compute_membership(fields, areas)
         unit_factors = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
         factors = np.exp(membership @ np.log(np.maximum(unit_factors, 1e-3)).astype(np.float32))

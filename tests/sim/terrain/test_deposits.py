@@ -7,8 +7,8 @@ import pytest
 
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Drifts, Dunes, Strata, TerrainGround
+from marsyard.sim.terrain.landforms.craters import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 from marsyard.sim.terrain.landforms.deposits import compute_lee
-from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.surface import TEXTURE
 

@@ -8,9 +8,17 @@ from scipy.ndimage import map_coordinates
 
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
+from marsyard.sim.terrain.landforms.craters import (
+    DEGRADED_DEPTH,
+    FRESH_DEPTH,
+    OUTLINE_EXPONENT,
+    OUTLINE_RMS,
+    add_craters,
+    draw_craters,
+    outline_tables,
+)
 from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
 from marsyard.sim.terrain.landforms.kernels.shapes import EJECTA_OPACITY, stamp_craters
-from marsyard.sim.terrain.landforms.relief import DEGRADED_DEPTH, FRESH_DEPTH, add_craters, draw_craters
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +42,10 @@ def test_height_matches_scipy_spline(surface: Surface, positions: tuple[np.ndarr
         control = surface.levels[level][..., channel].astype(np.float64)
         expected = map_coordinates(control, [y / spacing, x / spacing], order=3, mode="grid-wrap", prefilter=False)
         assert_allclose(actual, expected, atol=1e-12)
+
+
+#: Tables of a round outline without rays.
+ROUND = (np.zeros((1, 4)), np.zeros((1, 4)))
 
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
@@ -160,9 +172,9 @@ def test_white_noise_replaces_the_finest_octave(hurst: float) -> None:
 def test_large_craters_are_equal_on_a_coarser_grid() -> None:
     """A crater with a radius of 150 samples, on a grid of every fourth sample: equal within 2 % of its depth."""
     shape = (512, 512)
-    crater = np.array([[200.0, 260.0, 150.0, 24.0, 6.0, 2.4, 0.0, 0.1, -0.3, 0.8, *np.zeros(10), 0.3]])
+    crater = np.array([[200.0, 260.0, 150.0, 24.0, 6.0, 2.4, 0.0, 0.1, -0.3, 0.8, *np.zeros(4)]])
     height, log_albedo = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    stamp_craters(height, log_albedo, 1.0, crater, 3.0)
+    stamp_craters(height, log_albedo, 1.0, crater, *outline_tables(), 3.0)
     ground = TerrainGround(np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32), 1.0)
     add_craters(ground, crater)
     # the B-spline of the coarser grid smooths the crest over a sample
@@ -191,12 +203,36 @@ def test_crater_depths_range_from_degraded_to_fresh() -> None:
     assert depth_ratio.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
 
 
+def test_outlines_have_a_power_law_of_waves() -> None:
+    """Large craters are scalloped, not polygons: the power of the waves follows the law, and no wave is the shape."""
+    height, log_albedo = np.zeros((512, 512), dtype=np.float32), np.zeros((512, 512), dtype=np.float32)
+    azimuth = 2.0 * np.pi * np.arange(256) / 256
+    powers = []
+    for number in range(32):
+        height[:] = 0.0
+        crater = [256.0, 256.0, 80.0, 16.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, number, 0.1]
+        stamp_craters(height, log_albedo, 1.0, np.array([crater]), *outline_tables(), 3.0)
+        # without a rim, the bowl ends at the outline: it is at half its depth at 0.5**(1 / 2.2) of the local radius
+        radii = np.arange(20.0, 80.0, 0.25)
+        rays = [256.0 + radii[:, None] * shape(azimuth) for shape in (np.sin, np.cos)]
+        profile = map_coordinates(height, rays, order=1)
+        outline = radii[np.argmax(profile > -8.0, axis=0)] / (80.0 * 0.5 ** (1.0 / 2.2))
+        powers.append(np.abs(np.fft.rfft(outline - 1.0) / 256) ** 2)
+    power = np.mean(powers, axis=0)
+    assert np.sqrt(2.0 * power[1:].sum()) == pytest.approx(OUTLINE_RMS, rel=0.1)
+    waves = np.arange(2, 10)
+    exponent = np.polyfit(np.log(waves), np.log(power[waves]), 1)[0]
+    assert exponent == pytest.approx(2.0 * OUTLINE_EXPONENT, abs=0.4)
+    # five lobes alone, a pentagon, have a small fraction of the variance
+    assert power[5] < 0.1 * power[1:].sum()
+
+
 def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     height, log_albedo = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
     radius, depth, rim = 20.0, 6.4, 1.6
     # A crater with a sharp rim and a round outline, centred on the corner of the grid. Columns: see `stamp_craters`.
-    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, 0.0, 1.0, *np.zeros(10), 0.3]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
+    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, 0.0, 1.0, *np.zeros(4)]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND, 3.0)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
     assert tuple(map(int, np.unravel_index(centred.argmin(), centred.shape))) == (128, 128)
@@ -211,8 +247,8 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     # A crater of radius 30 m and depth 3 m, filled up to a flat floor. Columns: see `stamp_craters`.
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, 0.0, 1.0, *np.zeros(11)]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, 0.0, 1.0, *np.zeros(4)]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND, 3.0)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
     assert np.ptp(height[64, 56:73]) < 0.15
     assert not log_albedo.any()

@@ -17,9 +17,9 @@ from marsyard.sim.terrain import (
     TerrainParameters,
     synthesise,
 )
+from marsyard.sim.terrain.landforms.craters import DARK_EJECTA, FULL_CONTRAST_M, draw_craters
 from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
 from marsyard.sim.terrain.landforms.kernels.shapes import FILL_MARGIN, scale_roughness, stamp_craters, stamp_streaks
-from marsyard.sim.terrain.landforms.relief import DARK_EJECTA, FULL_CONTRAST_M, draw_craters
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
@@ -35,7 +35,7 @@ KINDS: list[dict[str, Any]] = [
 ]
 PLAIN = [{"name": "plain", "fraction": 1.0}]
 #: An empty table of craters; columns: see `stamp_craters`.
-NO_CRATERS = np.empty((0, 21))
+NO_CRATERS = np.empty((0, 14))
 
 
 def _make_units(**changes: Any) -> SurfaceUnits:
@@ -80,6 +80,47 @@ def test_patches_are_longer_along_the_wind() -> None:
     assert correlation_x > 1.2 * correlation_y
 
 
+def test_sand_lies_in_valleys_and_not_on_the_lower_half_of_the_terrain() -> None:
+    """Units follow relief of the size of their patches; a slope of kilometres does not separate them."""
+    kinds = [{"name": "sand", "fraction": 0.3, "texture": 0.5, "elevation": -4.0}, {"name": "rock", "fraction": 0.7}]
+    units = _make_units(kinds=kinds, largest_m=400.0, concentration=1e6)
+    phase = 2.0 * np.pi * np.arange(1024) / 1024
+    # one wave of 40 m along y, and ten valleys of 10 m along x
+    height = (20.0 * np.sin(phase)[:, None] + 5.0 * np.sin(10.0 * phase)).astype(np.float32)
+    ground = TerrainGround(height, np.zeros_like(height), 2.0)
+    is_sand = units.apply(ground, NO_CRATERS, np.random.default_rng(1))[..., TEXTURE] < 0.7
+    in_valley = np.broadcast_to(np.sin(10.0 * phase)[::4] < 0.0, is_sand.shape)
+    assert in_valley[is_sand].mean() > 0.8
+    low_half = is_sand[np.sin(phase)[::4] < 0.0].mean()
+    assert low_half == pytest.approx(is_sand.mean(), abs=0.1)
+
+
+def test_units_follow_the_landforms() -> None:
+    """Outcrop lies on lobes, which are added to the ground before its units."""
+    kinds = [{"name": "rock", "fraction": 0.3, "texture": 0.5, "elevation": 4.0}, {"name": "sand", "fraction": 0.7}]
+    lava = {"layers": 0.3, "lobe_length_m": 400.0, "lobe_thickness_m": 30.0, "aa_fraction": 0.0}
+    p = _make_parameters(units=_make_units(kinds=kinds, largest_m=600.0, concentration=1e6), lava=lava)
+    surface = synthesise(p, np.random.default_rng(2))
+    is_rock = surface.factors[..., TEXTURE] < 0.7
+    height = surface.levels[0][::4, ::4, 0]
+    is_lobe = height - gaussian_filter(height, 40.0, mode="wrap") > 5.0
+    assert is_rock[is_lobe].mean() > 2.0 * is_rock.mean()
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_albedo_follows_relief_at_all_scales(follows: bool) -> None:
+    """Hollows are dark and crests bright, at wavelengths of 8 to 16 and of 64 to 128 samples."""
+    p = _make_parameters(albedo_follows_relief=follows, albedo_hurst=0.0, hurst=0.8)
+    channels = synthesise(p, np.random.default_rng(3)).levels[0]
+    for size in (2.0, 16.0):
+        height, log_albedo = (
+            gaussian_filter(field, size, mode="wrap") - gaussian_filter(field, 2.0 * size, mode="wrap")
+            for field in (channels[..., 0], np.log(channels[..., 1]))
+        )
+        correlation = np.corrcoef(height.ravel(), log_albedo.ravel())[0, 1]
+        assert correlation > 0.8 if follows else abs(correlation) < 0.4
+
+
 def test_units_increase_the_patchiness_of_the_albedo() -> None:
     def compute_patchiness(parameters: TerrainParameters) -> float:
         log_albedo = np.log(synthesise(parameters, np.random.default_rng(3)).levels[0][..., 1].astype(float))
@@ -116,9 +157,9 @@ def test_sand_in_a_crater_has_the_specified_albedo_and_margin() -> None:
     """The sand ends at its radius, and is thicker downwind, which is along x."""
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     # x, y, radius, depth, rim height, rim width; filled fraction; albedo of ejecta and sand; radius of the sand and its
-    # increase along x and y; circular outline; phase
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, -0.5, 0.8, 0.3, 0.0, *np.zeros(9)]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), 3.0)
+    # increase along x and y; number and rotation of the outline, which is round
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, -0.5, 0.8, 0.3, 0.0, 0.0, 0.0]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), np.zeros((1, 4)), np.zeros((1, 4)), 3.0)
     assert log_albedo[64, 64] == pytest.approx(-0.5)
     assert log_albedo[64, 64 + 12] == pytest.approx(-0.5 * (1.0 + 0.3 * 0.4))
     assert log_albedo[64, 64 - 12] == pytest.approx(-0.5 * (1.0 - 0.3 * 0.4))

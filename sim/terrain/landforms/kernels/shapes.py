@@ -17,7 +17,7 @@ GridRow = NDArray[np.float32]
 RIM_HEIGHT_SENSITIVITY = 8.0
 #: Optical depth of the ejecta at the rim; assumed: they cover a third of the ground at two radii.
 EJECTA_OPACITY = 3.0
-#: Relative amplitude of each of the two sets of rays in the opacity of the ejecta (assumed).
+#: RMS of the rays relative to the mean thickness and opacity of the ejecta (assumed).
 RAY_CONTRAST = 0.25
 #: Width of the margin of a crater's fill, in crater radii (assumed).
 FILL_MARGIN = 0.25
@@ -64,8 +64,19 @@ def add_refined(fine: Grid, coarse: Grid) -> None:
         fine_row[2 * side - 1] += half * (row[side - 1] + row[0])
 
 
+@njit(cache=True, inline="always")
+def _azimuth_fraction(c: float, s: float) -> float:
+    """Return an angle from its cosine and sine as a fraction of a turn, uniform along the square |x| + |y| = 1."""
+    quarter = s / (abs(c) + abs(s))
+    if c < 0.0:
+        return 0.5 - 0.25 * quarter
+    return 0.25 * quarter if s >= 0.0 else 1.0 + 0.25 * quarter
+
+
 @njit(cache=True)
-def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array, max_r: float) -> None:
+def stamp_craters(
+    height: Grid, log_albedo: Grid, spacing: float, craters: Array, outlines: Array, rays: Array, max_r: float
+) -> None:
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
     Each crater is a row of `craters`:
@@ -73,21 +84,19 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
     - x, y, radius; depth below the surroundings, rim height, width of the rounded rim crest, all in metres
     - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the fill; radius of
       the fill in crater radii; relative increase of its strength per radius along x and y
-    - four pairs of cosine and sine terms of the outline with two, three, five and eight lobes
-    - phase of the rays
+    - number of its outline; rotation of outline and rays, as a fraction of a turn
 
-    With the distance r from the centre in radii, the bowl rises with r**2.2. The ejecta blanket falls with r**-3, has
-    rays outside the rim and ends at `max_r`. The rim is lower where the outline is displaced inwards. The ejecta change
-    the albedo where they cover the ground: by 1 - exp(-EJECTA_OPACITY r**-3).
+    `outlines` and `rays` have a row per outline: the relative change of the radius, and the strength of the rays, at
+    positions of `_azimuth_fraction`. With the distance r from the centre in radii, the bowl rises with r**2.2. The
+    ejecta blanket falls with r**-3, has rays outside the rim and ends at `max_r`. The rim is lower where the outline is
+    displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-EJECTA_OPACITY r**-3).
     """
-    mask = height.shape[0] - 1
+    mask, positions = height.shape[0] - 1, outlines.shape[1]
     for n in range(craters.shape[0]):
         x, y, radius, depth, rim, rounding, fill, ejecta_log_albedo, fill_log_albedo, fill_radius = craters[n, :10]
-        lee_x, lee_y, c2, s2, c3, s3, c5, s5, c8, s8, phase = craters[n, 10:]
-        extent = max_r * radius * 1.3
-        cos_phase_7, sin_phase_7 = math.cos(phase), math.sin(phase)
-        # the twelve rays have another phase than the seven rays
-        cos_phase_12, sin_phase_12 = math.cos(2.3 * phase), math.sin(2.3 * phase)
+        lee_x, lee_y, number, rotation = craters[n, 10:]
+        outline, ray = outlines[int(number)], rays[int(number)]
+        extent = max_r * radius * (1.0 + outline.max())
         # depth of the bowl before its fill
         bottom = depth / (1.0 - fill)
         blend_width = 0.25 * fill * bottom + 1e-9
@@ -99,32 +108,25 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
                 if d >= extent:
                     continue
                 c, s = dx / max(d, 1e-9), dy / max(d, 1e-9)
-                # cosines and sines of multiples of the azimuth
-                cos_2, sin_2 = c * c - s * s, 2.0 * c * s
-                cos_3, sin_3 = cos_2 * c - sin_2 * s, sin_2 * c + cos_2 * s
-                cos_5, sin_5 = cos_3 * cos_2 - sin_3 * sin_2, sin_3 * cos_2 + cos_3 * sin_2
-                cos_8, sin_8 = cos_5 * cos_3 - sin_5 * sin_3, sin_5 * cos_3 + cos_5 * sin_3
-                lobes = c2 * cos_2 + s2 * sin_2 + c3 * cos_3 + s3 * sin_3 + c5 * cos_5 + s5 * sin_5
-                scallops = c8 * cos_8 + s8 * sin_8
+                position = (_azimuth_fraction(c, s) + rotation) * positions if d > 0.0 else 0.0
+                k = int(position)
+                weight = position - k
+                first, second = k % positions, (k + 1) % positions
+                displacement = outline[first] + weight * (outline[second] - outline[first])
                 # distance from the centre in local radii: 1 on the rim
-                r = d / (radius * (1.0 + lobes + scallops))
+                r = d / (radius * (1.0 + displacement))
                 if r >= max_r:
                     continue
                 # inside the bowl the blanket's r**-3 is limited
                 outside = max(r, 0.6)
                 thickness = 1.0 / (outside * outside * outside)
                 fade = min((max_r - r) / (max_r - 1.0), 1.0)
-                notched_rim = rim * max(1.0 + RIM_HEIGHT_SENSITIVITY * lobes, 0.0)
-                blanket = notched_rim * thickness * fade
-                rays = 0.0
+                strength = 1.0
                 if r > 1.0:
-                    # seven and twelve rays: cosines of 7 and 12 times the azimuth, each with a phase
-                    cos_7, sin_7 = cos_5 * cos_2 - sin_5 * sin_2, sin_5 * cos_2 + cos_5 * sin_2
-                    rays = cos_7 * cos_phase_7 - sin_7 * sin_phase_7
-                    rays += (cos_7 * cos_5 - sin_7 * sin_5) * cos_phase_12 - (
-                        sin_7 * cos_5 + cos_7 * sin_5
-                    ) * sin_phase_12
-                    blanket *= 1.0 + 0.25 * rays * min(2.0 * (r - 1.0), 1.0)
+                    # rays begin at the rim
+                    along = ray[first] + weight * (ray[second] - ray[first])
+                    strength = max(1.0 + RAY_CONTRAST * along * min(2.0 * (r - 1.0), 1.0), 0.0)
+                blanket = rim * max(1.0 + RIM_HEIGHT_SENSITIVITY * displacement, 0.0) * thickness * fade * strength
                 change = blanket
                 # the profile is the lower one of the bowl, extended outwards, and the ejecta blanket
                 if r <= 1.0 or (rim + bottom) * r * r - bottom < blanket + rounding:
@@ -138,12 +140,12 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
                 row, column = i & mask, j & mask
                 height[row, column] += change
                 if ejecta_log_albedo != 0.0:
-                    coverage = 1.0 - math.exp(-EJECTA_OPACITY * thickness * max(1.0 + RAY_CONTRAST * rays, 0.0))
+                    coverage = 1.0 - math.exp(-EJECTA_OPACITY * thickness * strength)
                     log_albedo[row, column] += ejecta_log_albedo * coverage * fade
                 if fill_log_albedo != 0.0 and r < fill_radius:
                     # the fill thins out at its margin, and upwind
-                    strength = min((fill_radius - r) / FILL_MARGIN, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
-                    log_albedo[row, column] += fill_log_albedo * strength
+                    filled = min((fill_radius - r) / FILL_MARGIN, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
+                    log_albedo[row, column] += fill_log_albedo * filled
 
 
 @njit(cache=True)

@@ -1,0 +1,122 @@
+"""Impact craters: their sizes, ages and outlines, and the sand in them."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+from numpy.random import Generator
+
+from marsyard.sim.terrain.landforms.ground import TerrainGround
+from marsyard.sim.terrain.landforms.kernels.shapes import stamp_craters
+
+if TYPE_CHECKING:
+    from marsyard.sim.terrain.parameters import TerrainParameters
+
+RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
+EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
+#: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
+#: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
+FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
+#: Height of the rim crest above the surroundings of a fresh crater, divided by the diameter (Pike 1977).
+FRESH_RIM = 0.04
+SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
+DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
+DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
+FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
+SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
+#: Outlines in the table, and positions along each; waves around an outline; RMS of its radius, and exponent of the
+#: waves' amplitudes (assumed): a real rim is scalloped at all scales, and deviates from a circle by 5 to 10 %.
+OUTLINES, POSITIONS, OUTLINE_WAVES = 64, 256, (2, 24)
+OUTLINE_RMS, OUTLINE_EXPONENT = 0.06, -1.25
+RAY_WAVES = (5, 16)  #: Rays around a crater: waves of equal amplitude (assumed).
+_TABLE_SEED = 20040104  #: Seed of the tables of outlines and rays, which are the same for all terrains.
+
+
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 14"]:
+    """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
+
+    Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
+    `crater_knee_m` (saturation, Hartmann 1984: -1.83) and ``D**-crater_steep_exponent`` above it (production function,
+    Hartmann 2005). Outlines deviate from circles (`outline_tables`). Sand, dark on Mars, fills the inner part of some
+    craters, and dust that the impact has brought up or that the rim retains brightens the ejecta of most.
+
+    Diffusion wears craters: the depth of a Gaussian bowl is ``1 / (1 + t)`` of the initial one after the time t, in
+    units that are proportional to the square of the diameter. A crater vanishes at `DEGRADED_DEPTH`. Saturation is the
+    balance of new and vanished craters: below the knee the ages are uniform up to that of the vanishing crater, above
+    it up to that of the ground, so that large craters are fresher.
+    """
+    p = parameters
+    min_m, max_m = p.crater_diameter_min_m, p.crater_diameter_max_m
+    if max_m <= min_m:
+        limit = f"crater_diameter_min_m, {min_m:g}"
+        raise ValueError(f"crater_diameter_max_m is {max_m:g}; it must be larger than {limit}")
+    period = p.samples * p.spacing_m
+    count = int(rng.poisson(p.craters_per_km2 * (period / 1000.0) ** 2))
+    knee = min(max(p.crater_knee_m, min_m), max_m)
+    knee_fraction = (knee / min_m) ** -p.crater_exponent  # fraction of craters larger than the knee
+    fraction = rng.uniform(knee_fraction * (max_m / knee) ** -p.crater_steep_exponent, 1.0, count)
+    below_knee = min_m * fraction ** (-1.0 / p.crater_exponent)
+    above_knee = knee * (fraction / knee_fraction) ** (-1.0 / p.crater_steep_exponent)
+    diameter = np.sort(np.where(fraction > knee_fraction, below_knee, above_knee))[::-1]
+    age = (FRESH_DEPTH / DEGRADED_DEPTH - 1.0) * rng.uniform(0.0, 1.0, count) * np.minimum(knee / diameter, 1.0) ** 2
+    freshness = 1.0 / (1.0 + age)
+    position = rng.uniform(0.0, period, (count, 2))
+    # the sharper rim wears faster than the bowl: as the square (assumed)
+    rim = diameter * FRESH_RIM * freshness**2
+    depth = diameter * FRESH_DEPTH * freshness - rim
+    rounding = depth * (ROUNDEST_RIM + (SHARPEST_RIM - ROUNDEST_RIM) * freshness)
+    fill = DEEPEST_FILL * (1.0 - freshness)
+    # small craters shelter less sand, and throw out less material of other brightness
+    size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
+    ejecta_log_albedo = p.crater_ejecta_contrast * size_factor * rng.gamma(3.0, 1.0 / 3.0, count)
+    ejecta_log_albedo *= np.where(rng.uniform(size=count) < DARK_EJECTA, -1.0, 1.0)
+    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * size_factor
+    fill_log_albedo = np.where(
+        has_sand,
+        p.crater_sand_log_albedo * rng.uniform(0.5, 1.5, count),
+        p.crater_floor_contrast * rng.standard_normal(count),
+    )
+    # spread of sand and of its asymmetry between craters (assumed)
+    fill_radius = rng.uniform(SMALLEST_FILL, LARGEST_FILL, count)
+    lee = 0.3 * rng.standard_normal((count, 2))
+    outline = rng.integers(0, OUTLINES, count)
+    rotation = rng.uniform(0.0, 1.0, count)
+    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
+    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, rotation])
+
+
+@cache
+def outline_tables() -> tuple[Float64[np.ndarray, "outlines positions"], Float64[np.ndarray, "outlines positions"]]:
+    """Return the relative displacements of outlines, and the rays (RMS 1), at the positions of `stamp_craters`.
+
+    Both are sums of waves around the crater with random phases and a power law of amplitudes.
+    """
+    rng = np.random.default_rng(_TABLE_SEED)
+    quarter = 4.0 * np.arange(POSITIONS) / POSITIONS
+    # the square |x| + |y| = 1, along which the positions are uniform
+    y, x = (1.0 - np.abs((quarter + shift) % 4.0 - 2.0) for shift in (1.0, 2.0))
+    azimuth = np.arctan2(y, x)
+    tables = []
+    for (first, last), exponent, rms in ((OUTLINE_WAVES, OUTLINE_EXPONENT, OUTLINE_RMS), (RAY_WAVES, 0.0, 1.0)):
+        waves = np.arange(first, last + 1)
+        amplitude = waves**exponent
+        amplitude *= rms / np.sqrt(0.5 * np.sum(amplitude**2))
+        phase = rng.uniform(0.0, 2.0 * np.pi, (OUTLINES, waves.size))
+        tables.append(np.cos(waves * azimuth[:, None] + phase[:, None, :]) @ amplitude)
+    return tables[0], tables[1]
+
+
+def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 14"]) -> None:
+    """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
+    octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
+    layer = None
+    for step in range(int(octave.max(initial=0.0)), -1, -1):
+        grid = ground.coarser(ground.spacing_m * 2.0**step) if step else ground
+        if layer is not None:
+            grid.add(layer)
+        rows = craters[octave == step]
+        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, rows, *outline_tables(), EJECTA_EXTENT_RADII)
+        layer = grid
