@@ -78,9 +78,17 @@ class MapParameters(Parameters):
     signal_to_noise: Annotated[
         Positive, Field(description="mean signal divided by the SD of noise per map pixel; assumed")
     ] = 100.0
+    aperture_px: Annotated[
+        float, bounded_field(0.1, 1.0, "width of the ground that a detector element averages, map pixels; assumed")
+    ] = 0.8
     nyquist_mtf: Annotated[
-        float, bounded_field(0.01, 1.0, "MTF of optics, motion and processing at one cycle per two pixels; assumed")
-    ] = 0.25
+        float,
+        bounded_field(
+            0.01,
+            1.0,
+            "MTF of optics, motion and processing, without the aperture, at one cycle per two pixels; assumed",
+        ),
+    ] = 0.33
     bits: Annotated[int | None, Field(ge=6, le=16, description="bits of a pixel; None: not quantised")] = 8
     registration_sd_m: Annotated[
         NonNegative,
@@ -244,7 +252,7 @@ def _render(
     sun = sun_at(air, p.sun_azimuth_deg, p.sun_elevation_deg)
     orbiter = np.array([*centre_m, float(ground.surface.height(*centre_m)) + p.orbit_height_m])
     east, north = _world_grid(truth, *map_axes)
-    rays = orbital_rays(ground.surface, orbiter, east, north, p.pixel_m)
+    rays = orbital_rays(ground.surface, orbiter, east, north, p.aperture_px * p.pixel_m)
     scene = _map_scene(ground, sun, centre_m, east, north, p.orbit_height_m)
     del east, north  # frees memory before rendering
     pose = rigid(Rotation.identity(), orbiter)
@@ -282,9 +290,11 @@ def orbital_rays(
     orbiter_m: Float64[np.ndarray, "3"],
     east: Float64[np.ndarray, "rows columns"],
     north: Float64[np.ndarray, "rows columns"],
-    pixel_m: float,
+    aperture_m: float,
 ) -> PixelRays:
-    """Compute the rays from an orbiter to the surface points at world x, y, in world axes, with pixels of `pixel_m`.
+    """Compute the rays from an orbiter to the surface points at world x, y, in world axes.
+
+    `aperture_m` is the width of the ground that each of them averages.
 
     Rays are in single precision: at 300 km and up to 1.2 deg from nadir a position on the ground is exact to a
     millimetre.
@@ -298,7 +308,7 @@ def orbital_rays(
         vectors = np.stack([x, y, surface.height(x, y)], axis=-1) - orbiter_m
         distance = np.sqrt(np.einsum("ijk,ijk->ij", vectors, vectors))
         directions[block] = vectors / distance[..., None]
-        angles[block] = pixel_m / distance
+        angles[block] = aperture_m / distance
     border = [directions[0], directions[-1], directions[:, 0], directions[:, -1]]
     radius = max(float(np.abs(rays[:, :2] / rays[:, 2:]).max()) for rays in border)
     return PixelRays(

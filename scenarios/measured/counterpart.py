@@ -46,6 +46,12 @@ class CounterpartParameters(Parameters):
     map_sun: Annotated[SunParameters, Field(description="sun in the images of the map")] = SunParameters(
         azimuth_deg=_MAP.sun_azimuth_deg, elevation_deg=_MAP.sun_elevation_deg
     )
+    map_aperture_px: Annotated[
+        float, bounded_field(0.1, 1.0, "aperture of the orbital images in map pixels; less for a reduced copy of a map")
+    ] = _MAP.aperture_px
+    map_nyquist_mtf: Annotated[
+        float, bounded_field(0.01, 1.0, "MTF of the map at one cycle per two pixels, without the aperture")
+    ] = _MAP.nyquist_mtf
     bits_per_pixel: Annotated[
         float | None, bounded_field(MIN_BITS, MAX_BITS, "size of a compressed image; default: as the recorded image")
     ] = None
@@ -108,6 +114,8 @@ def render_counterpart(
         side_px=min(max(map_product.appearance.shape), period_px, _MAX_SIDE_PX),
         sun_azimuth_deg=p.map_sun.azimuth_deg,
         sun_elevation_deg=p.map_sun.elevation_deg,
+        aperture_px=p.map_aperture_px,
+        nyquist_mtf=p.map_nyquist_mtf,
         # a shift of the whole map has no effect on images without a position
         registration_sd_m=0.0,
     )

@@ -27,6 +27,7 @@ CENTRE = np.array([700.0, 1150.0])
 EXACT = MapParameters(
     side_px=SIDE_PX,
     signal_to_noise=1e12,
+    aperture_px=1.0,
     nyquist_mtf=1.0,
     bits=None,
     registration_sd_m=0.0,
@@ -205,6 +206,15 @@ def test_posts_smooth_the_elevation(world: LocalisationWorld) -> None:
     gradient = np.stack([g.ravel() for g in np.gradient(exact.elevation_m)[::-1]] + [np.ones(SIDE_PX**2)], axis=-1)
     displacement = np.linalg.lstsq(gradient, difference.ravel(), rcond=None)[0][:2]
     np.testing.assert_allclose(displacement, 0.0, atol=0.05)
+
+
+def test_map_resolves_what_its_aperture_averages(world: LocalisationWorld) -> None:
+    """A smaller aperture resolves finer relief and texture: more contrast between neighbouring pixels."""
+    contrasts = []
+    for aperture_px in (1.0, 0.3):
+        appearance = _make_map(world, aperture_px=aperture_px)[0].appearance
+        contrasts.append(float(np.diff(appearance, axis=1).std() / appearance.mean()))
+    assert contrasts[1] > 1.05 * contrasts[0]
 
 
 def test_blur_has_the_transfer_at_the_nyquist_frequency() -> None:

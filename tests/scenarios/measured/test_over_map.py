@@ -15,7 +15,9 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.scenarios.measured import store
+from marsyard.scenarios.localisation.map_product import MapParameters
+from marsyard.scenarios.localisation.world import LocalisationWorld
+from marsyard.scenarios.measured import counterpart, store
 from marsyard.scenarios.measured.columns import MAP_COLUMNS
 from marsyard.scenarios.measured.image_files import read_counts
 from marsyard.scenarios.measured.map_matching import MATCHERS, MapComparison, compare_with_map
@@ -310,6 +312,31 @@ def test_frames_of_the_landing_camera_are_registered_over_jezero(tmp_path: Path,
     assert float(row["template_yield"]) > 0.85
     assert 0.55 < float(row["template_correlation"]) < 0.85
     assert float(row["sift_yield"]) > float(row["orb_yield"])
+
+
+def test_rendered_map_has_the_stated_sharpness(flight: store.CasesFile, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reduced copy of a map is sharper, in its pixels, than orbital images; the default is that of localisation."""
+    mapped, parameters = load_map(flight), []
+
+    def make_map(_world: object, p: MapParameters, *_: object) -> None:
+        parameters.append(p)
+        raise StopIteration
+
+    monkeypatch.setattr(counterpart, "make_map", make_map)
+    monkeypatch.setattr(LocalisationWorld, "from_parameters", lambda *_, **__: None)
+    (image,) = store.load_images(flight, flight.stored.cases[0])
+    recorded = PosedImage.from_detector(image, np.zeros(3), Rotation.identity())
+    for p in (
+        counterpart.CounterpartParameters(),
+        counterpart.CounterpartParameters(map_aperture_px=0.4, map_nyquist_mtf=0.8),
+    ):
+        with pytest.raises(StopIteration):
+            counterpart.render_counterpart(recorded, mapped, 255, None, p, STREAMS, is_level=True)
+    defaults = MapParameters()
+    assert [(p.aperture_px, p.nyquist_mtf) for p in parameters] == [
+        (defaults.aperture_px, defaults.nyquist_mtf),
+        (0.4, 0.8),
+    ]
 
 
 @pytest.mark.slow
