@@ -66,6 +66,16 @@ def reduce_to_map(image: Float[np.ndarray, "side side"], height_m: float) -> Flo
     return np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA))
 
 
+def decimate_map(appearance: Float[np.ndarray, "rows rows"], pixel_m: float) -> Float64[np.ndarray, "side side"]:
+    """Reduce a map to `PIXEL_M` as the copy of the flown map was: by interpolation, without an average over its pixels.
+
+    The spectrum of the copy shows it: up to its Nyquist frequency, the amplitude falls as frequency**-0.95. An average
+    over 16 m would divide it by 1.6 there; instead it is 3 to 10 % larger, because finer detail aliases.
+    """
+    side = round(len(appearance) * pixel_m / PIXEL_M)
+    return cv2.resize(appearance, (side, side), interpolation=cv2.INTER_LINEAR).astype(np.float64)
+
+
 def compare_on_map(site: str, seed: int, turn_deg: float) -> list[MapStatistics]:
     """Simulate a descent, and compare its images with the map; images without a homography have NaN."""
     parameters = LocalisationScenarioParameters.model_validate(
@@ -82,9 +92,8 @@ def compare_on_map(site: str, seed: int, turn_deg: float) -> list[MapStatistics]
     )  # fmt: skip
     descent = LocalisedDescent.simulate(parameters, Streams(seed, "flight-map", 0))
     product, camera = descent.measurements.map_product, true_camera(parameters.camera)
-    side = round(len(product.appearance) * product.pixel_m / PIXEL_M)
     # row 0 of the map product is in the south
-    mapped = cv2.resize(product.appearance[::-1], (side, side), interpolation=cv2.INTER_AREA).astype(np.float64)
+    mapped = decimate_map(product.appearance[::-1], product.pixel_m)
     rows = []
     for image, state in zip(descent.images, descent.image_states, strict=True):
         x, y, z = state.position_m.tolist()
