@@ -124,6 +124,24 @@ def test_changed_kernel_changes_the_cache_folder(kernels: str, tmp_path: Path) -
     assert _find_cache_folder(sources, tmp_path / "cache") != original_folder
 
 
+@pytest.mark.parametrize(
+    "kernel", ["algorithms.hda.kernels.motion:solve", "scenarios.landing.kernels:raise_by_triangles"]
+)
+def test_kernels_are_cached_in_the_folder_for_any_first_import(kernel: str, tmp_path: Path) -> None:
+    module, function = kernel.split(":")
+    program = f"from marsyard.{module} import {function}; print({function}._cache.cache_path)"
+    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    run = subprocess.run(
+        [sys.executable, "-c", program],
+        env=environment | {"MARSYARD_CACHE": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert Path(run.stdout.strip()).is_relative_to(tmp_path / "kernels")
+
+
 def test_cache_folder_set_by_the_user_is_used(tmp_path: Path) -> None:
     assert _find_cache_folder(ROOT, tmp_path, NUMBA_CACHE_DIR="/somewhere") == "/somewhere"
 
