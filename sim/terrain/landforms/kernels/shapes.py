@@ -17,8 +17,8 @@ RIM_HEIGHT_SENSITIVITY = 8.0
 EJECTA_OPACITY = 3.0
 #: RMS of the rays relative to the mean thickness and opacity of the ejecta (assumed).
 RAY_CONTRAST = 0.25
-#: Width of the margin of a crater's fill, in crater radii (assumed).
-FILL_MARGIN = 0.25
+#: Width of the margin in which a crater's fill thins out, in crater radii; fitted to Spirit's descent images.
+FILL_MARGIN = 0.4
 
 
 class Bedforms(NamedTuple):
