@@ -336,7 +336,12 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"
     confidence = f"{format_fraction(verdict.confidence)} confidence"
     word = f"Met by the rate (no confidence, {_ONE})" if by_rate else f"{word} ({confidence}, {_ONE})"
-    reach = f"{word} {', '.join(ranges)}." if ranges else "These cases do not show PASS."
+    none = "These cases do not show PASS."
+    if verdict.status.is_met:
+        none = (
+            f"The cases are too few to state how far PASS reaches (effective number: {number(ball.effective_cases)})."
+        )
+    reach = f"{word} {', '.join(ranges)}." if ranges else none
     examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)
     by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
     chance = (

@@ -25,6 +25,7 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Store a run of two estimators with 40 cases, of which one is silent and eleven answers are wrong."""
     folder = tmp_path_factory.mktemp("results")
     frame = make_rows(40, answer_rate=1.0, terrains=40)
+    frame["terrain"] = range(40)
     frame["velocity_error_m_s"] = [1.0] * 28 + [9.0] * 11 + [float("nan")]
     frame["answered"] = [True] * 39 + [False]
     other = frame.rename(columns=lambda name: f"other.{name}")[["other.outcome", "other.answered"]]

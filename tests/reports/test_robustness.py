@@ -440,6 +440,16 @@ def test_reach_is_the_smallest_change_that_loses_the_verdict(tmp_path: Path) -> 
     assert reach_text(replace(verdicts[0], status=Status.INSUFFICIENT), all_records) == ""
 
 
+def test_too_few_terrains_for_any_change_are_stated(tmp_path: Path) -> None:
+    """60 cases on 20 terrains without a failure have PASS at 80 %, but fewer than 30 effective terrains."""
+    verdicts, _, records = evaluate(
+        tmp_path, 60, 0.8, lambda first, second, kind: first > 9.0, terrain=np.arange(60) // 3
+    )
+    assert verdicts[0].status is Status.PASS
+    text = robustness_text(verdicts[0], records)
+    assert text.startswith("The cases are too few to state how far PASS reaches (effective number: 20).")
+
+
 def test_chance_is_stated(tmp_path: Path) -> None:
     """Ten changes of three dispersions at 90 %: one of them can show FAIL by chance."""
     verdicts, _, records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
