@@ -339,7 +339,7 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     none = "These cases do not show PASS."
     if verdict.status.is_met:
         none = (
-            f"The cases are too few to state how far PASS reaches (effective number: {number(ball.effective_cases)})."
+            f"The cases are too few to state how far PASS reaches (effective number: {ball.effective_cases:.0f})."
         )
     reach = f"{word} {', '.join(ranges)}." if ranges else none
     examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)

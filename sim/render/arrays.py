@@ -5,7 +5,9 @@ programs are stored in the cache folder; their names are hashes of their instruc
 Results do not depend on the number of threads, because each pixel is computed independently of the others.
 """
 
+import gc
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import drjit as dr
@@ -18,9 +20,28 @@ from marsyard.sim.terrain.surface import ALIGNMENT_BYTES
 #: A Dr.Jit array of one of the types of the device.
 Values = Any
 
-#: Decorator of a function over arrays: it is traced for the first arguments, and for later ones only if their types
-#: differ. Numbers are arguments of the compiled program, not constants in it.
-compiled = dr.freeze(auto_opaque=False, warn_after=1000)
+
+def compiled(function: Callable[..., Values]) -> Any:
+    """Decorate a function over arrays: it is traced for the first arguments, and for later ones if their types differ.
+
+    Numbers are arguments of the compiled program, not constants in it. The attribute `frozen` of the result is
+    Dr.Jit's function. While a function is traced, Dr.Jit aborts the process if memory of other arrays is freed, which
+    the collection of reference cycles could do at any time; therefore it is suspended.
+    """
+    frozen = dr.freeze(function, auto_opaque=False, warn_after=1000)
+
+    @wraps(function)
+    def call(*arguments: Values) -> Values:
+        is_enabled = gc.isenabled()
+        gc.disable()
+        try:
+            return frozen(*arguments)
+        finally:
+            if is_enabled:
+                gc.enable()
+
+    call.frozen = frozen  # type: ignore[attr-defined]
+    return call
 
 
 def larger(a: Values, b: Values) -> Values:

@@ -1,5 +1,6 @@
 """Tests of the device that computes images: selection, exchange of arrays, compiled programs, and equal results."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -12,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Photometry, PixelRays, Renderer, Scene, Sun
-from marsyard.sim.render.arrays import clip, larger, smaller, to_device, to_host, vectors_to_device, where
+from marsyard.sim.render.arrays import clip, compiled, larger, smaller, to_device, to_host, vectors_to_device, where
 from marsyard.sim.render.backend import RenderingError
-from marsyard.sim.render.device import Array3f, Float, Int32, select_device
+from marsyard.sim.render.device import Array3f, Float, Float64, Int32, select_device
 from marsyard.sim.render.primary import trace_primary_rays
 from marsyard.sim.render.shading import shade
 from marsyard.sim.terrain import Surface
@@ -92,6 +93,27 @@ def test_selections_equal_those_of_numpy() -> None:
     assert calls
 
 
+def test_no_scene_is_collected_while_a_function_is_traced() -> None:
+    """A collected scene would free arrays, for which Dr.Jit aborts the process during a trace."""
+    states = []
+
+    @compiled
+    def double(values: Float) -> Float:
+        states.append(gc.isenabled())
+        if len(states) == 2:
+            raise ValueError
+        return 2.0 * values
+
+    values = to_device(Float, np.array([1.0, 2.0]))
+    np.testing.assert_array_equal(to_host(double(values)), [2.0, 4.0])
+    assert gc.isenabled()
+    # another type is traced again
+    with pytest.raises(RuntimeError):
+        double(to_device(Float64, np.array([1.0])))
+    assert states == [False, False]
+    assert gc.isenabled()
+
+
 def _render(renderer: Renderer, surface: Surface, size_px: int, elevation_rad: float, height_m: float) -> np.ndarray:
     scene = Scene(surface, (380.0, 200.0), Sun(direction(1.0, elevation_rad)), Photometry())
     pose = rigid(Rotation.from_euler("x", 6.0, degrees=True), np.array([380.0, 200.0, height_m]))
@@ -101,10 +123,10 @@ def _render(renderer: Renderer, surface: Surface, size_px: int, elevation_rad: f
 def test_programs_are_traced_once_for_images_of_all_sizes_and_scenes(renderer: Renderer, terrain: Surface) -> None:
     """A new trace for another size, sun or pose would take seconds in each case."""
     _render(renderer, terrain, 96, 0.5, 700.0)
-    counts = trace_primary_rays.n_recordings, shade.n_recordings
+    counts = trace_primary_rays.frozen.n_recordings, shade.frozen.n_recordings
     _render(renderer, terrain, 128, 0.6, 900.0)
     _render(renderer, terrain, 57, 0.45, 1100.0)
-    assert (trace_primary_rays.n_recordings, shade.n_recordings) == counts
+    assert (trace_primary_rays.frozen.n_recordings, shade.frozen.n_recordings) == counts
 
 
 DEVICE_SCRIPT = """
