@@ -338,9 +338,7 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     word = f"Met by the rate (no confidence, {_ONE})" if by_rate else f"{word} ({confidence}, {_ONE})"
     none = "These cases do not show PASS."
     if verdict.status.is_met:
-        none = (
-            f"The cases are too few to state how far PASS reaches (effective number: {ball.effective_cases:.0f})."
-        )
+        none = f"The cases are too few to state how far PASS reaches (effective number: {ball.effective_cases:.0f})."
     reach = f"{word} {', '.join(ranges)}." if ranges else none
     examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)
     by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
