@@ -36,14 +36,14 @@ class JointEvidence:
     """Contents of the record of confirmations about the claim of a run.
 
     - is_confirmation: whether the run is a confirmation, or repeats one
-    - registration: why the record does not show all earlier runs; empty if it does
+    - registration_problem: why the record does not show all earlier runs; empty if it does
     - own: entry of the run; None if the record does not contain it
     - others: other confirmations of the claim, by number
     - related: confirmations of other claims that began earlier, by claim (`list_related_claims`)
     """
 
     is_confirmation: bool = False
-    registration: str = ""
+    registration_problem: str = ""
     own: Confirmation | None = None
     others: Sequence[Confirmation] = field(default_factory=tuple)
     related: Sequence[Sequence[Confirmation]] = field(default_factory=tuple)
@@ -87,7 +87,7 @@ class JointEvidence:
 
     def is_qualified(self, requirement_id: str) -> bool:
         """Whether PASS of a requirement needs a decision of a person."""
-        return bool(self.registration) or self.has_failed_variant(requirement_id)
+        return bool(self.registration_problem) or self.has_failed_variant(requirement_id)
 
     def has_failed_variant(self, requirement_id: str) -> bool:
         """Whether an earlier claim about the same campaign has not passed a requirement."""
@@ -101,7 +101,7 @@ class JointEvidence:
     @property
     def notes(self) -> tuple[str, ...]:
         """The state of the record, and other claims with their results, in sentences."""
-        texts = [self.registration] if self.registration else []
+        texts = [self.registration_problem] if self.registration_problem else []
         if len(self.numbers) > 1:
             numbers = ", ".join(map(str, self.numbers))
             texts.append(f"The verdicts are those of the joint evidence of the confirmations {numbers} of this claim.")
@@ -162,7 +162,7 @@ def qualify_verdict(verdict: Verdict, joint: JointEvidence, cases: int) -> Verdi
         return verdict.withhold(block)
     if verdict.status is not Status.PASS:
         return verdict
-    if joint.registration:
+    if joint.registration_problem:
         return replace(verdict, status=Status.UNREGISTERED)
     return replace(verdict, status=Status.OTHER_CLAIMS) if joint.has_failed_variant(verdict.requirement_id) else verdict
 

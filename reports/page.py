@@ -1,6 +1,6 @@
-"""Contents of the report's page: rows of tables, figures with captions, and data of the explorer.
+"""Contents of the report's page: rows of tables, figures with captions, provenance and commands.
 
-The explorer is the interactive scatter plot of the page. A driver is a condition that may affect the metric.
+A driver is a condition that may affect the metric.
 """
 
 import base64

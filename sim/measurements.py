@@ -1,4 +1,4 @@
-"""Measurements, the only input of an algorithm, and drive commands.
+"""Measurements, the only input of an algorithm, the targets that operators select, and drive commands.
 
 Measurements contain no ground truth: camera models are calibrated ones, times are time tags, and attitudes and
 altitudes contain measurement errors.
@@ -189,7 +189,7 @@ class DescentMeasurements:
     def events(self) -> list[ImuIncrements | AltitudeMeasurement | DescentFrame]:
         """Return increments, altitudes and frames in the order of their time tags, up to the last image.
 
-        The increments are split at each altitude and image (`ImuIncrements.split`). Missing altitudes and altitudes
+        The increments are split at each altitude and image (`ImuIncrements.merge`). Missing altitudes and altitudes
         before the first increment are omitted. Without increments, only the frames are returned.
         """
         frames = self.frames()

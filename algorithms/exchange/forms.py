@@ -1,4 +1,4 @@
-"""Forms of the answers of each task in JSON: their outcomes and numbers, for programs and tables of answers."""
+"""Forms of velocities and landing sites in JSON: their outcomes and numbers, for programs and tables of answers."""
 
 import json
 from collections.abc import Callable, Mapping

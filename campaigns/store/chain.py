@@ -3,6 +3,7 @@
 Each stored row has an entry in the table `chain`: the SHA-256 of the row, and the head, the SHA-256 of the previous
 head and of this row. The first head is a hash of the texts that identify the campaign. The last head is stored a second
 time, signed with the key of the user (`marsyard.campaigns.store.key`). A row that replaces another one has a new entry.
+The tables of the rows (`cases`, `layouts`, `kinds`) are those of `marsyard.campaigns.store.rows`.
 """
 
 import hashlib
@@ -87,6 +88,7 @@ def find_broken_link(connection: sqlite3.Connection, about: Mapping[str, str]) -
     if added is not None:
         return f"the row of case {added} was added or moved"
     seal = read_seals(connection).get(ROWS)
+    # kinds of columns that are left belong to entries that were removed
     if seal is None or seal[0] != head.hex() or kinds:
         return f"rows after that of case {last_case} were removed" if rows else "rows were removed"
     return ""

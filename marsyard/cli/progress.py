@@ -1,6 +1,6 @@
 """Progress of a running campaign: bars with rate and remaining time on a terminal, text lines otherwise, and `run.log`.
 
-The public classes implement the protocol `ProgressObserver` of `marsyard.campaigns.running.engine`.
+The public classes implement the protocol `ProgressObserver` of `marsyard.campaigns.running.progress`.
 """
 
 from __future__ import annotations
@@ -81,16 +81,16 @@ class BarProgress:
         self._task = self.bars.add_task("starting", visible=False)
 
     def begin(self, stage: str, total: int) -> None:
-        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
+        """See `marsyard.campaigns.running.progress.ProgressObserver`."""
         self.bars.stop_task(self._task)
         self._task = self.bars.add_task(stage, total=total)
 
     def step(self) -> None:
-        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
+        """See `marsyard.campaigns.running.progress.ProgressObserver`."""
         self.bars.advance(self._task)
 
     def note(self, text: str) -> None:
-        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
+        """See `marsyard.campaigns.running.progress.ProgressObserver`."""
         self.bars.console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -103,13 +103,13 @@ class LineProgress:
         self._start_s = self._last_print_s = 0.0
 
     def begin(self, stage: str, total: int) -> None:
-        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
+        """See `marsyard.campaigns.running.progress.ProgressObserver`."""
         self._stage, self._total, self._done = stage, total, 0
         self._start_s = self._last_print_s = time.monotonic()
         self._print(f"{stage}: {total}")
 
     def step(self) -> None:
-        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
+        """See `marsyard.campaigns.running.progress.ProgressObserver`."""
         self._done += 1
         now_s = time.monotonic()
         if self._done < self._total and now_s - self._last_print_s < LINE_INTERVAL_S:
@@ -120,7 +120,7 @@ class LineProgress:
         self._print(f"{text}, {remaining:.0f} s left" if self._done < self._total else f"{text}, {elapsed_s:.1f} s")
 
     def note(self, text: str) -> None:
-        """See `marsyard.campaigns.running.engine.ProgressObserver`."""
+        """See `marsyard.campaigns.running.progress.ProgressObserver`."""
         self._print(f"note: {text}")
 
     def _print(self, text: str) -> None:

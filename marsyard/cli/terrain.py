@@ -70,7 +70,7 @@ def stats(
     from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
-    from marsyard.sim.terrain.published_sites import PAPER
+    from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
     from marsyard.sim.terrain.surface import terrain_statistics
 
     try:
@@ -89,7 +89,7 @@ def stats(
     if not as_json:
         _print_statistics(site, parameters, seed, statistics, extent, grid_north)
         return
-    paper = PAPER.get(site)
+    paper = PUBLISHED_SITES.get(site)
     published: dict[str, Any] | None = None
     if paper is not None:
         published = {"albedo": paper.albedo, "mean_slope_deg": paper.mean_slope_deg}
@@ -117,10 +117,10 @@ def _print_statistics(
 ) -> None:
     from rich.table import Table
 
-    from marsyard.sim.terrain.published_sites import PAPER
+    from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
     from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
 
-    side_m, paper = parameters.samples * parameters.spacing_m, PAPER.get(site)
+    side_m, paper = parameters.samples * parameters.spacing_m, PUBLISHED_SITES.get(site)
     albedo, slope, relief, contrast = "", "", "", ""
     if paper is not None:
         albedo, slope, contrast = _format_range(paper.albedo, 1), _format_range(paper.mean_slope_deg, 0), paper.contrast

@@ -1,4 +1,7 @@
-"""Rendered counterpart of an image over a map: another ground, with the same camera, height, attitude and map pixel."""
+"""Rendered counterpart of an image over a map: another ground, with the same camera, height, attitude and map pixel.
+
+If matchers succeed as often on it as on the recorded image, rendered cases are as hard as real ones.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Annotated

@@ -30,7 +30,7 @@ from marsyard.sim.terrain.surface import (
 )
 
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
-_MODULES_NOT_HASHED = ("rocks", "sites.py")
+_MODULES_NOT_HASHED = ("rocks", "sites.py", "environment.py", "published_sites.py")
 #: Beginning of the identity of a terrain on an imported DTM.
 IMPORTED_TERRAIN = "DTM"
 #: Maximum number of terrains of a bank: one for each case of the largest campaign.

@@ -4,8 +4,11 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class PaperFigures:
-    """Published values of a site: minimum and maximum; slopes are those for baselines of 30 m and 90 m."""
+class PublishedSite:
+    """Published values of a site: minimum and maximum; slopes are those for baselines of 30 m and 90 m.
+
+    - contrast: the publication's words on the contrast of the ground
+    """
 
     albedo: tuple[float, float]
     mean_slope_deg: tuple[float, float]
@@ -13,12 +16,12 @@ class PaperFigures:
     contrast: str
 
 
-_MER_SITE = PaperFigures((0.1, 0.3), (1.0, 2.0), None, "MOC: a lower limit, seen through dust")
+_MER_SITE = PublishedSite((0.1, 0.3), (1.0, 2.0), None, "MOC: a lower limit, seen through dust")
 #: DIMES field test paper, section III.A; it contains common values for the MER landing sites.
-PAPER: dict[str, PaperFigures] = {
-    "pisgah": PaperFigures((0.1, 0.1), (2.0, 3.0), None, "very little; like synthesised images of most MER sites"),
-    "kelso": PaperFigures((0.5, 0.5), (2.0, 3.0), (200.0, float("inf")), "repetitive"),
-    "ivanpah": PaperFigures((0.4, 0.4), (2.0, 3.0), None, "bland; the smoothest of the field sites"),
+PUBLISHED_SITES: dict[str, PublishedSite] = {
+    "pisgah": PublishedSite((0.1, 0.1), (2.0, 3.0), None, "very little; like synthesised images of most MER sites"),
+    "kelso": PublishedSite((0.5, 0.5), (2.0, 3.0), (200.0, float("inf")), "repetitive"),
+    "ivanpah": PublishedSite((0.4, 0.4), (2.0, 3.0), None, "bland; the smoothest of the field sites"),
     "gusev": _MER_SITE,
     "meridiani": _MER_SITE,
 }

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from marsyard.sim.terrain import Environment, Surface, TerrainParameters, site, sites, synthesise
-from marsyard.sim.terrain.published_sites import PAPER
+from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
 from marsyard.sim.terrain.rocks import RockField
 from marsyard.sim.terrain.surface import TerrainStatistics, image_contrast, mean_slope_deg, terrain_statistics
 from tests.sim.scenes import make_ground
@@ -38,7 +38,7 @@ def test_all_sites_exist() -> None:
 
 @pytest.mark.parametrize("name", FIELD_SITES + MARS_SITES)
 def test_albedo_and_slopes_match_the_paper(name: str, site_statistics: dict[str, TerrainStatistics]) -> None:
-    paper, statistics = PAPER[name], site_statistics[name]
+    paper, statistics = PUBLISHED_SITES[name], site_statistics[name]
     assert paper.albedo[0] - 1e-6 <= statistics.albedo <= paper.albedo[1] + 1e-6
     min_value, max_value = paper.mean_slope_deg
     assert min_value <= statistics.mean_slope_30_m_deg <= max_value
@@ -52,7 +52,7 @@ def test_small_bank_terrains_match_the_paper(name: str) -> None:
     statistics = terrain_statistics(
         synthesise(site(name).terrain("descent", {"samples": 2048, "spacing_m": 2.0}), np.random.default_rng(2))
     )
-    min_value, max_value = PAPER[name].mean_slope_deg
+    min_value, max_value = PUBLISHED_SITES[name].mean_slope_deg
     assert min_value <= statistics.mean_slope_30_m_deg <= max_value
     assert min_value <= statistics.mean_slope_90_m_deg <= max_value
 
