@@ -29,7 +29,9 @@ def measure(root: Path = ROOT) -> list[Measurement]:
 
 def _time_make(task: str, folder: Path, cache: Path) -> float:
     """Return the wall-clock time of a task; raises RuntimeError with its last lines if it fails."""
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    # of the caller's environment and of a `make` that started this program
+    inherited = ("PYTHONPATH", "VIRTUAL_ENV", "MAKEFLAGS", "MAKELEVEL", "MFLAGS")
+    environment = {name: value for name, value in os.environ.items() if name not in inherited}
     start = time.perf_counter()
     result = subprocess.run(
         ["make", task], cwd=folder, env=environment | {"MARSYARD_CACHE": str(cache)}, capture_output=True, text=True
