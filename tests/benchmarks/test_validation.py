@@ -34,6 +34,7 @@ REASONS_FOR_WIDE_LIMITS = {
     "rare violations, false": "the guaranteed error rate",
     "change to FAIL": "the guaranteed accuracy; the standard deviation of the estimate is 2 to 3 %",
     "nights with a false alarm": "the guaranteed rate",
+    "kurtosis_8, descent over meridiani divided by gusev": "a factor of two in both directions",
     "refused templates": "the 95 % confidence interval of 1 in 4 templates of flight images",
 }
 
