@@ -32,8 +32,12 @@ def camera_optics(camera: CameraModel) -> Optics:
 class CalibrationParameters(Parameters):
     """Errors of the calibrated camera of an algorithm; those of the descent camera are assumed for all."""
 
-    focal_error: Annotated[float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of focal length")] = 0.0002
-    centre_error_px: Annotated[float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the centre per axis")] = 0.5
+    focal_error: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")
+    ] = 0.0002
+    centre_error_px: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the calibrated image centre per axis, px")
+    ] = 0.5
     distortion_error_px: Annotated[
         float, CALIBRATION, bounded_field(0.0, 50.0, "RMS error of the calibrated distortion in the image corners, px")
     ] = 0.3

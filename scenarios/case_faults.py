@@ -25,8 +25,12 @@ Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 class SizedFaults(Parameters):
     """Sizes of the faults by name; size 0 means no fault."""
 
-    dust_discs: Annotated[int, OPTICS, Field(ge=0, le=1000, description="number of specks on the camera window")] = 0
-    bad_pixels: Annotated[NonNegative, DETECTOR, Field(le=0.5, description="fraction of dead, and of hot pixels")] = 0.0
+    dust_discs: Annotated[
+        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on the camera window")
+    ] = 0
+    bad_pixels: Annotated[
+        NonNegative, DETECTOR, Field(le=0.5, description="fraction of dead pixels, and fraction of hot pixels")
+    ] = 0.0
 
     @property
     def columns(self) -> dict[str, Scalar]:

@@ -5,7 +5,7 @@ from marsyard.scenarios.columns import Column, Kind, condition, error, flag, ins
 SITE = (text("site", "site of the terrain"), Column("terrain", Kind.PROVENANCE, "number of the terrain in the bank"))
 
 SUN = (
-    condition("sun_azimuth_deg", "azimuth, clockwise from north"),
+    condition("sun_azimuth_deg", "azimuth of the sun, clockwise from north"),
     condition("sun_elevation_deg", "elevation of the sun above the horizon"),
 )
 

@@ -50,11 +50,15 @@ class MeshFileError(ValueError):
 class MeshParameters(UserFile):
     """A user's mesh, and its position on the ground; its lowest point is `sink_m` below the ground."""
 
-    kind: Annotated[Literal["rock", "lander", "landmark"], Field(description="rocks have smooth normals")] = "rock"
+    kind: Annotated[
+        Literal["rock", "lander", "landmark"], Field(description="kind of object; rocks have smooth normals")
+    ] = "rock"
     east_m: Annotated[float, Field(allow_inf_nan=False, description="position of the origin")] = 0.0
     north_m: Annotated[float, Field(allow_inf_nan=False)] = 0.0
     heading_deg: Annotated[float, Field(ge=-720.0, le=720.0, description="rotation about up, clockwise")] = 0.0
-    size_m: Annotated[float | None, Field(gt=0.0, le=1000.0, description="largest horizontal extent; scales it")] = None
+    size_m: Annotated[
+        float | None, Field(gt=0.0, le=1000.0, description="maximum horizontal extent; scales the file")
+    ] = None
     scale: Annotated[float, Field(gt=0.0, le=1e4, description="metres per unit of the file, without size_m")] = 1.0
     up: Annotated[Literal["x", "y", "z"], Field(description="the file's axis that points up")] = "z"
     sink_m: Annotated[float, Field(ge=-100.0, le=100.0, description="depth of the lowest point below the ground")] = 0.0

@@ -53,7 +53,7 @@ class Location(Parameters):
 class SunParameters(Parameters):
     """Direction to the sun."""
 
-    azimuth_deg: Annotated[float, bounded_field(-360.0, 720.0, "azimuth, clockwise from north")] = 270.0
+    azimuth_deg: Annotated[float, bounded_field(-360.0, 720.0, "azimuth of the sun, clockwise from north")] = 270.0
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="elevation of the sun above the horizon")] = 40.0
 
 

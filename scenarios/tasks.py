@@ -262,7 +262,9 @@ class AlgorithmSelection(Parameters):
     task: ClassVar[Task[Any, Any]]
 
     algorithm: str
-    compared: Annotated[tuple[str, ...], Field(description="further algorithms, compared on the same cases")] = ()
+    compared: Annotated[
+        tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
+    ] = ()
     executable: Annotated[exchange.ExecutableLimits, Field(description="limits and isolation of custom algorithms")] = (
         exchange.ExecutableLimits()
     )

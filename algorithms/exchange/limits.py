@@ -21,17 +21,27 @@ class ExecutableLimits(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     time_s: Annotated[float, Field(gt=0.0, le=86400.0, description="wall-clock time for an answer, s")] = 60.0
-    total_s: Annotated[float, Field(gt=0.0, le=864000.0, description="wall-clock time for a case's answers")] = 600.0
-    loading_s: Annotated[float, Field(gt=0.0, le=86400.0, description="time to import and construct it")] = 300.0
+    total_s: Annotated[
+        float, Field(gt=0.0, le=864000.0, description="wall-clock time for all answers to one case, s")
+    ] = 600.0
+    loading_s: Annotated[
+        float, Field(gt=0.0, le=86400.0, description="wall-clock time to import and construct a Python class, s")
+    ] = 300.0
     memory_gb: Annotated[float, Field(gt=0.0, le=4096.0, description="resident memory of its process tree")] = 2.0
     output_mb: Annotated[float, Field(gt=0.0, le=1000.0, description="size of its standard output and error")] = 1.0
     files_mb: Annotated[float, Field(gt=0.0, le=1e6, description="size of the files in its temporary folder")] = 100.0
-    isolated: Annotated[bool, Field(description="Python classes run in a process of their own; false: to debug")] = True
-    devices: Annotated[tuple[str, ...], Field(min_length=1, description="devices, given to the workers in turn")] = (
-        CPU,
-    )
-    sandbox: Annotated[bool, Field(description="untrusted: no network, processes or files but its own (bwrap)")] = False
-    visible: Annotated[tuple[str, ...], Field(description="files and folders that it can also read there")] = ()
+    isolated: Annotated[
+        bool, Field(description="custom Python classes run in a process of their own; false: in the worker, to debug")
+    ] = True
+    devices: Annotated[
+        tuple[str, ...], Field(min_length=1, description="devices, such as cuda:0, given to the workers in turn")
+    ] = (CPU,)
+    sandbox: Annotated[
+        bool, Field(description="untrusted: without network, other processes, and files except its own (bubblewrap)")
+    ] = False
+    visible: Annotated[
+        tuple[str, ...], Field(description="further files and folders that it can read in the sandbox")
+    ] = ()
 
     @model_validator(mode="after")
     def _check_sandbox(self) -> ExecutableLimits:

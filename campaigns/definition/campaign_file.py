@@ -126,7 +126,9 @@ class CaseLimits(Parameters):
 class CalibrationRun(Parameters):
     """Options that were set by looking at the results of a run."""
 
-    options: Annotated[tuple[_Text, ...], Field(strict=False, min_length=1)] = Field(description="names of parameters")
+    options: Annotated[tuple[_Text, ...], Field(strict=False, min_length=1)] = Field(
+        description="parameters that were set, as dotted paths"
+    )
     campaign: _Text = Field(description="campaign of the results")
     seed: Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)] = Field(description="seed of the results")
     note: str = ""
@@ -159,7 +161,9 @@ class CampaignDefinition(Parameters):
         description="cases at the last planned evaluation of a campaign that stops when its verdicts are decided; set "
         "by --until-decided",
     )
-    appended: tuple[_Cases, ...] = Field(default=(), strict=False, description="sizes of blocks after the first")
+    appended: tuple[_Cases, ...] = Field(
+        default=(), strict=False, description="sizes of the blocks of cases that were added after the first"
+    )
 
     @property
     def total_cases(self) -> int:

@@ -30,20 +30,27 @@ class RunOptions:
     cluster: options.ClusterOption = None
     case_time: options.CaseTimeOption = None
     out: options.OutOption = None
-    dry_run: Annotated[bool, Option("--dry-run", help="Estimate time and disk space from a few trial cases.")] = False
-    until_decided: Annotated[bool, Option("--until-decided", help="Stop when verdicts are decided.")] = False
+    dry_run: Annotated[bool, Option("--dry-run", help="Only estimate time and disk space from a few trial cases.")] = (
+        False
+    )
+    until_decided: Annotated[
+        bool, Option("--until-decided", help="Stop as soon as the verdicts are decided; --cases is the maximum.")
+    ] = False
     override: options.SetOption = None
     algorithm: options.AlgorithmOption = None
     confirm: Annotated[
         bool,
         Option(
-            "--confirm", help="Evaluate a frozen algorithm on unseen cases: with a new seed, recorded before the run."
+            "--confirm",
+            help="Evaluate a frozen algorithm on unseen cases: draw a new seed, and record the run before it starts.",
         ),
     ] = False
     confirmations: options.ConfirmationsOption = options.CONFIRMATIONS
     shard: Annotated[
         str | None,
-        Option(metavar="K/N", help="Run only shard K of N, on one of N machines; `marsyard merge` combines them."),
+        Option(
+            metavar="K/N", help="Run only shard K of N, on one of N machines; `marsyard merge` combines the shards."
+        ),
     ] = None
 
 

@@ -62,7 +62,9 @@ def score(
     directory: Annotated[Path, Argument(metavar="DIR", help="Folder written by `marsyard export`.")],
     answers: Annotated[
         Path,
-        Argument(metavar="ANSWERS", help="CSV file with answers of an external algorithm (docs/custom-algorithms.md)."),
+        Argument(
+            metavar="ANSWERS", help="CSV file with the answers of the external algorithm (docs/custom-algorithms.md)."
+        ),
     ],
     truth: TruthOption = None,
     out: options.OutOption = None,

@@ -43,7 +43,9 @@ class NewOptions:
     detector: Annotated[str | None, Option(metavar="FILE", help="Custom detector datasheet in TOML.")] = None
     flight: Annotated[
         str | None,
-        Option(metavar="FILE", help="Recorded trajectory (docs/custom-worlds.md); by default simulated dynamics."),
+        Option(
+            metavar="FILE", help="Recorded trajectory (docs/custom-worlds.md); by default the dynamics are simulated."
+        ),
     ] = None
     axes: Annotated[str, Option(help="World axes of the trajectory: enu or ned.")] = "enu"
     bound: Annotated[

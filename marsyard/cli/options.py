@@ -11,7 +11,11 @@ CampaignArgument = Annotated[
     str, Argument(metavar="CAMPAIGN", help="A name from `marsyard list`, or the path of a TOML file.")
 ]
 SiteArgument = Annotated[
-    str, Argument(metavar="SITE", help="A site of `marsyard terrain list`, or a DTM: .tif, .img, .cub or .npz.")
+    str,
+    Argument(
+        metavar="SITE",
+        help="A site from `marsyard terrain list`, or a digital terrain model (DTM): .tif, .img, .cub or .npz.",
+    ),
 ]
 MaxHolesOption = Annotated[
     float | None,
@@ -37,7 +41,11 @@ JsonOption = Annotated[bool, Option("--json", help="Print JSON.")]
 DirectoryArgument = Annotated[Path, Argument(metavar="DIR", help="Folder of a campaign run.")]
 SetOption = Annotated[
     list[str] | None,
-    Option("--set", metavar="KEY=VALUE", help="Set a value, such as render.backend=egl; it is not dispersed."),
+    Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a value, such as render.backend=egl; the parameter is then fixed and not dispersed.",
+    ),
 ]
 AlgorithmOption = Annotated[
     list[str] | None,

@@ -21,7 +21,9 @@ class RenderOptions:
     """Arguments and options of `marsyard render`."""
 
     site: options.SiteArgument
-    camera: Annotated[str, Option(metavar="NAME", help="Camera, such as mer-navcam; an unknown name lists all.")]
+    camera: Annotated[
+        str, Option(metavar="NAME", help="Camera, such as mer-navcam or mer-descent-flown; an unknown name lists all.")
+    ]
     out: Annotated[Path, Option(metavar="PREFIX", help="Path of the files without extension.")]
     scale: Annotated[
         str | None,
@@ -35,8 +37,12 @@ class RenderOptions:
         float | None,
         Option(metavar="M", help="Camera height above the ground; by default a typical height for the camera."),
     ] = None
-    east: Annotated[float | None, Option(metavar="M", help="East of the camera; default: 0, or the centre.")] = None
-    north: Annotated[float | None, Option(metavar="M", help="North of the camera; default: 0, or the centre.")] = None
+    east: Annotated[
+        float | None, Option(metavar="M", help="East coordinate of the camera; by default 0, or the DTM centre.")
+    ] = None
+    north: Annotated[
+        float | None, Option(metavar="M", help="North coordinate of the camera; by default 0, or the DTM centre.")
+    ] = None
     azimuth: Annotated[float, Option(metavar="DEG", help="Viewing direction, clockwise from north.")] = 0.0
     elevation: Annotated[
         float | None,
@@ -44,7 +50,9 @@ class RenderOptions:
     ] = None
     sun_azimuth: Annotated[float, Option(metavar="DEG", help="Sun azimuth, clockwise from north.")] = 250.0
     sun_elevation: Annotated[float, Option(metavar="DEG", help="Sun elevation above the horizon.")] = 35.0
-    detector: Annotated[bool, Option("--detector/--radiance", help="Write counts, or the radiance factor.")] = True
+    detector: Annotated[
+        bool, Option("--detector/--radiance", help="Write detector counts, or the radiance factor (I/F).")
+    ] = True
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain and the noise.")] = 1
     overwrite: options.OverwriteOption = False
     max_holes: options.MaxHolesOption = None

@@ -27,7 +27,10 @@ def replay(
     ] = None,
     save_stages: Annotated[
         bool,
-        Option("--save-stages", help="Also write each intermediate result as a file to stages/ (.npy, .png, .json)."),
+        Option(
+            "--save-stages",
+            help="Also write each intermediate result as a file of its own to stages/ (.npy, .png or .json).",
+        ),
     ] = False,
     rerun: Annotated[
         Path | None, Option(metavar="FILE", help="Also write the case in space and time for the Rerun viewer (.rrd).")

@@ -26,7 +26,9 @@ def report(
     csv: Annotated[bool, Option("--csv", help="Also write all rows to cases.csv.")] = False,
     gallery: Annotated[
         bool,
-        Option("--gallery", help="First run some cases again for their images: largest errors, no answer, random."),
+        Option(
+            "--gallery", help="First run some cases again to store their images: largest errors, no answer, and random."
+        ),
     ] = False,
     trust: options.TrustOption = False,
 ) -> None:

@@ -61,9 +61,15 @@ def prepare_study(arguments: StudyOptions, kind: str) -> tuple[Campaign, Executo
 class RareOptions(StudyOptions):
     """Arguments and options of `marsyard rare`."""
 
-    max_probability: Annotated[float, Option(metavar="P", help="Maximum probability of a violation per case.")] = 1e-4
+    max_probability: Annotated[
+        float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
+    ] = 1e-4
     method: Annotated[
-        str, Option(metavar="METHOD", help="`subset`: subset simulation. `importance`: also with importance sampling.")
+        str,
+        Option(
+            metavar="METHOD",
+            help="`subset`: subset simulation. `importance`: the same, followed by importance sampling.",
+        ),
     ] = "subset"
     samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
     replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6
@@ -75,8 +81,12 @@ class RareOptions(StudyOptions):
             "count for --max-cases.",
         ),
     ] = 600
-    importance_cases: Annotated[int, Option(metavar="N", help="Cases of importance sampling (--method).")] = 600
-    confidence: Annotated[float, Option(metavar="C", help="Two-sided: PASS and FAIL are wrong with (1 - C) / 2.")] = 0.9
+    importance_cases: Annotated[
+        int, Option(metavar="N", help="Cases of importance sampling, for --method importance.")
+    ] = 600
+    confidence: Annotated[
+        float, Option(metavar="C", help="Two-sided confidence: PASS and FAIL are each wrong at most with (1 - C) / 2.")
+    ] = 0.9
     max_cases: MaxCasesOption = 20_000
 
 
@@ -111,10 +121,20 @@ class SearchOptions(StudyOptions):
     """Arguments and options of `marsyard search`."""
 
     cases: Annotated[
-        int, Option("-n", "--cases", metavar="N", help="Cases of the search; each reduction takes further cases.")
+        int,
+        Option(
+            "-n",
+            "--cases",
+            metavar="N",
+            help="Cases of the search; the reduction of each violation takes further cases.",
+        ),
     ] = 300
-    restarts: Annotated[int, Option(metavar="N", help="Optimizer (CMA-ES) runs from different starting cases.")] = 3
-    failures: Annotated[int, Option(metavar="N", help="Maximum number of violations that are reduced to causes.")] = 5
+    restarts: Annotated[
+        int, Option(metavar="N", help="Number of optimizer (CMA-ES) runs from different starting cases.")
+    ] = 3
+    failures: Annotated[
+        int, Option(metavar="N", help="Maximum number of violations whose causes are reduced to a few parameters.")
+    ] = 5
     max_cases: MaxCasesOption = 5_000
 
 
@@ -139,7 +159,9 @@ def search(arguments: SearchOptions) -> None:
 class BudgetOptions(StudyOptions):
     """Arguments and options of `marsyard budget`."""
 
-    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Base cases, for k sources in 2 k + 2 runs.")] = 100
+    cases: Annotated[
+        int, Option("-n", "--cases", metavar="N", help="Base cases. Each runs 2 k + 2 times for k sources of error.")
+    ] = 100
     sobol: Annotated[
         int,
         Option(
@@ -175,13 +197,18 @@ class RobustOptions:
     directory: options.DirectoryArgument
     parameter: Annotated[
         list[str] | None,
-        Option(metavar="PATH=VALUE", help="Run cases with other values of an undispersed parameter, up to VALUE."),
+        Option(
+            metavar="PATH=VALUE",
+            help="Run cases with other values of a parameter that the campaign does not disperse, up to VALUE.",
+        ),
     ] = None
     variant: Annotated[
         list[str] | None,
         Option(metavar="NAME", help="Run cases with an alternative model of the system; `all`: with each of them."),
     ] = None
-    cases: Annotated[int, Option("-n", "--cases", metavar="N", help="Cases for each value and model, from 60.")] = 100
+    cases: Annotated[
+        int, Option("-n", "--cases", metavar="N", help="Cases of the run, at least 60, for each value and model.")
+    ] = 100
     jobs: options.JobsOption = None
     cluster: options.ClusterOption = None
 

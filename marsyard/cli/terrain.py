@@ -54,7 +54,10 @@ def stats(
     site: SiteArgument,
     scale: Annotated[
         str | None,
-        Option(metavar="SCALE", help="`descent` (kilometres) or `ground` (100 metres); by default the first."),
+        Option(
+            metavar="SCALE",
+            help="`descent` (kilometres) or `ground` (a hundred metres); by default `descent`, if the site has it.",
+        ),
     ] = None,
     seed: Annotated[int, Option(metavar="S", min=0, help="Seed of the terrain.")] = 1,
     as_json: JsonOption = False,

@@ -68,7 +68,9 @@ COLUMNS = Columns(
         ),
         outcome("stream_images", "number of images that a stream received"),
         outcome("images_before_answer", "number of images before the first velocity of a stream; 0 without a velocity"),
-        error("velocity_error_after_*_m_s", "velocity error after a stream's image", "velocity error after image *"),
+        error(
+            "velocity_error_after_*_m_s", "velocity error after an image of a stream", "velocity error after image *"
+        ),
         error("firing_velocity_error_m_s", "velocity error, propagated to ignition", "velocity error at ignition"),
         error("firing_velocity_error_x_m_s", "eastward error at ignition", "east velocity error at ignition"),
         error("firing_velocity_error_y_m_s", "northward error at ignition", "north velocity error at ignition"),

@@ -59,22 +59,36 @@ FAULTY_IMAGE = 1
 class DescentFaults(SizedFaults):
     """Faults of a descent."""
 
-    heat_shield_deg: Annotated[NonNegative, Field(le=90.0, description="angular diameter in the first image")] = 0.0
-    cloud_cover: Annotated[NonNegative, CLOUDS, Field(le=0.9, description="fraction of the ground in shadow")] = 0.0
+    heat_shield_deg: Annotated[
+        NonNegative, Field(le=90.0, description="angular diameter of the falling heat shield in the first image")
+    ] = 0.0
+    cloud_cover: Annotated[
+        NonNegative, CLOUDS, Field(le=0.9, description="fraction of the ground in cloud shadows")
+    ] = 0.0
     haze: Haze = 0.0
     dunes_m: Annotated[NonNegative, Field(le=30.0, description="height of regular dunes on the whole terrain")] = 0.0
-    cable_bursts: Annotated[NonNegative, DETECTOR, Field(le=1e4, description="interference bursts per image")] = 0.0
-    exposure_delay_s: Annotated[NonNegative, Field(le=3.0, description="delay of exposure 2 after its time tag")] = 0.0
+    cable_bursts: Annotated[NonNegative, DETECTOR, Field(le=1e4, description="mean interference bursts per image")] = (
+        0.0
+    )
+    exposure_delay_s: Annotated[
+        NonNegative, Field(le=3.0, description="delay of the second exposure after its time tag")
+    ] = 0.0
     repeated_image: Annotated[int, bounded_field(0, 3, "image replaced by the previous one, 2 or 3; 0: none")] = 0
     black_image: Annotated[int, bounded_field(0, 3, "image that is delivered black, 1 to 3; 0: none")] = 0
     shield_range_m: Annotated[
         NonNegative,
-        Field(le=2000.0, description="range to the heat shield in image 1, to which the radar locks; 0: not locked"),
+        Field(
+            le=2000.0, description="range to the heat shield in image 1, if the radar is locked on it; 0: not locked"
+        ),
     ] = 0.0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
-    altitude_error_once: Annotated[NonNegative, Field(le=0.9, description="additional error of altitude 2")] = 0.0
+    altitude_error_once: Annotated[
+        NonNegative, Field(le=0.9, description="additional relative error of the altitude of image 2")
+    ] = 0.0
     attitude_error_deg: Annotated[NonNegative, Field(le=90.0, description="tilt error of all attitudes")] = 0.0
-    attitude_error_once_deg: Annotated[NonNegative, Field(le=90.0, description="additional tilt at image 2")] = 0.0
+    attitude_error_once_deg: Annotated[
+        NonNegative, Field(le=90.0, description="additional tilt error of the attitude of image 2")
+    ] = 0.0
 
     def detector_changes(self) -> dict[str, Mapping[str, float | bool]]:
         """Return the detector parameters that the faults change, including interference bursts on the camera cable."""
@@ -148,15 +162,21 @@ class DescentLanderParameters(Parameters):
     camera, which moves its shadow by 1 deg in the view. This is not modelled: DIMES masks a zero-phase spot of 4 deg.
     """
 
-    caster_diameter_m: Annotated[float, SHADOW, bounded_field(0.0, 100.0, "diameter of the casting disc")] = 10.9
+    caster_diameter_m: Annotated[
+        float, SHADOW, bounded_field(0.0, 100.0, "diameter of the disc that casts the shadow")
+    ] = 10.9
 
 
 class LandingParameters(Parameters):
     """Parameters of the landing (`descent.score.compute_touchdown`); all values except the burn's are assumed."""
 
     computation_s: Annotated[float, bounded_field(0.0, 1000.0, "computation time on the flight computer")] = 14.0
-    steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "horizontal speed without steering")] = 5.0
-    max_steering_m_s: Annotated[float, bounded_field(0.0, 100.0, "limit: burn of 80 m/s, 15 deg tilt")] = 20.0
+    steering_deadband_m_s: Annotated[float, bounded_field(0.0, 100.0, "maximum horizontal speed without steering")] = (
+        5.0
+    )
+    max_steering_m_s: Annotated[float, bounded_field(0.0, 100.0, "limit of steering: burn of 80 m/s, 15 deg tilt")] = (
+        20.0
+    )
     steering_error: Annotated[float, bounded_field(0.0, 1.0, "RMS relative error of the steering per axis")] = 0.1
     burn_error_m_s: Annotated[float, bounded_field(0.0, 50.0, "RMS velocity error of the burn per axis")] = 1.0
 
@@ -177,7 +197,9 @@ class DescentCameraParameters(CalibrationParameters):
     radial_0: Annotated[float, bounded_field(-0.1, 0.1, "radial distortion R0 (CAHVOR)")] = 0.00096
     radial_1: Annotated[float, bounded_field(-0.5, 0.5, "radial distortion R1 (CAHVOR)")] = -0.002183
     radial_2: Annotated[float, bounded_field(-0.5, 0.5, "radial distortion R2 (CAHVOR)")] = 0.018547
-    alignment_error_deg: Annotated[float, CALIBRATION, bounded_field(0.0, 10.0, "RMS mounting error per axis")] = 0.02
+    alignment_error_deg: Annotated[
+        float, CALIBRATION, bounded_field(0.0, 10.0, "RMS error of the mounting per axis")
+    ] = 0.02
 
 
 class InertialParameters(Parameters):
@@ -229,7 +251,7 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         site_validator("a descent", "descent"),
         Field(description="preset of terrain, light and gravity; none: generic terrain"),
     ] = None
-    terrain_site: Annotated[str | None, Field(description="site of the terrain; set from `site`")] = None
+    terrain_site: Annotated[str | None, Field(description="site of the terrain; set automatically from `site`")] = None
     location: Location = Location()
     terrain: CheckedTerrain = TerrainParameters()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom objects on the ground")] = ()
@@ -237,7 +259,9 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
     dust_opacity: DustOpacity = None
     photometry: PhotometryChanges = PhotometryChanges()
     descent: SwingParameters = SwingParameters()
-    images: Annotated[int, bounded_field(2, 100, "number of images; only streams use more than three")] = TRIPLE_SIZE
+    images: Annotated[int, bounded_field(2, 100, "number of images; only stream estimators use more than three")] = (
+        TRIPLE_SIZE
+    )
     #: Default: the last image and two earlier ones, at the longest possible equal intervals.
     triple: Annotated[tuple[int, int, int] | None, Field(description="image numbers of the triple, from 1")] = None
     flight: Annotated[Flight | None, Field(description="recorded flight or custom motion")] = None
@@ -256,7 +280,10 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
         offset_sd_s=0.001, jitter_sd_s=0.0005
     )
     exact_instruments: Annotated[
-        bool, Field(description="estimators receive true attitudes, altitudes, times, camera: the error from images")
+        bool,
+        Field(
+            description="estimators receive true attitudes, altitudes, times, camera; shows the error from the images"
+        ),
     ] = False
     landing: LandingParameters = LandingParameters()
     render: RenderParameters = Field(default_factory=RenderParameters)

@@ -37,9 +37,13 @@ class FlightFile(UserFile, RecordedAxes):
     origin: Annotated[
         FlightOrigin, Field(description="origin of positions: ground below the first image, or the terrain's origin")
     ] = FlightOrigin.LOCATION
-    first_image_s: Annotated[float | None, Field(description="time of image 1; default: start + `lead_s`")] = None
+    first_image_s: Annotated[
+        float | None, Field(description="file's time of the first image; default: file's start + `lead_s`")
+    ] = None
     lead_s: Annotated[float, bounded_field(0.2, 30.0, "navigation time before the first image")] = 5.0
-    heading_offset_deg: Annotated[float, bounded_field(-720.0, 720.0, "clockwise rotation of the flight")] = 0.0
+    heading_offset_deg: Annotated[
+        float, bounded_field(-720.0, 720.0, "rotation of the flight about the vertical, clockwise from above")
+    ] = 0.0
 
     @classmethod
     def file_hash(cls, file: str) -> str:

@@ -44,9 +44,9 @@ class RunParameters(Parameters):
     same_direction: Annotated[Count, Field(description="triples at three altitudes, one flight direction")] = 0
     opposite_direction: Annotated[Count, Field(description="triples at three altitudes, both directions")] = 0
     clouds: Annotated[CloudParameters | None, Field(description="clouds whose shadows drift over the site")] = None
-    cable_bursts: Annotated[NonNegative, Field(le=1e4, description="interference bursts per image (faulty cable)")] = (
-        0.0
-    )
+    cable_bursts: Annotated[
+        NonNegative, Field(le=1e4, description="mean interference bursts per image, from a faulty camera cable")
+    ] = 0.0
 
     @property
     def triples(self) -> int:
@@ -67,7 +67,9 @@ class DriftParameters(Parameters):
         ATTITUDE,
         Field(description="gyro bias per temperature change, deg/h/K; axis along the line: tilts the camera across it"),
     ] = 1.0
-    change_k: Annotated[float, Field(ge=-100.0, le=100.0, description="final temperature change; 0: no drift")] = -19.0
+    change_k: Annotated[
+        float, Field(ge=-100.0, le=100.0, description="temperature change after a long time, K; 0: no drift")
+    ] = -19.0
     time_constant_s: Annotated[Positive, Field(description="time constant of the cooling, s (assumed)")] = 300.0
 
 
@@ -89,9 +91,9 @@ class ImageTargetParameters(Parameters):
     centroid_px: Annotated[
         NonNegative, Field(description="standard deviation of a centroid per axis for the attitude fit, px (assumed)")
     ] = 0.15
-    prior_deg: Annotated[Positive, Field(le=5.0, description="platform's error per axis before the fit (assumed)")] = (
-        1.0
-    )
+    prior_deg: Annotated[
+        Positive, Field(le=5.0, description="error of the platform's attitude per axis, deg, before the fit (assumed)")
+    ] = 1.0
     survey_m: Annotated[NonNegative, Field(description="error of the survey per axis, m (assumed)")] = 0.02
 
     @model_validator(mode="after")
@@ -112,7 +114,9 @@ class ElevationParameters(Parameters):
     posting_m: Annotated[Positive, Field(description="spacing of the model's samples (posts), m")] = 30.0
     error_m: Annotated[NonNegative, ELEVATION, Field(description="standard deviation of a post's error, m")] = 6.0
     correlation_m: Annotated[Positive, Field(description="correlation length of post errors, m (assumed)")] = 150.0
-    interpolation_m: Annotated[NonNegative, ELEVATION, Field(description="SD of the interpolation error")] = 1.0
+    interpolation_m: Annotated[
+        NonNegative, ELEVATION, Field(description="standard deviation of the interpolation error, m")
+    ] = 1.0
 
 
 class ImageParameters(Parameters):
@@ -132,13 +136,18 @@ class TripleParameters(Parameters):
     """Selection of triples from a run's images (paper, III.D and IV)."""
 
     virtual_interval_s: Annotated[
-        Positive, Field(le=60.0, description="time assigned to the interval between two images, as in the MER landings")
+        Positive,
+        Field(
+            le=60.0, description="time that is assigned to the interval between two images, as in the MER landings, s"
+        ),
     ] = 3.75
     velocity_bias_m_s: Annotated[
         NonNegative,
         Field(description="SD per axis of the constant error of the horizontal inertial velocity (assumed: the wind)"),
     ] = 15.0
-    max_speed_m_s: Annotated[Positive, Field(description="maximum of distance / virtual interval, as in DIMES")] = 30.0
+    max_speed_m_s: Annotated[
+        Positive, Field(description="maximum speed: distance divided by the virtual interval, as in DIMES")
+    ] = 30.0
     overlap_fraction: Annotated[
         Positive, Field(description="maximum distance between two image centres divided by the altitude (assumed)")
     ] = 0.35

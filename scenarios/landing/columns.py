@@ -15,7 +15,11 @@ COLUMNS = Columns(
         condition("height_m", "true height above the ground at the first image"),
         condition("baseline_m", "true distance between both camera positions"),
         condition("baseline_fraction", "horizontal part of the baseline, divided by the height", "baseline / height"),
-        condition("height_change_fraction", "change between the images / height", "change of height / height"),
+        condition(
+            "height_change_fraction",
+            "change of the height between both images, divided by the height",
+            "change of height / height",
+        ),
         condition("pair_rotation_deg", "true rotation between both images", "rotation between the two images"),
         condition("pitch_deg", "component of the true rotation between both images about the body's x axis"),
         condition("yaw_deg", "component of the true rotation between both images about the body's y axis"),
@@ -37,13 +41,13 @@ COLUMNS = Columns(
         instrument_error("level_error_deg", "error of the measured vertical", "tilt error of the vertical"),
         instrument_error("pose_position_error_m", "error of the first pose's position", "position error of the pose"),
         instrument_error(
-            "pose_motion_error_m", "error of the motion between the poses", "error of the motion between the poses"
+            "pose_motion_error_m", "error of the motion between both poses", "error of the motion between the poses"
         ),
         instrument_error("pose_tilt_error_deg", "tilt error of the first pose", "tilt error of the pose"),
         instrument_error("pose_azimuth_error_deg", "azimuth error of the first pose", "azimuth error of the pose"),
         instrument_error(
             "pose_rotation_error_deg",
-            "error of the rotation between the poses",
+            "error of the rotation between both poses",
             "error of the rotation between the poses",
         ),
         instrument_error(
@@ -66,7 +70,12 @@ COLUMNS = Columns(
             Kind.TRUTH,
         ),
         flag("hazard_visible", "both images show a footprint that is not safe", "with a visible hazard", Kind.TRUTH),
-        flag("within_limits", "the motion is within the paper's limits", "within the tracking limits", Kind.TRUTH),
+        flag(
+            "within_limits",
+            "the change between the images is within the paper's limits",
+            "within the tracking limits",
+            Kind.TRUTH,
+        ),
         flag(
             "strict_threshold",
             "the algorithm's limit of the roughness is at most that of the lander",
@@ -75,7 +84,9 @@ COLUMNS = Columns(
         ),
         outcome("features", "selected features"),
         outcome("tracks", "accepted tracks"),
-        outcome("features_in_view", "features truly in both images", "features visible in both images"),
+        outcome(
+            "features_in_view", "features whose true position is in both images", "features visible in both images"
+        ),
         error("tracks_correct", "accepted tracks within 1 px of the true position"),
         error("tracked_fraction", "correct tracks, divided by the features in view"),
         error("tracks_outlier_fraction", "fraction of the accepted tracks that are not correct"),
@@ -128,7 +139,11 @@ COLUMNS = Columns(
         ),
         outcome("site_slope_deg", "true slope at the site", "true slope at the site"),
         outcome("site_roughness_m", "true roughness at the site", "true roughness at the site"),
-        error("site_hazard_distance_m", "distance from site to nearest hazard", "distance from site to nearest hazard"),
+        error(
+            "site_hazard_distance_m",
+            "distance from the site to the nearest hazard",
+            "distance from the site to the nearest hazard",
+        ),
         error("site_margin", "distance of slope and roughness from their limits, relative to them; the smaller one"),
         flag("landed", "the helicopter lands", "that land"),
         flag("touchdown_safe", "the touchdown is on safe ground"),
@@ -148,12 +163,16 @@ COLUMNS = Columns(
         outcome("touchdown_slope_deg", "true slope at the touchdown"),
         outcome("touchdown_roughness_m", "true roughness at the touchdown"),
         error("touchdown_hazard_distance_m", "distance from the touchdown to the nearest hazard"),
-        error("touchdown_margin", "distance of slope and roughness at touchdown from their limits; the smaller one"),
+        error(
+            "touchdown_margin", "distance of slope and roughness at the touchdown from their limits; the smaller one"
+        ),
         outcome("touchdown_sink_m_s", "vertical speed at touchdown"),
         outcome("touchdown_horizontal_speed_m_s", "horizontal speed at touchdown"),
         outcome("gps_solutions", "averaged solutions of the receiver after touchdown"),
         outcome("landing_iterations", "iterations of flight and filter", "iterations of flight and filter"),
-        outcome("landing_path_change_m", "change in the last iteration", "path change in the last iteration"),
+        outcome(
+            "landing_path_change_m", "change of the path in the last iteration", "path change in the last iteration"
+        ),
         outcome("landing_after_s", "time from the second image to touchdown", "time from the images to the landing"),
     )
 )

@@ -18,11 +18,17 @@ class LandingFaults(SizedFaults):
 
     black_image: Annotated[int, bounded_field(0, 2, "number of the black image, 1 or 2; 0: none")] = 0
     repeated_image: Annotated[int, bounded_field(0, 1, "1: the second image is a copy of the first")] = 0
-    lost_rows: Annotated[float, bounded_field(0.0, 1.0, "fraction of image 2 that is lost, from the bottom")] = 0.0
+    lost_rows: Annotated[
+        float, bounded_field(0.0, 1.0, "fraction of the rows of image 2 that is lost, from the bottom")
+    ] = 0.0
     lost_images: Annotated[float, bounded_field(0.0, 1.0, "fraction of images lost; two always arrive")] = 0.0
-    laser_silent: Annotated[int, bounded_field(0, 1, "1: the altimeter returns no range, also in the landing")] = 0
+    laser_silent: Annotated[
+        int, bounded_field(0, 1, "1: the altimeter returns no range, at the images and in the landing")
+    ] = 0
     laser_stuck: Annotated[float, bounded_field(0.0, 5.0, "relative excess of the stuck range; 0: no fault")] = 0.0
-    gps_outage_s: Annotated[float, bounded_field(0.0, 300.0, "duration before image 1; it lasts to the end")] = 0.0
+    gps_outage_s: Annotated[
+        float, bounded_field(0.0, 300.0, "duration of the GPS outage before image 1; it lasts to the end")
+    ] = 0.0
     listed_bad_pixels: Annotated[
         float,
         DETECTOR,

@@ -36,8 +36,12 @@ class LandingHelicopterParameters(Parameters):
     image_clock: ClockParameters = Field(
         default=ClockParameters(offset_sd_s=0.001, jitter_sd_s=0.0005), description="errors of the time tags (assumed)"
     )
-    averaging_after_s: float = Field(default=2.0, ge=2.0, le=3600.0, description="start after touchdown (assumed)")
-    averaging_s: float = Field(default=5.0, gt=0.0, le=600.0, description="dozens of solutions, as in the paper")
+    averaging_after_s: float = Field(
+        default=2.0, ge=2.0, le=3600.0, description="start of the average after touchdown (assumed)"
+    )
+    averaging_s: float = Field(
+        default=5.0, gt=0.0, le=600.0, description="duration of the average: dozens of solutions, as in the paper"
+    )
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -62,32 +62,38 @@ class ImagePoseParameters(Parameters):
     heading_deg: Annotated[Angle, Field(description="azimuth of the image's upper edge")] = 0.0
     course_deg: Annotated[Angle, Field(description="clockwise from the upper edge; 90: along the rows")] = 90.0
     tilt_deg: Annotated[float, Field(ge=0.0, le=60.0, description="angle of the first optical axis from nadir")] = 0.0
-    tilt_towards_deg: Annotated[Angle, Field(description="azimuth to which the first optical axis tilts")] = 0.0
+    tilt_towards_deg: Annotated[Angle, Field(description="azimuth towards which the first optical axis is tilted")] = (
+        0.0
+    )
     climb_fraction: float = Field(default=0.0, gt=-0.9, le=5.0, description="change of height divided by height")
     roll_deg: Annotated[Angle, Field(description="rotation about the optical axis between the images")] = 0.0
     pitch_deg: Annotated[Angle, Field(description="rotation about the image's right direction")] = 0.0
     yaw_deg: Annotated[Angle, Field(description="rotation about the image's up direction")] = 0.0
-    rate_deg_s: Annotated[NonNegative, RATE, Field(le=100.0, description="RMS rate per axis at an image")] = 0.0
+    rate_deg_s: Annotated[NonNegative, RATE, Field(le=100.0, description="RMS attitude rate per axis at an image")] = (
+        0.0
+    )
 
 
 class PoseErrorParameters(Parameters):
     """Standard deviations per axis of the on-board poses and of the inclinometers, sampled for a case."""
 
     position_m: Annotated[NonNegative, POSE_POSITION] = Field(
-        default=0.02, le=100.0, description="SD common to both images"
+        default=0.02, le=100.0, description="SD of the position, common to both images"
     )
-    motion_m: Annotated[NonNegative, POSE_POSITION, Field(le=10.0, description="SD of the motion between images")] = (
-        0.01
-    )
+    motion_m: Annotated[
+        NonNegative, POSE_POSITION, Field(le=10.0, description="SD of the motion between images, m")
+    ] = 0.01
     tilt_deg: Annotated[NonNegative, POSE_ATTITUDE] = Field(
-        default=0.3, le=30.0, description="SD common to both images"
+        default=0.3, le=30.0, description="SD of roll and pitch, common to both images"
     )
     azimuth_deg: Annotated[NonNegative, POSE_ATTITUDE] = Field(
-        default=1.0, le=30.0, description="SD common to both images"
+        default=1.0, le=30.0, description="SD of the azimuth, common to both images"
     )
-    rotation_deg: Annotated[NonNegative, POSE_ATTITUDE, Field(le=10.0, description="SD between the images")] = 0.1
+    rotation_deg: Annotated[
+        NonNegative, POSE_ATTITUDE, Field(le=10.0, description="SD of the rotation between images")
+    ] = 0.1
     inclinometer_deg: Annotated[NonNegative, POSE_ATTITUDE] = Field(
-        default=0.2, le=30.0, description="SD of roll and pitch"
+        default=0.2, le=30.0, description="SD of the inclinometers' roll and pitch"
     )
 
 
@@ -107,7 +113,9 @@ class LanderParameters(Parameters):
     diameter_m: float = Field(default=2.0, gt=0.0, le=100.0, description="diameter of the footprint disc (paper, IV)")
     max_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="slope of the plane under the lander")] = 15.0
     max_roughness_m: float = Field(default=0.2, gt=0.0, le=100.0, description="maximum distance from the plane")
-    caster_diameter_m: NonNegative = Field(default=0.0, le=100.0, description="diameter of the casting disc; 0: none")
+    caster_diameter_m: NonNegative = Field(
+        default=0.0, le=100.0, description="diameter of the disc that casts the lander's shadow; 0: none"
+    )
 
     @property
     def limits(self) -> Limits:
@@ -123,11 +131,13 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
 
     site: Annotated[str, Field(description="preset of terrain, light, texture and rocks")] = "heli-hazardous"
     scale: Annotated[Literal["ground", "descent"], Field(description="terrain of the site")] = "ground"
-    terrain_site: str | None = Field(default=None, description="site of the terrain; set from `site`")
+    terrain_site: str | None = Field(default=None, description="site of the terrain; set automatically from `site`")
     terrain: CheckedTerrain = TerrainParameters()
     location: Location = Location()
     meshes: Annotated[tuple[MeshParameters, ...], Field(description="custom meshes on the ground")] = ()
-    texture: NonNegative = Field(default=1.0, le=10.0, description="contrast of the fine texture / its nominal value")
+    texture: NonNegative = Field(
+        default=1.0, le=10.0, description="contrast of the fine texture of the ground, relative to its nominal value"
+    )
     sun: SunParameters = SunParameters()
     dust_opacity: DustOpacity = None
     photometry: PhotometryChanges = PhotometryChanges()
@@ -140,7 +150,7 @@ class LandingScenarioParameters(AlgorithmSelection, CustomScores):
         description="camera poses at the images; a helicopter flight uses only the azimuths",
     )
     navigation: PoseErrorParameters = Field(
-        default=PoseErrorParameters(), description="of cases without a helicopter flight"
+        default=PoseErrorParameters(), description="navigation errors of cases without a helicopter flight"
     )
     helicopter: LandingHelicopterParameters | None = Field(default=None, description="helicopter flight and landing")
     pair: PairParameters = Field(default=PairParameters(), description="choice of two images of a helicopter flight")

@@ -36,7 +36,9 @@ COLUMNS = Columns(
         error("position_error_east_m", "eastward error of the last position, relative to the map"),
         error("position_error_north_m", "northward error of the last position, relative to the map"),
         error("position_error_up_m", "vertical error of the last position"),
-        error("position_error_world_m", "horizontal distance of reported and true position in the world at the end"),
+        error(
+            "position_error_world_m", "horizontal distance between reported and true position in the world at the end"
+        ),
         error(
             "position_error_at_10_s_m",
             "horizontal error of the last position reported within 10 s of the start",

@@ -78,12 +78,16 @@ class ProfileParameters(Parameters):
     """
 
     altitude_start_m: Annotated[float, bounded_field(1000.0, 8000.0, "altitude at time 0")] = 4200.0
-    parachute: Annotated[SwingParameters, Field(description="its altitudes are not used")] = PARACHUTE
+    parachute: Annotated[SwingParameters, Field(description="parachute descent; its altitudes are not used")] = (
+        PARACHUTE
+    )
     altitude_separation_m: Annotated[float, bounded_field(800.0, 7000.0, "altitude of backshell separation")] = 2100.0
     altitude_end_m: Annotated[float, bounded_field(200.0, 5000.0, "altitude at the end of localisation")] = 500.0
     descent_speed_m_s: Annotated[float, bounded_field(10.0, 150.0, "final vertical speed")] = 50.0
     max_vertical_m_s2: Annotated[float, bounded_field(0.5, 20.0, "limit of the vertical acceleration (assumed)")] = 3.0
-    max_horizontal_m_s2: Annotated[float, bounded_field(0.1, 5.0, "limit of horizontal acceleration (assumed)")] = 1.0
+    max_horizontal_m_s2: Annotated[float, bounded_field(0.1, 5.0, "limit of the horizontal acceleration (assumed)")] = (
+        1.0
+    )
     velocity_gain_per_s: Annotated[float, bounded_field(0.05, 1.0, "gain k of the velocity (assumed)")] = 0.5
     thrust_lag_rad_s: Annotated[float, bounded_field(2.0, 20.0, "frequency W of the thrust's lag (assumed)")] = 6.0
     free_fall_s: Annotated[float, bounded_field(0.0, 3.0, "separation to start of the thrusters (assumed)")] = 1.0

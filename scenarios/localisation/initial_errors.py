@@ -24,7 +24,9 @@ class InitialErrors(Parameters):
     of each other and of the inertial unit's errors.
     """
 
-    horizontal_sd_m: Annotated[NonNegative, INITIAL, Field(description="sd per axis, not truncated (assumed)")] = 1000.0
+    horizontal_sd_m: Annotated[
+        NonNegative, INITIAL, Field(description="sd per axis before truncation, m (assumed)")
+    ] = 1000.0
     horizontal_max_m: Annotated[float, Field(gt=0.0, description="largest horizontal position error, m")] = 3200.0
     vertical_sd_m: Annotated[NonNegative, INITIAL, Field(description="sd of the height, m (assumed)")] = 100.0
     velocity_sd_m_s: Annotated[NonNegative, INITIAL, Field(description="sd per axis, m/s (assumed)")] = 1.0

@@ -43,7 +43,9 @@ class LanderCameraParameters(Parameters):
     alignment_error_deg: Annotated[
         float, CALIBRATION, bounded_field(0.0, 10.0, "RMS error of the calibrated mounting per axis (assumed)")
     ] = 0.02
-    calibration: Annotated[CalibrationParameters, Field(description="of the lens (assumed)")] = CalibrationParameters()
+    calibration: Annotated[CalibrationParameters, Field(description="errors of the calibrated lens (assumed)")] = (
+        CalibrationParameters()
+    )
 
     @model_validator(mode="after")
     def _check_field(self) -> LanderCameraParameters:

@@ -64,15 +64,26 @@ class MapParameters(Parameters):
     sun_azimuth_deg: Annotated[
         float, bounded_field(0.0, 360.0, "azimuth of the sun in the orbital images, clockwise from north (15 h)")
     ] = 275.0
-    sun_elevation_deg: Annotated[float, bounded_field(5.0, 90.0, "sun in the orbital images (15 h local time)")] = 40.0
+    sun_elevation_deg: Annotated[
+        float, bounded_field(5.0, 90.0, "elevation of the sun in the orbital images (15 h local time)")
+    ] = 40.0
     optical_depth: Annotated[
         float | None, Field(ge=0.0, le=10.0, description="optical depth in the orbital images; None: as at the landing")
     ] = None
-    orbit_height_m: Annotated[float, bounded_field(1e5, 1e6, "height of the orbiter above the map's centre")] = 3.0e5
-    signal_to_noise: Annotated[Positive, Field(description="mean signal / SD of noise per map pixel; assumed")] = 100.0
-    aperture_px: Annotated[float, bounded_field(0.1, 1.0, "ground averaged by a detector element; assumed")] = 0.8
+    orbit_height_m: Annotated[
+        float, bounded_field(1e5, 1e6, "height of the orbiter above the ground, above the map's centre, m")
+    ] = 3.0e5
+    signal_to_noise: Annotated[
+        Positive, Field(description="mean signal divided by the SD of noise per map pixel; assumed")
+    ] = 100.0
+    aperture_px: Annotated[
+        float, bounded_field(0.1, 1.0, "width of the ground that a detector element averages, map pixels; assumed")
+    ] = 0.8
     nyquist_mtf: Annotated[
-        float, bounded_field(0.01, 1.0, "optics, motion, processing, without aperture, per two pixels; assumed")
+        float,
+        bounded_field(
+            0.01, 1.0, "MTF of optics, motion and processing, without aperture, at one cycle per two pixels; assumed"
+        ),
     ] = 0.33
     bits: Annotated[int | None, Field(ge=6, le=16, description="bits of a pixel; None: not quantised")] = 8
     registration_sd_m: Annotated[
@@ -80,10 +91,16 @@ class MapParameters(Parameters):
         REGISTRATION,
         Field(description="SD of the shift of the whole map, per axis, m; assumed: up to 150 m is 3 SD"),
     ] = 50.0
-    distortion_sd_m: Annotated[NonNegative, DISTORTION, Field(description="SD per axis; assumed: one pixel")] = 6.0
-    distortion_length_m: Annotated[Positive, Field(description="correlation length; assumed")] = 1500.0
+    distortion_sd_m: Annotated[
+        NonNegative, DISTORTION, Field(description="SD of the distortion, per axis, m; assumed: one pixel")
+    ] = 6.0
+    distortion_length_m: Annotated[Positive, Field(description="correlation length of the distortion, m; assumed")] = (
+        1500.0
+    )
     elevation_sd_m: Annotated[NonNegative, ELEVATION, Field(description="SD of the elevation error, m; assumed")] = 5.0
-    elevation_length_m: Annotated[Positive, Field(description="correlation length of the error; assumed")] = 300.0
+    elevation_length_m: Annotated[
+        Positive, Field(description="correlation length of the elevation error, m; assumed")
+    ] = 300.0
     elevation_post_m: Annotated[
         NonNegative, Field(description="distance of the elevation model's posts, m; assumed; 0: exact in each pixel")
     ] = 20.0

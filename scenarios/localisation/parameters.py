@@ -29,12 +29,16 @@ from marsyard.sim.terrain import PhotometryChanges, Site, TerrainParameters
 class LocalisationFaults(SizedFaults):
     """Faults of a descent with localisation."""
 
-    heat_shield_deg: Annotated[NonNegative, Field(le=60.0, description="angular diameter in the first image")] = 0.0
+    heat_shield_deg: Annotated[
+        NonNegative, Field(le=60.0, description="angular diameter of the falling heat shield in the first image")
+    ] = 0.0
     haze: Haze = 0.0
     lost_images: Annotated[NonNegative, Field(le=1.0, description="fraction of images that is not delivered")] = 0.0
     black_image: Annotated[int, bounded_field(0, 100, "image that is delivered black, from 1; 0: none")] = 0
     altitude_error: Annotated[NonNegative, Field(le=0.9, description="relative excess of all altitudes")] = 0.0
-    attitude_error_deg: Annotated[NonNegative, Field(le=30.0, description="added tilt of the initial attitude")] = 0.0
+    attitude_error_deg: Annotated[
+        NonNegative, Field(le=30.0, description="additional tilt error of the initial attitude")
+    ] = 0.0
     wrong_map: Annotated[int, bounded_field(0, 1, "1: the map shows another terrain of the same site")] = 0
 
 
@@ -49,7 +53,9 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     task = LOCALISATION
 
     site: Annotated[str, Field(description="preset of terrain, light and gravity")] = "crater-floor"
-    terrain_site: Annotated[str, Field(description="site of the terrain; set from `site`")] = "crater-floor"
+    terrain_site: Annotated[str, Field(description="site of the terrain; set automatically from `site`")] = (
+        "crater-floor"
+    )
     location: Location = Location()
     terrain: CheckedTerrain
     start_east_m: Annotated[float, bounded_field(-3000.0, 3000.0, "start, east of the map's centre")] = 0.0

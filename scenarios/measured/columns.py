@@ -75,7 +75,9 @@ VELOCITY_COLUMNS = Columns(
         condition("sun_elevation_deg", "elevation of the sun above the horizon"),
         flag("truth_known", "the truth is known"),
         error("inertial_difference_m_s", "difference from the inertial velocity, which has an unknown constant error"),
-        error("pair_discrepancy_m_s", "difference of velocity changes between both pairs: estimated minus inertial"),
+        error(
+            "pair_discrepancy_m_s", "difference of the velocity changes between both pairs: estimated minus inertial"
+        ),
         error("difference_m_s", "difference from the answer of the algorithm under test"),
     )
 )

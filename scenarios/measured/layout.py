@@ -35,7 +35,9 @@ class IngestError(ValueError):
 class CameraTable(Parameters):
     """Default camera of the images."""
 
-    file: Annotated[str | None, Field(description="camera file; not for PDS3 products, whose labels have one")] = None
+    file: Annotated[
+        str | None, Field(description="camera file; not needed for PDS3 products, whose labels contain the camera")
+    ] = None
     number: Annotated[int, Field(ge=0, description="index of the camera in the file, from 0")] = 0
     pose_in_file: Annotated[
         bool,
@@ -44,7 +46,9 @@ class CameraTable(Parameters):
             "false: the camera looks down, regardless of the pose in the file"
         ),
     ] = False
-    subframe_folded_in: Annotated[bool, Field(description="PDS labels: the model is of the stored image")] = False
+    subframe_folded_in: Annotated[
+        bool, Field(description="PDS labels: a subframe's model describes the stored image")
+    ] = False
 
 
 class DetectorTable(Parameters):
@@ -53,8 +57,12 @@ class DetectorTable(Parameters):
     bits: Annotated[int, Field(ge=1, le=16, description="bits of a count; the largest count is 2^bits - 1")]
     offset_dn: Annotated[float, Field(ge=0.0, le=65535.0, description="count of a dark pixel")] = 0.0
     exposure_s: Annotated[float, Field(ge=0.0, le=100.0, description="exposure time; 0: unknown")] = 0.0
-    transfer_row_s: Annotated[float, Field(ge=0.0, le=1.0, description="time per row while shifted; 0: none")] = 0.0
-    clear_row_s: Annotated[float, bounded_field(0.0, 1.0, "time under each row while cleared; 0: none")] = 0.0
+    transfer_row_s: Annotated[
+        float, Field(ge=0.0, le=1.0, description="frame transfer: time under each row while shifted out; 0: none")
+    ] = 0.0
+    clear_row_s: Annotated[
+        float, bounded_field(0.0, 1.0, "frame transfer: time under each row while cleared; 0: none")
+    ] = 0.0
     rows_summed: Annotated[
         int | None,
         Field(ge=1, le=64, description="detector rows in an image row; default: ratio of the camera's focal lengths"),
@@ -71,7 +79,7 @@ class DetectorTable(Parameters):
 class SunTable(Parameters):
     """Default direction to the sun."""
 
-    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth, clockwise from north")]
+    azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")]
     elevation_deg: Annotated[float, Field(gt=0.0, le=90.0, description="elevation of the sun above the horizon")]
 
     @property
@@ -109,7 +117,12 @@ class IngestFile(Parameters):
     name: Annotated[
         str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100, description="name of the campaign")
     ]
-    task: Annotated[TaskName, Field(description="velocity: three images; landing: two; matching: from two; map: one")]
+    task: Annotated[
+        TaskName,
+        Field(
+            description="velocity: three images of a descent; landing: two; matching: two or more; map: one, over a map"
+        ),
+    ]
     description: Annotated[str, Field(description="description in the report")] = ""
     poses: Annotated[RecordedAxes | None, Field(description="not needed if PDS3 labels contain all poses")] = None
     camera: CameraTable = CameraTable()

@@ -40,7 +40,9 @@ class OverMapParameters(MeasuredParameters):
 
     task_name = "map"
 
-    position_sd_m: Annotated[NonNegative, Field(description="SD of a measured position: range of the search")] = 100.0
+    position_sd_m: Annotated[
+        NonNegative, Field(description="SD of a measured position per axis, m: range of the landmarks' search")
+    ] = 100.0
     lvs: Annotated[LvsOptions, Field(description="options of the landmarks")] = LvsOptions()
     rendered: Annotated[CounterpartParameters, Field(description="rendered images")] = CounterpartParameters()
 

@@ -41,7 +41,9 @@ _TARGET = (
     condition("slip_mean", "mean slip of the wheels, weighted with the lengths", "mean wheel slip"),
     condition("slip_max", "maximum slip of the wheels", "maximum wheel slip"),
     instrument_error("pose_error_m", "position error of the rover's estimated pose at the last stop"),
-    instrument_error("pose_error_fraction", "pose error / distance", "rover pose error / distance driven"),
+    instrument_error(
+        "pose_error_fraction", "pose error, divided by the distance", "rover pose error / distance driven"
+    ),
     outcome("duration_min", "time from the first to the last stop, minutes"),
     condition("sun_motion_deg", "angle between the sun's directions at the first and the last stop"),
     condition("min_exposure_s", "shortest exposure", "shortest exposure"),
@@ -106,7 +108,9 @@ _TARGET = (
     outcome("stereo_score_min", "smallest correlation of a stereo match"),
     outcome("magnification_min", "smallest change of the template's scale"),
     outcome("magnification_max", "largest change of the template's scale"),
-    outcome("correction_max_px", "maximum from prediction to match", "maximum distance from prediction to match"),
+    outcome(
+        "correction_max_px", "largest distance from prediction to match", "maximum distance from prediction to match"
+    ),
     outcome("update_time_s", "mean processor time of an update"),
 )
 

@@ -55,9 +55,13 @@ class WorldParameters(Parameters):
     samples: Annotated[int, Field(ge=256, le=8192, description="samples along each side, every 2.5 cm")] = 2048
     incline: InclineParameters = InclineParameters()
     rms_slope_deg: Annotated[float | None, bounded_field(0.0, 30.0, "ground's RMS slope; default: the site's")] = None
-    dust_opacity: Annotated[float | None, bounded_field(0.0, 10.0, "optical depth of dust; default: the site's")] = None
+    dust_opacity: Annotated[
+        float | None, bounded_field(0.0, 10.0, "optical depth of the dusty air; default: the site's")
+    ] = None
     photometry: PhotometryChanges = PhotometryChanges()
-    rock_abundance: Annotated[float | None, bounded_field(0.0, 0.4, "of the ground; default: the site's")] = None
+    rock_abundance: Annotated[
+        float | None, bounded_field(0.0, 0.4, "fraction of the ground covered by rocks; default: the site's")
+    ] = None
     largest_near_m: Annotated[NonNegative, Field(description="maximum diameter of rocks on the route")] = 0.08
     east_m: float = Field(default=8.0, description="east position of the target's rock on the periodic terrain, m")
     north_m: float = Field(default=8.0, description="north position of the target's rock on the periodic terrain, m")
@@ -101,20 +105,29 @@ class TargetParameters(Parameters):
 
     diameter_m: Annotated[float, Field(gt=0.01, le=5.0, description="diameter of the rock")] = 0.8
     height_m: Annotated[Positive | None, Field(description="height of the rock; default: half the diameter")] = None
-    shape: Annotated[int | None, Field(ge=0, le=31, description="number of the shape; random if omitted")] = None
+    shape: Annotated[
+        int | None, Field(ge=0, le=31, description="number of the rock's shape; random if omitted, see PlacedRock")
+    ] = None
     yaw_deg: Annotated[float | None, Field(description="yaw of the rock, deg; random if omitted")] = None
-    across: Annotated[float, Field(ge=-1.0, le=1.0, description="designated point: -1 at its left, 1 at its right")] = (
-        0.0
-    )
-    up: Annotated[float, Field(ge=0.0, le=1.0, description="designated point: 0 at its foot, 1 at its top")] = 0.5
+    across: Annotated[
+        float,
+        Field(ge=-1.0, le=1.0, description="designated point on the rock: -1 at its left edge, 1 at its right edge"),
+    ] = 0.0
+    up: Annotated[
+        float, Field(ge=0.0, le=1.0, description="designated point on the rock: 0 at its foot, 1 at its top")
+    ] = 0.5
     designation: Literal["pixel", "rover", "site"] = Field(default="pixel", description="kind of designation")
 
 
 class StartParameters(Parameters):
     """The rover's position and heading at the start, relative to the target."""
 
-    distance_m: float = Field(default=10.0, gt=1.0, le=40.0, description="horizontal distance from mast to target")
-    bearing_deg: Azimuth = Field(default=270.0, description="azimuth from target to rover, clockwise from north")
+    distance_m: float = Field(
+        default=10.0, gt=1.0, le=40.0, description="horizontal distance from mast to designated point"
+    )
+    bearing_deg: Azimuth = Field(
+        default=270.0, description="azimuth from the target to the rover at the start, clockwise from north"
+    )
     target_azimuth_deg: RelativeAngle = Field(default=0.0, description="direction of the target, to the right of ahead")
 
 
@@ -133,13 +146,19 @@ class LegParameters(Parameters):
 
     motion: Literal["stay", "approach", "back-off", "straight", "turn", "circle"] = "approach"
     steps: Annotated[int, bounded_field(1, 200, "number of steps; the maximum of an approach or back-off")] = 60
-    step_fraction: float = Field(default=0.1, gt=0.0, le=0.9, description="step / camera's distance from the target")
+    step_fraction: float = Field(
+        default=0.1, gt=0.0, le=0.9, description="step length divided by the camera's distance from the target"
+    )
     step_m: Annotated[float | None, Field(description="fixed step length; required for straight")] = None
     step_deg: Annotated[RelativeAngle, Field(description="step of a turn or circle")] = 5.0
     goal_m: Positive = Field(default=2.0, description="final horizontal distance of the rover's origin from the target")
-    ends_with_steps: bool = Field(default=False, description="whether all steps complete it, even before goal_m")
+    ends_with_steps: bool = Field(
+        default=False, description="whether the leg is complete after all steps, even before goal_m"
+    )
     offset_right_m: float = Field(default=0.0, description="offset of the goal to the right of the target's direction")
-    shuffle_m: NonNegative = Field(default=0.0, description="short drive after each step of a turn, forward and back")
+    shuffle_m: NonNegative = Field(
+        default=0.0, description="length of a short drive after each step of a turn, alternately forward and back"
+    )
     visual_odometry: Annotated[bool, Field(description="whether the pose is corrected by visual odometry")] = False
     visual_odometry_step_m: Positive = Field(
         default=0.75, description="maximum drive between two image pairs of visual odometry (60 % overlap)"
@@ -165,13 +184,15 @@ SUN_MOTION = ErrorSource("sun", "motion of the sun")
 class MovingSunParameters(Parameters):
     """Position of the sun at the start, and motion of the sun."""
 
-    azimuth_deg: Annotated[Azimuth, Field(description="azimuth, clockwise from north")] = 225.0
+    azimuth_deg: Annotated[Azimuth, Field(description="azimuth of the sun, clockwise from north")] = 225.0
     elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun above the horizon")] = 45.0
     hour_angle_deg_min: Annotated[
         float, SUN_MOTION, bounded_field(-1.0, 1.0, "rotation rate of the sun, deg/min; Table IV: 16 deg in 66 min")
     ] = 16.0 / 66.0
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0, description="latitude of the site, north positive")] = -2.0
-    update_interval_s: Annotated[Positive, Field(description="interval between positions of the sun")] = 120.0
+    update_interval_s: Annotated[Positive, Field(description="interval between updates of the sun's position, s")] = (
+        120.0
+    )
 
     def direction(self, time_s: float) -> Float64[np.ndarray, "3"]:
         """Compute the unit vector to the sun, world axes; the sun rotates westwards about the pole."""
@@ -240,10 +261,18 @@ class MastCameraParameters(Parameters):
     )
     custom: Annotated[CustomPair | None, Field(description="a custom pair on the preset's mast")] = None
     detector: DetectorChoice | None = Field(default=None, description="both detectors; default: the preset's")
-    detector_noise: Annotated[bool, DETECTOR, Field(description="whether images have noise and response")] = True
-    defocus_px: Annotated[NonNegative, OPTICS, Field(le=10.0, description="diameter of a point's blur circle")] = 0.0
-    stray_light: Annotated[float, OPTICS, bounded_field(0.0, 0.5, "fraction of light that is spread")] = 0.0
-    dust_discs: Annotated[int, OPTICS, Field(ge=0, le=1000, description="number of specks on each camera window")] = 0
+    detector_noise: Annotated[bool, DETECTOR, Field(description="whether images have detector noise and response")] = (
+        True
+    )
+    defocus_px: Annotated[
+        NonNegative, OPTICS, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
+    ] = 0.0
+    stray_light: Annotated[
+        float, OPTICS, bounded_field(0.0, 0.5, "stray light: fraction of all light that is spread evenly")
+    ] = 0.0
+    dust_discs: Annotated[
+        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on each camera window")
+    ] = 0
     dust_depth: Annotated[Fraction, Field(description="fraction of the light absorbed by a speck")] = 0.3
 
     @field_validator("preset")
@@ -351,7 +380,9 @@ class RoverScenarioParameters(AlgorithmSelection, CustomScores):
     camera: MastCameraParameters = MastCameraParameters()
     exposure: ExposureParameters = ExposureParameters()
     sun: MovingSunParameters = MovingSunParameters()
-    clouds: Annotated[CloudParameters | None, CLOUDS, Field(description="clouds, whose shadows drift")] = None
+    clouds: Annotated[CloudParameters | None, CLOUDS, Field(description="clouds whose shadows drift over the run")] = (
+        None
+    )
     rover_shadow: Annotated[bool, SHADOW, Field(description="whether the rover and its mast cast shadows")] = True
     timing: TimingParameters = TimingParameters()
     algorithm: str = Field(default="vtt", description="vtt, pure-ncc, lucas-kanade, or a custom 'module:Class'")

@@ -64,7 +64,9 @@ class VariantParameters(Parameters):
     height_m: Annotated[float, Field(gt=0.01, le=5.0, description="height of the rock")] = 0.8
     shape: Annotated[int, Field(ge=0, le=31, description="number of the rock's shape, see PlacedRock")] = 0
     yaw_deg: Annotated[float, Field(description="yaw of the rock, deg")] = 0.0
-    sun_azimuth_deg: Annotated[float, Field(ge=-360.0, le=720.0, description="azimuth, clockwise from north")] = 225.0
+    sun_azimuth_deg: Annotated[
+        float, Field(ge=-360.0, le=720.0, description="azimuth of the sun, clockwise from north")
+    ] = 225.0
     sun_elevation_deg: Annotated[float, Field(gt=3.0, le=90.0, description="elevation of the sun")] = 45.0
 
 
@@ -90,7 +92,9 @@ class SharedDriveParameters(Parameters):
     """
 
     drive: Annotated[RoverScenarioParameters, Field(description="drive with its smallest steps, and the tracker")]
-    variants: Annotated[tuple[VariantParameters, ...], Field(min_length=1, description="rock, terrain, sun of a run")]
+    variants: Annotated[
+        tuple[VariantParameters, ...], Field(min_length=1, description="rock, terrain, sun of each run")
+    ]
     targets: Annotated[tuple[PointParameters, ...], Field(min_length=1, description="points on every run's rock")]
     run: Annotated[int, Field(ge=0, description="index of the run")] = 0
     target: Annotated[int, Field(ge=0, description="index of the target")] = 0

@@ -49,15 +49,25 @@ class SlipParameters(Parameters):
     Climb and cross slope are the slopes along and across the motion; tilt is the rover's angle from the vertical.
     """
 
-    flat: Annotated[Fraction, SLIP, Field(description="slip on level ground, fraction of the commanded path")] = 0.01
-    full_slope_deg: Annotated[float, Field(gt=0.0, lt=90.0, description="slope at which wheels slip completely")] = 20.0
+    flat: Annotated[Fraction, SLIP, Field(description="wheel slip on level ground, fraction of the commanded path")] = (
+        0.01
+    )
+    full_slope_deg: Annotated[
+        float, Field(gt=0.0, lt=90.0, description="slope at which the wheels slip completely")
+    ] = 20.0
     exponent: Annotated[float, bounded_field(1.0, 100.0, "exponent of the slope in the slip formula")] = 2.4
     downhill: Annotated[Fraction, SLIP, Field(description="path gained downhill divided by path lost uphill")] = 0.3
     across: Annotated[Fraction, SLIP, Field(description="sideways sliding on a cross slope / path lost uphill")] = 0.5
     turn: Annotated[Fraction, SLIP, Field(description="fraction of a turn lost on level ground")] = 0.03
-    turn_slope: Annotated[Fraction, SLIP, Field(description="fraction of a turn lost / path lost uphill")] = 0.5
-    soil_spread: Annotated[LogDeviation, SLIP, Field(description="RMS logarithm of the soil factor of a run")] = 0.15
-    step_spread: Annotated[LogDeviation, SLIP, Field(description="RMS logarithm of each command's factor")] = 0.15
+    turn_slope: Annotated[
+        Fraction, SLIP, Field(description="fraction of a turn lost on a slope / path lost uphill")
+    ] = 0.5
+    soil_spread: Annotated[
+        LogDeviation, SLIP, Field(description="RMS of the logarithm of the soil factor of a run")
+    ] = 0.15
+    step_spread: Annotated[LogDeviation, SLIP, Field(description="RMS of the logarithm of each command's factor")] = (
+        0.15
+    )
     wander_deg_m: Annotated[
         float, SLIP, bounded_field(0.0, 10.0, "RMS random turn on 1 m of path; grows with the square root of the path")
     ] = 0.3

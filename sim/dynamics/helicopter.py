@@ -48,19 +48,25 @@ class HelicopterParameters(Parameters):
     """
 
     pass_s: Annotated[Positive, Field(le=1000.0, description="duration of a pass (assumed)")] = 70.0
-    collection_s: Annotated[Positive, Field(description="time from the first pass's start to the last's end")] = 1800.0
+    collection_s: Annotated[
+        Positive, Field(description="time from the start of the first to the end of the last pass")
+    ] = 1800.0
     speed_m_s: Annotated[Positive, Field(le=100.0, description="mean speed along a pass")] = 30.0
     speed_change_m_s: Annotated[float, bounded_field(0.0, 10.0, "RMS change of speed within a pass (assumed)")] = 1.0
-    lowest_m: Annotated[Positive, Field(description="initial height of the first pass above ground")] = 1000.0
+    lowest_m: Annotated[Positive, Field(description="initial height of the first pass above the line's ground")] = (
+        1000.0
+    )
     highest_m: Annotated[Positive, Field(description="height above the line's ground that ends the last pass")] = 2000.0
     min_climb_m_s: Annotated[float, bounded_field(0.1, 10.0, "minimum rate of climb on a pass")] = 1.0
     max_climb_m_s: Annotated[float, bounded_field(0.1, 10.0, "maximum rate of climb on a pass")] = 2.0
     wander_m: Annotated[float, bounded_field(0.0, 200.0, "RMS distance from the line (assumed)")] = 8.0
-    pointing_deg: Annotated[Angle, Field(description="RMS tilt along and across (assumed: it reaches the limit)")] = (
-        12.0
-    )
+    pointing_deg: Annotated[
+        Angle, Field(description="RMS tilt along and across the line (assumed: flights reach the maximum)")
+    ] = 12.0
     max_tilt_deg: Annotated[Angle, Field(description="maximum angle off nadir of pointing and swing")] = 45.0
-    swinging_fraction: Annotated[Fraction, Field(description="fraction of passes that swing (assumed)")] = 0.5
+    swinging_fraction: Annotated[Fraction, Field(description="fraction of passes with a swinging camera (assumed)")] = (
+        0.5
+    )
     swing_rate_deg_s: Annotated[float, bounded_field(0.0, 120.0, "maximum rate of the swinging")] = 60.0
     swing_hz: Annotated[Positive, Field(le=5.0, description="frequency of the swinging, 1/s (assumed)")] = 0.6
     platform_deg: Annotated[float, bounded_field(0.0, 10.0, "RMS residual motion of the platform (assumed)")] = 0.2

@@ -28,21 +28,37 @@ class SwingParameters(WindParameters):
 
     altitude_first_m: Annotated[float, Field(gt=100.0, le=10000.0, description="altitude of the first image")] = 2000.0
     interval_s: Annotated[float, Field(gt=0.1, le=60.0, description="time between images")] = 3.75
-    descent_rate_m_s: Annotated[float, bounded_field(20.0, 200.0, "descent rate at the first image")] = 75.0
-    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "CO2 at 220 K")] = 11200.0
-    cone_angle_deg: Annotated[float, SWING, bounded_field(0.0, 45.0, "largest angle from the axis to nadir")] = 15.0
-    cone_minor_fraction: Annotated[float, bounded_field(-1.0, 1.0, "minor / major axis; sign: sense of rotation")] = 0.5
+    descent_rate_m_s: Annotated[
+        float, bounded_field(20.0, 200.0, "descent rate of the parachute at the first image")
+    ] = 75.0
+    density_scale_height_m: Annotated[float, bounded_field(5000.0, 20000.0, "density scale height: CO2 at 220 K")] = (
+        11200.0
+    )
+    cone_angle_deg: Annotated[
+        float, SWING, bounded_field(0.0, 45.0, "largest angle between the lander's axis and nadir")
+    ] = 15.0
+    cone_minor_fraction: Annotated[
+        float, bounded_field(-1.0, 1.0, "minor / major axis of the coning; sign: sense of rotation")
+    ] = 0.5
     cone_direction_deg: Annotated[Degrees, Field(description="azimuth of the major axis of the coning")] = 0.0
     cone_phase_deg: Annotated[Degrees, Field(description="phase of the coning at the first image")] = 0.0
-    cone_damping_ratio: Annotated[float, bounded_field(-0.05, 0.2, "small coning (assumed)")] = 0.01
+    cone_damping_ratio: Annotated[float, bounded_field(-0.05, 0.2, "damping of small coning / critical (assumed)")] = (
+        0.01
+    )
     nod_rate_deg_s: Annotated[
         float, SWING, bounded_field(0.0, 120.0, "largest rate of the nodding: fast swing of the lander on its bridle")
     ] = 20.0
-    nod_direction_deg: Annotated[Degrees, Field(description="azimuth relative to the coning's major axis")] = 0.0
+    nod_direction_deg: Annotated[
+        Degrees, Field(description="azimuth of the nodding, relative to the coning's major axis")
+    ] = 0.0
     nod_phase_deg: Annotated[Degrees, Field(description="phase of the nodding at the first image")] = 0.0
-    nod_damping_ratio: Annotated[float, bounded_field(0.0, 0.5, "small nodding (assumed)")] = 0.002
+    nod_damping_ratio: Annotated[float, bounded_field(0.0, 0.5, "damping of small nodding / critical (assumed)")] = (
+        0.002
+    )
     heading_deg: Annotated[Degrees, Field(description="rotation about the lander's axis at the first image")] = 0.0
-    spin_rate_deg_s: Annotated[float, SWING, bounded_field(-30.0, 30.0, "about its axis, at the first image")] = 0.0
+    spin_rate_deg_s: Annotated[
+        float, SWING, bounded_field(-30.0, 30.0, "spin rate about the lander's axis at the first image")
+    ] = 0.0
     line_length_m: Annotated[float, bounded_field(10.0, 200.0, "canopy to hinge; bridle 20 m, rest assumed")] = 47.0
     bridle_length_m: Annotated[float, bounded_field(1.0, 100.0, "from the backshell to the hinge")] = 20.0
     canopy_mass_kg: Annotated[float, bounded_field(1.0, 1000.0, "canopy, lines and entrained air (assumed)")] = 30.0
@@ -52,7 +68,9 @@ class SwingParameters(WindParameters):
     gyration_transverse_m: Annotated[Gyration, Field(description="radius of gyration across the axis (assumed)")] = 0.5
     gyration_axial_m: Annotated[Gyration, Field(description="radius of gyration about the axis (assumed)")] = 0.5
     arm_length_m: Annotated[float, bounded_field(0.0, 10.0, "from the hinge to the camera (assumed)")] = 1.5
-    thruster_firing_m: Annotated[float, bounded_field(0.0, 1000.0, "height above ground at the firing")] = 100.0
+    thruster_firing_m: Annotated[float, bounded_field(0.0, 1000.0, "height above ground of the thrusters' firing")] = (
+        100.0
+    )
 
     @model_validator(mode="after")
     def _check_bridle(self) -> SwingParameters:

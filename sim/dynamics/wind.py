@@ -28,8 +28,12 @@ class WindParameters(Parameters):
     wind_north_m_s: Annotated[float, bounded_field(-60.0, 60.0, "mean wind to the north")] = 0.0
     wind_layer_m: Annotated[Positive, Field(le=5000.0, description="depth of the boundary layer (assumed)")] = 500.0
     wind_roughness_m: Annotated[Positive, Field(le=1.0, description="roughness (Mars Pathfinder: 0.03)")] = 0.03
-    gust_intensity_m_s: Annotated[float, GUSTS, bounded_field(0.0, 20.0, "RMS of each component (assumed)")] = 1.5
-    gust_length_m: Annotated[float, bounded_field(50.0, 5000.0, "scale (MIL-F-8785C above 610 m: 533 m)")] = 533.0
+    gust_intensity_m_s: Annotated[
+        float, GUSTS, bounded_field(0.0, 20.0, "RMS of each component of the gusts (assumed)")
+    ] = 1.5
+    gust_length_m: Annotated[float, bounded_field(50.0, 5000.0, "length scale (MIL-F-8785C above 610 m: 533 m)")] = (
+        533.0
+    )
 
 
 @dataclass(frozen=True)

@@ -36,9 +36,15 @@ class ApproachParameters(Parameters):
     scale factor error of the spin-axis gyro after its calibration against the stars during cruise.
     """
 
-    attitude_sd_deg: Annotated[NonNegative, ATTITUDE, Field(description="error at the reference per axis")] = 0.05
-    velocity_sd_m_s: Annotated[NonNegative, ACCELERATION, Field(description="error at the reference per axis")] = 1.0
-    spin_scale_ppm: Annotated[NonNegative, ATTITUDE, Field(description="scale error of the spin gyro")] = 100.0
+    attitude_sd_deg: Annotated[
+        NonNegative, ATTITUDE, Field(description="attitude error at the reference per axis, deg")
+    ] = 0.05
+    velocity_sd_m_s: Annotated[
+        NonNegative, ACCELERATION, Field(description="velocity error at the reference per axis, m/s")
+    ] = 1.0
+    spin_scale_ppm: Annotated[NonNegative, ATTITUDE, Field(description="scale factor error of the spin gyro, ppm")] = (
+        100.0
+    )
     cruise_s: Annotated[NonNegative, Field(le=20000.0, description="time from star reference to entry, s")] = 900.0
     entry_s: Annotated[Positive, Field(le=2000.0, description="time from entry to parachute deployment, s")] = 240.0
     parachute_s: Annotated[Positive, Field(le=2000.0, description="time from deployment to the descent, s")] = 80.0

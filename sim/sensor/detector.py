@@ -81,10 +81,16 @@ class DetectorParameters(Parameters):
     temperature_c: Annotated[float, Field(ge=-150.0, le=80.0, description="temperature of the detector, deg C")] = -34.0
     dark_e_s: Annotated[NonNegative, Field(description="dark current of a pixel at 0 deg C, electrons/s")] = 159.0
     dark_doubling_c: Annotated[float, Field(gt=0.0, le=50.0, description="temperature rise for doubling, deg C")] = 6.0
-    response_spread: Annotated[_RelativeError, DETECTOR, Field(description="RMS relative response")] = 0.01
-    residual_spread: Annotated[_RelativeError, DETECTOR, Field(description="RMS pattern without calibration")] = 0.0
+    response_spread: Annotated[_RelativeError, DETECTOR, Field(description="RMS of the pixels' relative response")] = (
+        0.01
+    )
+    residual_spread: Annotated[
+        _RelativeError, DETECTOR, Field(description="RMS of a pattern in the response that the calibration lacks")
+    ] = 0.0
     residual_px: Annotated[float, Field(gt=0.0, le=100.0, description="scale (SD) of this pattern's blur, px")] = 2.0
-    calibration_error: Annotated[_RelativeError, DETECTOR, Field(description="RMS error of the calibration")] = 0.002
+    calibration_error: Annotated[
+        _RelativeError, DETECTOR, Field(description="RMS error of the calibrated response")
+    ] = 0.002
     companded: Annotated[bool, Field(description="compress counts to 8 bits and expand them again")] = False
     optics: OpticsParameters = OpticsParameters()
     defects: DefectParameters = DefectParameters()

@@ -60,20 +60,36 @@ class ImuParameters(Parameters):
     gyro_bias_deg_h: Annotated[NonNegative, ATTITUDE, Field(description="constant gyro bias, deg/h")] = 1.0
     gyro_wander_deg_h: Annotated[NonNegative, ATTITUDE, Field(description="time-correlated gyro bias, deg/h")] = 0.35
     gyro_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 100.0
-    gyro_bias_deg_h_k: Annotated[NonNegative, ATTITUDE, Field(description="bias change with temperature")] = 0.1
-    angular_random_walk_deg_sqrt_h: Annotated[NonNegative, ATTITUDE, Field(description="angular random walk")] = 0.07
-    gyro_scale_ppm: Annotated[NonNegative, ATTITUDE, Field(description="gyro scale factor error, ppm")] = 100.0
-    gyro_misalignment_mrad: Annotated[NonNegative, ATTITUDE, Field(description="cross-axis sensitivity")] = 0.1
-    gyro_count_rad: Annotated[NonNegative, Field(description="resolution, rad; 0: no rounding")] = 2.0**-19
-    accelerometer_bias_mg: Annotated[NonNegative, ACCELERATION, Field(description="constant bias")] = 0.3
-    accelerometer_wander_mg: Annotated[NonNegative, ACCELERATION, Field(description="time-correlated bias")] = 0.05
-    accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 60.0
-    accelerometer_bias_mg_k: Annotated[NonNegative, ACCELERATION, Field(description="bias change with temperature")] = (
-        0.02
+    gyro_bias_deg_h_k: Annotated[NonNegative, ATTITUDE, Field(description="bias change with temperature, deg/h/K")] = (
+        0.1
     )
-    velocity_random_walk_ug_sqrt_hz: Annotated[NonNegative, ACCELERATION, Field(description="velocity noise")] = 50.0
-    accelerometer_scale_ppm: Annotated[NonNegative, ACCELERATION, Field(description="scale factor error")] = 300.0
-    accelerometer_misalignment_mrad: Annotated[NonNegative, ACCELERATION, Field(description="cross sensitivity")] = 0.1
+    angular_random_walk_deg_sqrt_h: Annotated[
+        NonNegative, ATTITUDE, Field(description="angular random walk, deg/sqrt(h)")
+    ] = 0.07
+    gyro_scale_ppm: Annotated[NonNegative, ATTITUDE, Field(description="gyro scale factor error, ppm")] = 100.0
+    gyro_misalignment_mrad: Annotated[
+        NonNegative, ATTITUDE, Field(description="cross-axis sensitivity of each gyro, mrad")
+    ] = 0.1
+    gyro_count_rad: Annotated[NonNegative, Field(description="resolution, rad; 0: no rounding")] = 2.0**-19
+    accelerometer_bias_mg: Annotated[
+        NonNegative, ACCELERATION, Field(description="constant accelerometer bias, mg")
+    ] = 0.3
+    accelerometer_wander_mg: Annotated[
+        NonNegative, ACCELERATION, Field(description="time-correlated accelerometer bias, mg")
+    ] = 0.05
+    accelerometer_wander_s: Annotated[Positive, Field(description="correlation time of the bias, s")] = 60.0
+    accelerometer_bias_mg_k: Annotated[
+        NonNegative, ACCELERATION, Field(description="bias change with temperature, mg/K")
+    ] = 0.02
+    velocity_random_walk_ug_sqrt_hz: Annotated[
+        NonNegative, ACCELERATION, Field(description="velocity noise, ug/sqrt(Hz)")
+    ] = 50.0
+    accelerometer_scale_ppm: Annotated[
+        NonNegative, ACCELERATION, Field(description="accelerometer scale factor error, ppm")
+    ] = 300.0
+    accelerometer_misalignment_mrad: Annotated[
+        NonNegative, ACCELERATION, Field(description="cross-axis sensitivity, mrad")
+    ] = 0.1
     accelerometer_count_m_s: Annotated[NonNegative, Field(description="resolution, m/s; 0: no rounding")] = 2.0**-14
     warm_up: WarmUp = WarmUp()
     clock: ClockParameters = ClockParameters(offset_sd_s=0.0002, jitter_sd_s=0.00002)

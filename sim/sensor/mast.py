@@ -59,7 +59,9 @@ class PointingParameters(Parameters):
     the other values are assumed.
     """
 
-    zero_deg: Annotated[Degrees, POINTING, Field(description="zero offset of the encoders, constant in a run")] = 0.1
+    zero_deg: Annotated[
+        Degrees, POINTING, Field(description="zero offset of the mast's encoders, constant in a run, deg")
+    ] = 0.1
     backlash_deg: Annotated[Degrees, POINTING, Field(description="full width of the backlash, deg")] = 0.1
     settling_deg: Annotated[Degrees, POINTING, Field(description="motor stop minus command, deg")] = 0.01
     count_deg: Annotated[Degrees, POINTING, Field(description="encoder resolution, deg; 0: no rounding")] = 0.005
@@ -72,7 +74,9 @@ class StereoCalibrationParameters(Parameters):
     epipolar_error_px: Annotated[Pixels, STEREO, Field(description="perpendicular to the epipolar lines, px")] = 0.2
     alignment_deg: Annotated[Degrees, STEREO, Field(description="alignment error of the pair per axis, deg")] = 0.05
     roll_deg: Annotated[Degrees, STEREO, Field(description="roll error of each camera, deg")] = 0.01
-    focal_error: Annotated[float, STEREO, Field(ge=0.0, le=0.05, description="relative, of each camera")] = 1e-4
+    focal_error: Annotated[float, STEREO, Field(ge=0.0, le=0.05, description="relative error of each focal length")] = (
+        1e-4
+    )
 
 
 @dataclass(frozen=True)

@@ -59,12 +59,20 @@ class OdometryParameters(Parameters):
     Slip is not included: it is part of the true motion (`marsyard.sim.dynamics.driving`).
     """
 
-    scale_error: Annotated[Fraction, ODOMETRY, Field(description="fraction of the path (wheel radius)")] = 0.01
+    scale_error: Annotated[Fraction, ODOMETRY, Field(description="fraction of the path, constant (wheel radius)")] = (
+        0.01
+    )
     walk_m: Annotated[float, ODOMETRY, Field(ge=0.0, le=1.0, description="random walk per axis, m/sqrt(m)")] = 0.01
-    heading_scale_error: Annotated[Fraction, ODOMETRY, Field(description="fraction of the turn, constant")] = 0.002
-    heading_drift_deg_m: Annotated[Degrees, ODOMETRY, Field(description="drift along the path, constant")] = 0.03
+    heading_scale_error: Annotated[Fraction, ODOMETRY, Field(description="fraction of the turn, constant in a run")] = (
+        0.002
+    )
+    heading_drift_deg_m: Annotated[
+        Degrees, ODOMETRY, Field(description="drift along the path, constant in a run, deg/m")
+    ] = 0.03
     heading_walk_deg: Annotated[Degrees, ODOMETRY, Field(description="random walk of the heading, deg/sqrt(m)")] = 0.05
-    misalignment_deg: Annotated[Degrees, ODOMETRY, Field(description="of the accelerometers per axis, constant")] = 0.1
+    misalignment_deg: Annotated[
+        Degrees, ODOMETRY, Field(description="accelerometer misalignment per axis, constant")
+    ] = 0.1
     tilt_noise_deg: Annotated[Degrees, ODOMETRY, Field(description="pitch and roll noise at each stop")] = 0.03
     visual: VisualOdometryParameters = VisualOdometryParameters()
 

@@ -129,9 +129,15 @@ class OpticsParameters(Parameters):
     diffraction_px: Annotated[NonNegative, Field(le=5.0, description="wavelength x f-number / pitch; 0: none")] = 0.70
     diffusion_px: Annotated[NonNegative, Field(le=5.0, description="RMS charge diffusion, px (assumed)")] = 0.25
     pixel_aperture: Annotated[bool, Field(description="average over pixels; only for point-sampled scenes")] = False
-    defocus_px: Annotated[NonNegative, OPTICS, Field(le=10.0, description="diameter of a point's blur circle")] = 0.0
-    stray_light: Annotated[float, OPTICS, Field(ge=0.0, le=0.5, description="fraction of light that is spread")] = 0.0
-    dust_discs: Annotated[int, OPTICS, Field(ge=0, le=1000, description="number of specks on the camera window")] = 0
+    defocus_px: Annotated[
+        NonNegative, OPTICS, Field(le=10.0, description="defocus: diameter of the blur circle of a point")
+    ] = 0.0
+    stray_light: Annotated[
+        float, OPTICS, Field(ge=0.0, le=0.5, description="stray light: fraction of all light that is spread evenly")
+    ] = 0.0
+    dust_discs: Annotated[
+        int, OPTICS, Field(ge=0, le=1000, description="number of specks of dust on the camera window")
+    ] = 0
     dust_depth: Annotated[float, Field(ge=0.0, le=1.0, description="fraction of the light absorbed by a speck")] = 0.3
     dust_radius_px: Annotated[float, Field(gt=0.0, le=1000.0, description="mean shadow radius, px; +- 1/3")] = 25.0
     dust_softness: Annotated[float, Field(gt=0.0, le=1.0, description="half width of the edge / radius")] = 0.5

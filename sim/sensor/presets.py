@@ -242,7 +242,9 @@ class Datasheet(Parameters):
     transfer_row_s: Annotated[NonNegative, Field(description="frame transfer: shift time per row")] = 0.0
     rows: Annotated[int, Field(ge=16, le=16384, description="rows of a frame")]
     readout_s: Annotated[NonNegative, Field(description="readout time of a frame, s")]
-    exposure_s: Annotated[float | None, Field(gt=0.0, le=10.0, description="default: 60 % full well at I/F 0.3")] = None
+    exposure_s: Annotated[float | None, Field(gt=0.0, le=10.0, description="default: 60 % of full well at I/F 0.3")] = (
+        None
+    )
     sun_au: Annotated[float, Field(gt=0.1, le=100.0, description="distance from the sun; sets exposure_s")] = 1.5
     lens: Lens
 

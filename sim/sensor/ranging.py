@@ -42,13 +42,15 @@ class RangingParameters(Parameters):
     """Parameters of a ranging instrument; errors are standard deviations."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=10000.0, description="readings per second")] = 10.0
-    scale_error: Annotated[_Fraction, ALTITUDE, Field(description="constant, fraction of the range")] = 0.0
+    scale_error: Annotated[_Fraction, ALTITUDE, Field(description="constant scale error, fraction of the range")] = 0.0
     noise: Annotated[_Fraction, ALTITUDE, Field(description="noise per reading, fraction of the range")] = 0.0
     noise_m: Annotated[_Metres, ALTITUDE, Field(description="noise per reading, independent of range, m")] = 0.0
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.0
     min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 0.0
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 5000.0
-    boresight_deg: Annotated[_Degrees, ALTITUDE, Field(description="SD of the constant error per axis")] = 0.0
+    boresight_deg: Annotated[
+        _Degrees, ALTITUDE, Field(description="SD per axis of the constant pointing error, deg")
+    ] = 0.0
     clock: ClockParameters = ClockParameters()
 
     @model_validator(mode="after")
@@ -66,7 +68,9 @@ class LaserParameters(RangingParameters):
     noise_m: Annotated[_Metres, ALTITUDE, Field(description="noise per reading, independent of range, m")] = 0.05
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.01
     max_range_m: Annotated[float, Field(gt=0.0, le=20000.0, description="maximum range, m")] = 300.0
-    boresight_deg: Annotated[_Degrees, ALTITUDE, Field(description="SD of the constant error per axis")] = 0.1
+    boresight_deg: Annotated[
+        _Degrees, ALTITUDE, Field(description="SD per axis of the constant pointing error, deg")
+    ] = 0.1
     clock: ClockParameters = ClockParameters(offset_sd_s=0.002, jitter_sd_s=0.0005)
 
 
@@ -78,8 +82,12 @@ class RadarParameters(RangingParameters):
 
     beam_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width of the beam, deg")] = 60.0
     sidelobe_deg: Annotated[float, Field(gt=0.0, lt=180.0, description="full width with the side lobes, deg")] = 120.0
-    sidelobe_fraction: Annotated[Fraction, SIDE_LOBES, Field(description="fraction of readings from side lobes")] = 0.0
-    scale_error: Annotated[_Fraction, ALTITUDE, Field(description="constant, fraction of the range")] = 0.003
+    sidelobe_fraction: Annotated[
+        Fraction, SIDE_LOBES, Field(description="fraction of the radar readings that come from side lobes")
+    ] = 0.0
+    scale_error: Annotated[_Fraction, ALTITUDE, Field(description="constant scale error, fraction of the range")] = (
+        0.003
+    )
     noise: Annotated[_Fraction, ALTITUDE, Field(description="noise per reading, fraction of the range")] = 0.0015
     count_m: Annotated[_Metres, Field(description="resolution, m; 0: no rounding")] = 0.3
     min_range_m: Annotated[float, Field(ge=0.0, description="minimum range, m")] = 5.0

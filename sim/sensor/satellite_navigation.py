@@ -111,7 +111,11 @@ class RtkParameters(Parameters):
     floating: SolutionErrors = _FLOATING
     float_fraction: Annotated[Fraction, Field(description="fraction of the time with a floating solution")] = 0.1
     float_s: Annotated[Positive, Field(description="mean duration of a floating solution, s")] = 60.0
-    velocity_noise_m_s: Annotated[PerAxis, RECEIVER, Field(description="noise per solution")] = (0.03, 0.03, 0.05)
+    velocity_noise_m_s: Annotated[PerAxis, RECEIVER, Field(description="velocity noise per solution")] = (
+        0.03,
+        0.03,
+        0.05,
+    )
     velocity_wander_m_s: Annotated[PerAxis, RECEIVER, Field(description="velocity wander, m/s")] = (0.01, 0.01, 0.02)
     velocity_correlation_s: Annotated[Positive, Field(description="correlation time of the velocity error, s")] = 10.0
     reported_spread: Annotated[Fraction, Field(description="sd of log(reported / true deviation)")] = 0.1

@@ -39,7 +39,9 @@ class TiltCompassParameters(Parameters):
     tilt_bias_deg: Annotated[Degrees, COMPASS, Field(description="inclinometer bias, mounting included")] = 0.2
     tilt_noise_deg: Annotated[Degrees, COMPASS, Field(description="inclinometer noise per reading")] = 0.15
     lag_s: Annotated[float, Field(gt=0.0, le=5.0, description="time constant of the inclinometers, s")] = 0.2
-    heading_bias_deg: Annotated[Degrees, COMPASS, Field(description="bias, with mounting and declination")] = 0.8
+    heading_bias_deg: Annotated[
+        Degrees, COMPASS, Field(description="heading bias, mounting and declination included")
+    ] = 0.8
     hard_iron_deg: Annotated[Degrees, COMPASS, Field(description="amplitudes of sine and cosine of the heading")] = 0.5
     soft_iron_deg: Annotated[Degrees, COMPASS, Field(description="amplitudes for twice the heading")] = 0.25
     heading_noise_deg: Annotated[Degrees, COMPASS, Field(description="heading noise per reading")] = 0.3

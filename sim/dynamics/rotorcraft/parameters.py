@@ -19,7 +19,9 @@ class VibrationParameters(Parameters):
     """
 
     rate_hz: Annotated[Positive, Field(le=45.0, description="frequency of the rotor, 1/s")] = 22.0
-    acceleration_m_s2: Annotated[NonNegative, VIBRATION, Field(le=20.0, description="amplitude per world axis")] = 1.5
+    acceleration_m_s2: Annotated[
+        NonNegative, VIBRATION, Field(le=20.0, description="amplitude along each world axis")
+    ] = 1.5
     angle_deg: Annotated[NonNegative, VIBRATION, Field(le=1.0, description="amplitude of yaw, pitch and roll")] = 0.03
 
 
@@ -83,9 +85,13 @@ class TransitParameters(Parameters):
     speed_m_s: Annotated[Positive, Field(le=15.0, description="commanded speed, m/s (assumed)")] = 1.0
     acceleration_m_s2: Annotated[Positive, Field(le=3.0, description="acceleration to that speed (assumed)")] = 1.0
     hover_s: Annotated[NonNegative, Field(le=600.0, description="duration of the initial hover, s (assumed)")] = 15.0
-    settle_s: Annotated[NonNegative, Field(le=60.0, description="constant speed before image 1 (assumed)")] = 1.5
+    settle_s: Annotated[
+        NonNegative, Field(le=60.0, description="duration at constant speed before the first image, s (assumed)")
+    ] = 1.5
     images: Annotated[int, bounded_field(2, 1000, "number of images")] = 40
-    imaging_duration_s: Annotated[Positive, Field(le=120.0, description="duration from the first to the last")] = 5.0
+    imaging_duration_s: Annotated[
+        Positive, Field(le=120.0, description="duration from the first to the last image, s")
+    ] = 5.0
 
     @property
     def lead_s(self) -> float:

@@ -44,7 +44,9 @@ class FilterParameters(Parameters):
     disturbance: Annotated[Positive, Field(description="tilt error, rad, divided by acceleration / gravity")] = 3.0
     unmodelled_acceleration_m_s2: Annotated[Positive, Field(description="assumed unmodelled acceleration, m/s2")] = 0.3
     gate: Annotated[Positive, Field(description="maximum normalised innovation of an accepted reading")] = 5.0
-    max_rejected_fixes: Annotated[int, Field(ge=1, description="consecutive rejections before a restart")] = 10
+    max_rejected_fixes: Annotated[
+        int, Field(ge=1, description="consecutive rejected RTK solutions before a restart")
+    ] = 10
     max_repeated_fixes: Annotated[int, Field(ge=2, description="maximum equal consecutive readings; more: stuck")] = 8
 
 
