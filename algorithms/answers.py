@@ -134,7 +134,10 @@ def _type_name(value: object) -> str:
 
 
 def check_and_set_span(answer: object, tags_s: Sequence[float]) -> VelocityEstimate:
-    """Validate an estimate as `check_velocity`; a missing time span becomes the last image interval."""
+    """Validate an estimate; a missing time span becomes the last image interval.
+
+    Raises the same error as `check_velocity`.
+    """
     estimate = check_velocity(answer, tags_s)
     if estimate.span_s is not None or len(tags_s) < 2:
         return estimate

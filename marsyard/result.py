@@ -62,7 +62,10 @@ class Case:
         return Timeline.from_products(self.products)
 
     def replay(self) -> Case:
-        """Run the case again and store its products. Raises CampaignError if its row differs or it crashes."""
+        """Run the case again, store its products, and return the case with them.
+
+        Raises CampaignError if the row differs from the stored one, or the case crashes.
+        """
         from marsyard.campaigns.running.replay import replay
 
         rerun = replay(self.result.directory, self.number)
@@ -202,6 +205,9 @@ class Result:
 
 
 def open_result(directory: str | Path) -> Result:
-    """Open a stored campaign; an unfinished one has the rows stored so far. Raises CampaignError without a campaign."""
+    """Open a stored campaign; the rows of an unfinished one are those stored so far.
+
+    Raises CampaignError if the folder contains no campaign.
+    """
     refresh_table(Path(directory))
     return Result(Path(directory))

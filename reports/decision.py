@@ -94,7 +94,10 @@ def requirement_masks(frame: pd.DataFrame, requirement: Mapping[str, Any]) -> tu
 def collect_evidence(
     frame: pd.DataFrame, requirement: Mapping[str, Any], sampling: SamplingDesign, *, has_own_terrains: bool
 ) -> RequirementEvidence | None:
-    """Collect a requirement's results; None if impossible. `has_own_terrains`: no other confirmation uses them."""
+    """Collect the results of the cases of a requirement; None if it cannot be evaluated.
+
+    has_own_terrains: whether no other confirmation uses the terrains
+    """
     verdict = _empty_verdict(requirement)
     frame = _complete_columns(sampling.exclude_nominal_case(frame), verdict)
     if _describe_problem(frame, verdict):
@@ -187,7 +190,10 @@ def _withhold_if_uncertain(verdict: Verdict, with_unfinished: Verdict) -> Verdic
 
 
 def _decide(verdict: Verdict, evidence: CaseEvidence, sampling: SamplingDesign, frame: pd.DataFrame) -> Verdict:
-    """Decide the verdict from the results of a population of at least one case; `frame` has all cases."""
+    """Decide the verdict from the results of a population of at least one case.
+
+    frame: all cases of the campaign
+    """
     n, failures, decides_by_rate = evidence.n, evidence.failures, verdict.decide_by == ESTIMATE
     rate = (n - failures) / n
     with_counts = replace(verdict, n=n, failures=failures, estimate=rate, terrains=evidence.terrains)

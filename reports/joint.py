@@ -65,7 +65,10 @@ class JointEvidence:
         return joined
 
     def find_block(self, cases: int) -> str:
-        """Describe an unfinished confirmation, which blocks PASS of a run with `cases` cases; empty without one."""
+        """Describe an unfinished confirmation, which blocks PASS; empty if all are finished.
+
+        cases: number of cases of the run
+        """
         if self.own is not None and cases < self.own.cases:
             return (
                 f"The record announces {count(self.own.cases, 'case')} of confirmation {self.own.number}; this folder "

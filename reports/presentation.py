@@ -143,7 +143,10 @@ _SPACE_CAPTION = (
 
 
 def create_case_view(products: Products, *, complete: bool) -> CaseView:
-    """Create the view of a case, `complete` for files; without figures if no system recognizes its products."""
+    """Create the view of a case, without figures if no system recognizes its products.
+
+    complete: whether the view is for files, which contain all figures
+    """
     kind, timeline = find_case_kind(products), Timeline.from_products(products)
     view = CaseView([]) if kind is None else kind.view(products, complete)
     space = [] if timeline is None else [CaseFigure("space", draw_timeline(timeline), _SPACE_CAPTION, wide=False)]
@@ -152,7 +155,10 @@ def create_case_view(products: Products, *, complete: bool) -> CaseView:
 
 
 def write_case_figures(directory: Path, products: Products) -> list[Path]:
-    """Write a case's figures as PNG on white into a folder; return their paths. Raises OSError on failure."""
+    """Write a case's figures as PNG on white into a folder; returns their paths.
+
+    Raises OSError if they cannot be written.
+    """
     view = create_case_view(products, complete=True)
     figures = {directory / f"{item.name}.png": item.figure for item in view.figures}
     for path, figure in figures.items():

@@ -226,7 +226,10 @@ def rms(values: Float[np.ndarray, " n"]) -> float:
 
 
 def quantile(values: Float[np.ndarray, " n"], probability: float) -> float:
-    """Compute a quantile; NaN for extrapolations: only minimum (0), median and maximum (1) exist in every sample."""
+    """Compute a quantile; NaN if no value lies beyond it, which would be an extrapolation.
+
+    Minimum (0), median and maximum (1) exist in every sample.
+    """
     is_known = values.size > 0 and (probability in (0.0, 0.5, 1.0) or is_interpolated(values.size, probability))
     return float(np.quantile(values, probability)) if is_known else math.nan
 

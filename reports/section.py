@@ -16,7 +16,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of texts, and the number of omitted rows. Raises ValueError for a row without one cell per column."""
+    """A table of texts, and the number of omitted rows.
+
+    Raises ValueError if a row does not have one cell per column.
+    """
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]

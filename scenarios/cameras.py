@@ -30,7 +30,10 @@ def camera_optics(camera: CameraModel) -> Optics:
 
 
 class CalibrationParameters(Parameters):
-    """Errors of the calibrated camera of an algorithm; those of the descent camera are assumed for all."""
+    """Errors of the calibrated camera that an algorithm receives.
+
+    The values of the descent camera are assumed for all cameras.
+    """
 
     focal_error: Annotated[
         float, CALIBRATION, bounded_field(0.0, 0.05, "RMS relative error of the calibrated focal length")

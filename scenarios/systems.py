@@ -192,7 +192,10 @@ def scenario_names() -> list[str]:
 
 
 def scenario(name: str) -> Scenario:
-    """Create the scenario of a name, or of a class ``module:Class``. Raises UnknownScenarioError with allowed names."""
+    """Create the scenario of a name, or of a class ``module:Class`` that implements `Scenario`.
+
+    Raises UnknownScenarioError with the allowed names.
+    """
     path = name if ":" in name else scenario_paths().get(name)
     if path is None:
         matches = difflib.get_close_matches(name, scenario_names(), n=1)

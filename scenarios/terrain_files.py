@@ -262,7 +262,10 @@ class NoInverseError(Exception):
 
 
 def map_scale(file: Any) -> MapScale | None:
-    """Compute a projection's scale at a dataset's centre; None if unknown. Raises NoInverseError without inverse."""
+    """Compute the scale of a rasterio dataset's projection at its centre; None if its terms are unknown.
+
+    Raises NoInverseError for a projection without inverse.
+    """
     from rasterio._err import CPLE_BaseError  # GDAL's errors, which are no RasterioError
     from rasterio.crs import CRS
     from rasterio.errors import RasterioError

@@ -55,7 +55,10 @@ class VelocityCase:
     increments: ImuIncrements | None = None
 
     def timeline(self, estimate: VelocityEstimate | None, start: State | None) -> Timeline:
-        """Create the timeline; `start` is the true state at the start of the estimated path, or None without one."""
+        """Create the timeline with an estimate.
+
+        start: true state at the start of the estimate's time span; None for no estimated path
+        """
         motion = self.motion
         paths = {"true": Path.from_motion(motion)}
         if estimate is not None and estimate.velocity_m_s is not None and start is not None:

@@ -144,7 +144,10 @@ class Viewpoint:
 def render_state(
     backend: Backend, scene: Scene, optics: Optics, state: State, mounting: RigidTransform | None = None
 ) -> tuple[Frame, ImageMotion]:
-    """Render the view of a camera in a body with this `mounting`; compute the image motion during its exposure."""
+    """Render the view of a camera at the body's origin, and compute the image motion during its exposure.
+
+    `mounting` rotates the camera in the body.
+    """
     pose = state.world_from_body if mounting is None else state.world_from_body * mounting
     frame = process_renderer(backend).render(scene, optics.rays, pose, state.time_s)
     rate = state.attitude.apply(state.body_rate_rad_s)

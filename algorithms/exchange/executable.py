@@ -89,7 +89,10 @@ class ExecutableAlgorithm:
 
 
 class ExecutableTargetTracker(ExecutableAlgorithm):
-    """Target tracker that runs an external program. `state` is that of its last answer."""
+    """Target tracker that runs an external program.
+
+    - state: state of the tracker according to its last answer
+    """
 
     def __init__(self, command: Command, limits: ExecutableLimits) -> None:
         super().__init__(command, limits, TRACKER_REQUESTS)

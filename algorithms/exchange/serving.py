@@ -44,7 +44,10 @@ def parse_object(output: Output) -> Mapping[str, Any]:
 
 @dataclass
 class Server:
-    """Running program that has written its greeting line; `request_count` is the `id` of the last request."""
+    """Running program that has written its greeting line.
+
+    - request_count: Number of requests sent, which is the `id` of the last request
+    """
 
     child: RunningProgram
     request_count: int = 0

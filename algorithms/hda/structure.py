@@ -18,7 +18,10 @@ from marsyard.algorithms.hda.preparation import prepare_views
 
 
 class MatchStatus(IntEnum):
-    """Result of a structure match: accepted, or failed correlation, depth bounds, or forward-backward consistency."""
+    """Result of a structure match: accepted, or the failed check.
+
+    The checks are correlation, depth bounds and forward-backward consistency.
+    """
 
     ACCEPTED = 0
     DISSIMILAR = 1

@@ -92,7 +92,10 @@ class NavigationOutcome(Enum):
 
 @dataclass(frozen=True)
 class NavigationPlan:
-    """Result of `navigate`: drive commands of one step along the path, in order; empty unless the outcome is PATH."""
+    """Result of `navigate`: the next step to drive.
+
+    - commands: Drive commands of one step along the path, in order; empty unless the outcome is PATH
+    """
 
     outcome: NavigationOutcome
     commands: tuple[DriveCommand, ...]

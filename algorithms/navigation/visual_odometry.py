@@ -90,7 +90,10 @@ def estimate_motion(
     predicted: RigidTransform,
     options: VisualOdometryOptions | None = None,
 ) -> MotionEstimate:
-    """Estimate the motion between two stereo pairs; `predicted` is the second rover frame in the first."""
+    """Estimate the rover's motion between two stereo pairs.
+
+    `predicted` is the pose of the second rover frame in the first, from wheel odometry and gyros.
+    """
     options = VisualOdometryOptions() if options is None else options
     first_pair, second_pair = RectifiedPair.from_measurement(first), RectifiedPair.from_measurement(second)
     pixels = _detect_features(first_pair, options)

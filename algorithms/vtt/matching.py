@@ -99,7 +99,10 @@ def extract_patch(
 
 
 def search_window(image: MastImage, pixel: Vector2, side: int) -> tuple[Counts, tuple[int, int]]:
-    """Extract a square of `side` pixels around a pixel, clipped to the image, and its upper left corner (u, v)."""
+    """Extract a square of `side` pixels around a full-frame pixel, clipped to the image.
+
+    Also returns the full-frame pixel (u, v) of its upper left corner.
+    """
     start = np.rint(pixel - 0.5 * (side - 1)).astype(int) - np.array(image.corner)
     end = np.maximum(start + side, 0)
     start = np.maximum(start, 0)

@@ -179,7 +179,10 @@ class Evidence:
 
 
 def classify_evidence(campaign: Campaign, confirmations: Sequence[Confirmation], frozen: FrozenAlgorithm) -> Evidence:
-    """Determine the evidence of a run that is no confirmation, from the record of `confirmations`."""
+    """Determine the kind of evidence of a run that was not started as a confirmation.
+
+    confirmations: entries of the record of confirmations
+    """
     definition = campaign.definition
     name, seed = definition.name, definition.seed
     for entry in confirmations:

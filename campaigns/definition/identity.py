@@ -74,7 +74,10 @@ class Identity:
 
 
 def create_identity(definition: CampaignDefinition) -> Identity:
-    """Create the identity with the current code, versions and files. Raises CampaignError for an invalid input file."""
+    """Create the identity of a campaign with the current code, versions and input files.
+
+    Raises CampaignError if an input file is no longer valid.
+    """
     custom_components = (*list_algorithms(definition), *list_parts(definition))
     code = hash_code((scenario_source(definition.scenario), *custom_components))
     return Identity(definition_hash(definition), code, read_versions(), hash_inputs(definition))

@@ -28,7 +28,10 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def find_campaign(name_or_path: str) -> Path:
-    """Return a campaign's file, from its name in the catalogue or its path. Raises DefinitionError if there is none."""
+    """Return the file of a campaign, from its name in the catalogue or from the path of a TOML file.
+
+    Raises DefinitionError if there is no such file.
+    """
     path = Path(name_or_path)
     if path.suffix == ".toml" or len(path.parts) > 1:
         if not path.is_file():

@@ -34,7 +34,10 @@ class _RequirementsFile(Parameters):
 
 
 def read_requirements(path: Path) -> tuple[SharedRequirement, ...]:
-    """Read the requirements of a file. Raises DefinitionError, in which every problem has its key, if it is invalid."""
+    """Read the requirements of a file.
+
+    Raises DefinitionError if it is unreadable or invalid; every problem has its key.
+    """
     requirements = read_table(path, _RequirementsFile).requirements
     ids = [requirement.id for requirement in requirements]
     repeated_ids = sorted({name for name in ids if ids.count(name) > 1})

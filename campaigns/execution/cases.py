@@ -34,7 +34,10 @@ _MAX_TEXT = 8000
 
 @dataclass(frozen=True)
 class CompletedCase:
-    """Row of a case, its products if stored, and a note on products or changes of the worker process."""
+    """Row of a case and, if they are stored, its products.
+
+    `note` describes why products could not be stored, and how the case changed its worker process.
+    """
 
     row: Row
     products: PackedProducts | None = None
@@ -231,7 +234,10 @@ def _build_finished_row(
 
 
 def _convert_columns(row: Mapping[str, Any]) -> dict[str, Scalar]:
-    """Convert columns, also NumPy scalars, to Python values. Raises ValueError or TypeError if one cannot be stored."""
+    """Convert the columns of a scenario, including NumPy scalars, to plain Python values.
+
+    Raises ValueError or TypeError if a column cannot be stored.
+    """
     reserved_names = sorted({*LEADING_COLUMNS, *TRAILING_COLUMNS}.intersection(row))
     if reserved_names:
         raise ValueError(f"the scenario's row has columns that the engine writes: {', '.join(reserved_names)}")

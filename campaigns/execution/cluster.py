@@ -214,7 +214,10 @@ class _BatchQueue:
             raise CampaignError(f"the cluster has had no workers for {_NO_WORKERS_S / 60:.0f} minutes")
 
     def _collect(self, future: Any, batch: Sequence[int]) -> list[TaskResult[Any]]:
-        """Return a batch's results; none if it was lost and queued again. Raises CampaignError if none can run."""
+        """Return the results of a batch; empty if it was lost and is queued again.
+
+        Raises CampaignError if the cluster cannot run batches.
+        """
         try:
             if future.status == "cancelled":
                 raise CancelledError

@@ -36,7 +36,10 @@ ADAPTIVE: Final = "adaptive"
 
 
 class Design(Parameters):
-    """Sampling design of a campaign. If `nominal`, the first case has the campaign's parameters without sampling."""
+    """Sampling design of a campaign.
+
+    With `nominal`, the first case has the campaign's parameters without sampling.
+    """
 
     kind: Kind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False

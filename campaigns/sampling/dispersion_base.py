@@ -310,7 +310,10 @@ STANDARD_NORMAL = UnivariateDistribution(lambda function, x: float(_NORMAL_FUNCT
 
 @lru_cache(maxsize=1)
 def scipy_distributions() -> Mapping[str, bool]:
-    """Return the univariate distributions of `scipy.stats` (not `uniform`), and whether each is discrete."""
+    """Return the univariate distributions of `scipy.stats` by name, and whether each is discrete.
+
+    `uniform` is excluded, since `Uniform` has other parameters.
+    """
     from scipy import stats
 
     kinds = ((name, getattr(stats, name)) for name in dir(stats) if name != "uniform")

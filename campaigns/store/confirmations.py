@@ -83,7 +83,10 @@ def classify_run(campaign: Campaign) -> Evidence:
 
 
 def read_confirmations(path: Path) -> list[Confirmation]:
-    """Read the confirmations in the order of their start; none without the file. Raises StoreError as `read_record`."""
+    """Read the confirmations in the order of their start; none if the file does not exist.
+
+    Raises StoreError like `read_record`.
+    """
     return list(read_record(path).confirmations)
 
 
@@ -127,7 +130,10 @@ def _add_former_entry(entries: dict[object, Confirmation], stored: Mapping[str, 
 
 
 def _add_entry(entries: dict[object, Confirmation], kind: str, stored: Mapping[str, Any], head: str) -> None:
-    """Add an entry, after which the chain has the hash `head`. Raises ValueError if it contradicts those before it."""
+    """Add an entry of the chain; `head` is the hash with this entry.
+
+    Raises ValueError if the entry contradicts those before it.
+    """
     if kind == "chain":
         return
     key = (str(stored["claim"]), int(stored["number"]))

@@ -30,7 +30,10 @@ _LOCKED = (errno.EWOULDBLOCK, errno.EACCES)
 
 @contextmanager
 def folder_lock(directory: Path) -> Iterator[None]:
-    """Lock a folder, and remove files of dead processes. Raises StoreError if it is locked or not writable."""
+    """Lock a campaign's folder, and remove temporary files of dead processes.
+
+    Raises StoreError if another process uses the folder, or the folder is not writable.
+    """
     path = directory / _LOCK_FILE
     with report_write_errors(directory):
         file = path.open("a+", encoding="utf-8")

@@ -29,7 +29,10 @@ def git_commit() -> str | None:
 
 
 def describe_machine() -> dict[str, Any]:
-    """Describe Python, platform and processor. Machines with equal descriptions compute bit-identical rows."""
+    """Describe Python, platform and processor (with a hash of its features).
+
+    Machines with equal descriptions compute bit-identical rows.
+    """
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:

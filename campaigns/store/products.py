@@ -134,7 +134,10 @@ def _move_arrays(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def load_products(directory: Path) -> dict[str, Any]:
-    """Load the products in a folder; tuples become lists. Raises StoreError if there are none."""
+    """Load the products in a folder; tuples become lists.
+
+    Raises StoreError if there are none.
+    """
     with report_damage(directory, StoreError, "contains no products of a case"):
         files = [(directory / name).read_bytes() for name in (_OUTLINE_FILE, "products.npz")]
         return unpack_products(PackedProducts(*files))

@@ -116,7 +116,10 @@ def update(directory: Path, changes: Mapping[str, Any]) -> None:
 
 
 def write(directory: Path, record: Mapping[str, Any]) -> None:
-    """Write a campaign's record atomically. Raises StoreError on failure; the previous record then remains."""
+    """Write a campaign's record atomically.
+
+    Raises StoreError on failure; the previous record then remains.
+    """
     path = directory / RECORD_FILE
     with report_write_errors(path), replace_file(path) as partial, partial.open("w", encoding="utf-8") as file:
         file.write(json.dumps(record, indent=2, ensure_ascii=False) + "\n")

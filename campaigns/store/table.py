@@ -146,7 +146,10 @@ def read_rows(path: Path, case: int | None = None) -> list[dict[str, Any]]:
 
 
 def refresh_table(directory: Path) -> None:
-    """Verify a campaign's rows, and write its table. Raises StoreError for a changed row, or if it is not writable."""
+    """Verify the rows of a campaign, and write its table from them.
+
+    Raises StoreError if a row was changed after it was stored, or the table is not writable.
+    """
     if not (directory / ROWS_FILE).exists() and (directory / TABLE_FILE).exists():
         return  # a folder of which only the table was copied
     requirements = stored_definition(directory).requirements

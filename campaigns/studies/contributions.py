@@ -161,7 +161,10 @@ def _combine(
     combinations: Float64[np.ndarray, "outputs variants"],
     weights: Float64[np.ndarray, " groups"],
 ) -> tuple[Float64[np.ndarray, " outputs"], Float64[np.ndarray, " outputs"]]:
-    """Combine mean squares, with standard errors (linearisation); the last output is relative to the first of them."""
+    """Compute combinations of mean squares with their standard errors (linearisation).
+
+    The last output is divided by the first mean square.
+    """
     squares, influence = mean_squares.evaluate(weights)
     total = max(squares[0], np.finfo(np.float64).tiny)  # 0 if a resample contains only one group
     outputs, slopes = combinations @ squares, combinations.copy()

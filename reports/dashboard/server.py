@@ -32,7 +32,10 @@ _HEADERS = {
 
 
 class _Handler(SimpleHTTPRequestHandler):
-    """Handler of requests for files in the folder; the server has these host `names`, no listings and no log."""
+    """Handler of requests for files in the dashboard's folder, without folder listings and log messages.
+
+    `names` are the allowed host names of the server.
+    """
 
     def __init__(self, *args: Any, names: Collection[str], **kwargs: Any) -> None:
         self._names = names

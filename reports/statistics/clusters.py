@@ -320,7 +320,10 @@ def attainable_risk(sizes: Sizes, rate: float, risk: float) -> float:
 
 @dataclass(frozen=True)
 class TerrainEvidence:
-    """Numbers of terrains with a case, a failure, and a success; and of pairs of failures on one terrain."""
+    """Numbers of terrains with a case of the population, with a failure, and with a success.
+
+    failure_pairs: number of pairs of failures on one terrain
+    """
 
     terrains: int
     failed_terrains: int

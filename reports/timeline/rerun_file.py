@@ -25,7 +25,10 @@ _SIGMAS = 3.0
 
 
 def write_rerun(path: Path, timeline: Timeline, name: str) -> None:
-    """Write a timeline as a recording (.rrd) of this `name` with the arrangement of its views. Raises OSError."""
+    """Write a timeline as a recording (.rrd) with the arrangement of its views. Raises OSError on failure.
+
+    name: title of the recording
+    """
     path.write_bytes(b"")  # OSError if the file cannot be written; the recording would raise another exception
     recording = rr.RecordingStream("marsyard", recording_id=name)
     recording.save(path)

@@ -208,7 +208,10 @@ def draw_path(products: Products) -> Figure:
 
 
 def _stop_panels(stop: StopImages, side_px: float) -> tuple[Panel, Panel, Panel]:
-    """Create the panels of a stop: left subframe, enlarged match, right subframe; `side_px` is the template's side."""
+    """Create the panels of the left subframe of a stop, of the enlarged match, and of the right subframe.
+
+    side_px: side of the template, pixels
+    """
     corner, target = stop.corners[0], stop.matches[0] - stop.corners[0]
     marks = square(target, side_px, _TARGET_STYLE)
     if np.isfinite([*stop.window, *corner]).all():

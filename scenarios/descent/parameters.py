@@ -295,7 +295,10 @@ class DescentScenarioParameters(AlgorithmSelection, CustomScores):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> DescentScenarioParameters:
-        """Check terrain, binning, selected images and flight: terrain and light must come from the same site."""
+        """Check terrain, binning, selected images and flight.
+
+        Terrain and light must come from the same site.
+        """
         if self.dust_opacity is not None and self.site is None:
             raise ValueError("dust_opacity needs a site; the air of a generic terrain is clear")
         if self.terrain_site != self.site:

@@ -41,7 +41,10 @@ _ITERATIONS = 3
 
 @dataclass(frozen=True)
 class EarthRotation:
-    """Rotation of the world axes (east, north, up) in inertial space: rotation vector per second, world axes."""
+    """Rotation of the surface-fixed world axes (east, north, up) in inertial space.
+
+    - rate_rad_s: rotation vector per second, world axes
+    """
 
     rate_rad_s: Float64[np.ndarray, "3"]
 

@@ -82,7 +82,10 @@ def find_triples(images: ImageMeasurements, parameters: TripleParameters) -> dic
 def draw_triples(
     run: RunParameters, images: ImageMeasurements, parameters: TripleParameters, rng: np.random.Generator
 ) -> tuple[Triple, ...]:
-    """Draw the specified number of a run's triples for each category. Raises ValueError if there are too few."""
+    """Draw the triples of a run: for each category the specified number out of all of its triples.
+
+    Raises ValueError if there are too few.
+    """
     counts = (run.short_time, run.same_direction, run.opposite_direction)
     triples = []
     for (category, indices), count in zip(find_triples(images, parameters).items(), counts, strict=True):

@@ -128,7 +128,10 @@ class MapTruth:
         return np.stack([self.distortion_x.at(x, y), self.distortion_y.at(x, y)], axis=-1).reshape(np.shape(map_m))
 
     def world_position(self, map_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
-        """Return the world x, y of what appears at a map position; the map's error is the position minus it."""
+        """Return the world x, y of the surface point that appears at a map position.
+
+        The position error of the map is ``map_m - world_position(map_m)``.
+        """
         return np.asarray(map_m - self.shift_m - self.distortion(map_m))
 
     def map_position(self, world_m: Float[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:

@@ -81,7 +81,10 @@ def compare_with_poses(
 
 
 def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
-    """Return the columns of a case: matches, residuals over all pairs (NaN without), largest median of a pair."""
+    """Return the columns of a case: number of matches, residuals over all pairs, and the largest median of a pair.
+
+    Residuals are NaN without matches.
+    """
     nan = float("nan")
     residuals = np.concatenate([pair.residuals_px for pair in pairs])
     inliers = np.concatenate([pair.matches.inliers for pair in pairs])

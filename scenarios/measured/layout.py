@@ -220,7 +220,10 @@ class ImageRow:
 
 
 def read_table(path: Path, task: str) -> dict[str, list[ImageRow]]:
-    """Read the rows of `images.csv` by case, in order of first rows. Raises IngestError with all problems by line."""
+    """Read the rows of `images.csv` by case, in the order of the cases' first rows.
+
+    Raises IngestError with all problems by line.
+    """
     allowed = [column.name for column in COLUMNS if task in column.tasks]
     required = [column.name for column in COLUMNS if task in column.tasks and column.required == "every"]
     hint = f"allowed for {task}: {', '.join(allowed)}"

@@ -71,7 +71,10 @@ class Poses:
 
 
 class CustomMotion(CustomPart, RecordedAxes):
-    """A user-defined motion, as its module describes: of the camera or, with `lever_m`, of the vehicle."""
+    """A user-defined motion (see `marsyard.scenarios.parts.motions`).
+
+    Positions are those of the camera or, with `lever_m`, of the vehicle.
+    """
 
     kind = DYNAMICS
     name_key = "motion"

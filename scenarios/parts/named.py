@@ -153,7 +153,10 @@ class CustomPart(Parameters):
 
 
 def default_or_custom(default: type[BaseModel], custom: type[CustomPart]) -> Discriminator:
-    """Create the discriminator of a user-defined part's table and the default one; the tags are the models' names."""
+    """Create the discriminator between a table with a user-defined part and the default table.
+
+    The tags are the names of the models.
+    """
 
     def select_tag(table: Any) -> str:
         is_custom = custom.name_key in table if isinstance(table, Mapping) else isinstance(table, custom)

@@ -164,7 +164,10 @@ class TrackerGuide:
         return check_aim(answer, run.setup.rig.calibrated)
 
     def observe(self, run: RoverRun, view: StopView) -> RunOutcome | None:
-        """Update the tracker and append the stop; return the outcome if the run ends, else None. Raises as `aim`."""
+        """Update the tracker and append the stop to the run; return the outcome if the run ends, else None.
+
+        Raises the same exceptions as `aim`.
+        """
         images = self._input((view.images.left, view.images.right))
         measurements = RoverMeasurements(*images, self._mast, *view.angles_rad, view.estimated_pose)
         start_s = algorithm_time_s()
@@ -384,7 +387,10 @@ def take_odometry_pair(p: RoverScenarioParameters, run: RoverRun) -> StereoMeasu
 
 
 def map_terrain(p: RoverScenarioParameters, run: RoverRun, leg: LegParameters, target: TargetEstimate) -> None:
-    """Add the stereo pairs of an update to the navigator's map; the first also adds the ground under the rover."""
+    """Add the stereo pairs of a navigation update to the navigator's map.
+
+    The first update also adds the ground under the rover.
+    """
     run.autonav_updates += 1
     run.time_s += p.timing.autonav_s
     vehicle, cameras, time_s = run.setup.vehicle, run.setup.navigation_cameras, run.time_s

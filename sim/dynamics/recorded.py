@@ -191,7 +191,10 @@ def _read_file(path: str, _modified_ns: int, size: int) -> RecordedPoses:
 
 
 def _read_table(path: str, head: bytes) -> tuple[Decimal, Float64[np.ndarray, "n 8"]]:
-    """Read, from any format, the first time, and of each row time since then, position and quaternion (x, y, z, w)."""
+    """Read the first time and, of each row, time since then, position and quaternion (x, y, z, w).
+
+    The first bytes determine the format.
+    """
     first_line = head.decode("utf-8", errors="replace").lstrip("\ufeff").split("\n", 1)[0].strip()
     if head.startswith(b"PAR1"):
         return _read_parquet(path)
