@@ -103,7 +103,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("list", type=Path, nargs="?", default=Path(__file__).with_name("confirmations.txt"))
     parser.add_argument("--out", type=Path, default=Path("runs/confirmations"), help="folder of the runs and the log")
-    parser.add_argument("--record", type=Path, default=Path("confirmations.jsonl"), help="record of confirmations")
+    parser.add_argument(
+        "--record",
+        type=Path,
+        default=Path("benchmarks/results/confirmations.jsonl"),
+        help="record of confirmations; default: that of this project",
+    )
     options = parser.parse_args(arguments)
     try:
         entries = read_list(options.list)

@@ -36,8 +36,8 @@ def test_interrupted_queue_continues_where_it_stopped(tmp_path: Path, monkeypatc
 
     monkeypatch.setattr(subprocess, "run", run)
     with pytest.raises(KeyboardInterrupt):
-        queue.main(["queue.txt", "--out", "runs"])
-    assert queue.main(["queue.txt", "--out", "runs"]) == 0
+        queue.main(["queue.txt", "--out", "runs", "--record", "confirmations.jsonl"])
+    assert queue.main(["queue.txt", "--out", "runs", "--record", "confirmations.jsonl"]) == 0
     assert [command[:2] for command in commands] == [["run", "fake.toml"], ["run", "other.toml"], ["run", "other.toml"]]
     reports = [json.loads((tmp_path / "runs" / name / "report.json").read_text()) for name in ("fake", "other")]
     assert [(report["cases"], report["verdict"]) for report in reports] == [(10, "PASS"), (11, "PASS")]
@@ -48,7 +48,7 @@ def test_interrupted_queue_continues_where_it_stopped(tmp_path: Path, monkeypatc
     # the record is committed; a campaign without its last cases is resumed
     assert queue.git("status", "--porcelain", "--untracked-files=no") == ""
     (tmp_path / "runs" / "other" / "report.json").unlink()
-    assert queue.main(["queue.txt", "--out", "runs"]) == 0
+    assert queue.main(["queue.txt", "--out", "runs", "--record", "confirmations.jsonl"]) == 0
     assert commands[3][:2] == ["resume", "runs/other"]
 
 
@@ -60,10 +60,10 @@ def test_changed_tree_is_refused(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "queue.log").write_text("2026-01-01T00:00:00+00:00 0123456789abcdef start: marsyard\n")
-    assert queue.main(["queue.txt", "--out", "runs"]) == 2
+    assert queue.main(["queue.txt", "--out", "runs", "--record", "confirmations.jsonl"]) == 2
     assert "was begun on the tree 0123456789abcdef; this is " in capsys.readouterr().err
     (tmp_path / "estimator.py").write_text("class Estimator:\n    option = 1\n")
-    assert queue.main(["queue.txt", "--out", "other"]) == 2
+    assert queue.main(["queue.txt", "--out", "other", "--record", "confirmations.jsonl"]) == 2
     assert "the tree has changes (M estimator.py): commit them" in capsys.readouterr().err
     assert (tmp_path / RECORD).read_text() == ""
 
