@@ -13,7 +13,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, measure_within
-from benchmarks.validation.image_statistics import BLOCK, GroundStatistics, compute_ground_statistics
+from benchmarks.validation.image_statistics import (
+    BLOCK,
+    GroundStatistics,
+    compute_ground_statistics,
+    compute_image_statistics,
+)
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.terrain import sites
@@ -24,6 +29,10 @@ from marsyard.site_images import ImageRequest, RenderedImage, render_images, tru
 CROP_PX, TOP_DEG = 384, 7.0
 #: Azimuths of mast images, degrees, and their elevation: the mounting's default shows the horizon.
 AZIMUTHS_DEG = (0.0, 90.0, 180.0, 270.0)
+#: Elevation of the camera in mast images without horizon, degrees, and limits of the median contrast of their blocks
+#: after reduction (`ImageStatistics.local_p50`).
+DOWN_DEG, REDUCED_CONTRAST = -35.0, (0.045, 0.075)
+FLOWN_REDUCED = {"gusev": "Spirit: 0.061 to 0.065", "meridiani": "Opportunity: 0.040 to 0.055"}
 #: Azimuth and elevation of the sun in mast images of Spirit (2N292280938) and Opportunity (1N491020376), and elevation
 #: in a hazard image of Opportunity (1F498644828), degrees: Mars24 formulas for the times of the spacecraft's clocks,
 #: which agree with the label of Opportunity's mast image to 1 deg.
@@ -117,6 +126,12 @@ def render_mast(site: str, **values: float | int) -> RenderedImage:
     return _render(site, "mer-navcam", sun_azimuth_deg=azimuth, sun_elevation_deg=elevation, **values)
 
 
+def measure_reduced_contrast(site: str, azimuth_deg: float, seed: int) -> float:
+    """Median contrast of the blocks of a mast image that is reduced by area."""
+    image = render_mast(site, azimuth_deg=azimuth_deg, elevation_deg=DOWN_DEG, seed=seed)
+    return compute_image_statistics(image.to_uint16().astype(np.float64)).local_p50
+
+
 def render_hazard(site: str, seed: int) -> RenderedImage:
     """Render a hazard image with the sun behind the rover."""
     azimuth, elevation = HAZARD_SUN_DEG
@@ -139,6 +154,10 @@ def compare_ground_images(quick: bool) -> Iterator[Measure]:
             MAST_LIMITS,
             FLOWN_MAST,
         )
+        contrasts = [measure_reduced_contrast(site, azimuth, seed) for seed in seeds for azimuth in AZIMUTHS_DEG]
+        how = f"median of {len(contrasts)} images without horizon; {FLOWN_REDUCED[site]}"
+        claim = f"local_p50 of reduced images, mast images over {site}"
+        yield from measure_within(claim, float(np.median(contrasts)), REDUCED_CONTRAST, how)
         away: dict[str, Any] = {"azimuth_deg": MAST_SUNS_DEG[site][0] - 180.0, "elevation_deg": 0.0}
         ratio = np.median([sky_over_ground(render_mast(site, seed=seed, **away)) for seed in seeds])
         # the flown value is Opportunity's
