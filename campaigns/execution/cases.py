@@ -24,7 +24,8 @@ from marsyard.campaigns.store.products import PackedProducts, ProductSelection, 
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, recording_timelines
 from marsyard.scenarios.systems import scenario
-from marsyard.sim.cache import CacheWarning, hide_folders
+from marsyard.sim.array_cache import CacheWarning
+from marsyard.sim.cache import hide_folders
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023

@@ -10,7 +10,8 @@ from weakref import WeakValueDictionary
 import numpy as np
 from jaxtyping import Float32
 
-from marsyard.sim.cache import CacheWarning, cache_directory, evict_files, load_array, save_array, touch
+from marsyard.sim.array_cache import CacheWarning, load_array, save_array
+from marsyard.sim.cache import cache_directory, evict_files, touch
 from marsyard.sim.terrain.imported import blend_into_ground, embed, extract_fine_detail
 from marsyard.sim.terrain.landforms.craters import add_craters, draw_craters
 from marsyard.sim.terrain.landforms.ground import FractalField, TerrainGround, refine, substream

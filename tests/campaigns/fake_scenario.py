@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from marsyard.algorithms.exchange import ExecutableLimits
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.velocity import VELOCITY
-from marsyard.sim.cache import CacheWarning
+from marsyard.sim.array_cache import CacheWarning
 from marsyard.sim.streams import Streams
 
 

@@ -15,7 +15,8 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from scipy.spatial import ConvexHull
 
-from marsyard.sim.cache import cache_directory, evict_files, load_array, save_array, touch
+from marsyard.sim.array_cache import load_array, save_array
+from marsyard.sim.cache import cache_directory, evict_files, touch
 from marsyard.sim.kernel_cache import processor_features
 
 _SEED = 0x70C6  #: Root seed of all shapes.

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import marsyard.sim.cache as cache_module
-from marsyard.sim.cache import CacheWarning
+import marsyard.sim.array_cache as cache_module
+from marsyard.sim.array_cache import CacheWarning
 from marsyard.sim.terrain import TerrainBank, TerrainParameters
 
 SMALL = TerrainParameters(samples=64)
@@ -86,7 +86,7 @@ def test_zeroed_cache_file_is_rebuilt(cache: Path) -> None:
 def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bank = TerrainBank(SMALL, seed=1)
     expected = _read_bytes(bank, 0)
-    monkeypatch.setattr("marsyard.sim.cache._VERIFIED", {})
+    monkeypatch.setattr("marsyard.sim.array_cache._VERIFIED", {})
     checked_sizes: list[int] = []
     compute_checksum = cache_module._compute_checksum
 
@@ -94,7 +94,7 @@ def test_file_is_verified_once_per_process(cache: Path, monkeypatch: pytest.Monk
         checked_sizes.append(array.size)
         return compute_checksum(array)
 
-    monkeypatch.setattr("marsyard.sim.cache._compute_checksum", count_and_compute)
+    monkeypatch.setattr("marsyard.sim.array_cache._compute_checksum", count_and_compute)
     assert [_read_bytes(bank, 0), _read_bytes(bank, 0)] == [expected, expected]
     assert len(checked_sizes) == 1
 
