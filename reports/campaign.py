@@ -26,6 +26,7 @@ from marsyard.reports.convergence import convergence_section
 from marsyard.reports.driver_section import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.gallery import CASES_PER_GROUP, gallery_views
+from marsyard.reports.hidden_folders import hide_folders
 from marsyard.reports.overall import OverallVerdict, multiplicity_text
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.presentation import presentations
@@ -44,7 +45,6 @@ from marsyard.reports.traceability import junit_xml, read_algorithms, requiremen
 from marsyard.reports.validity import validity_section
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count, label, number
-from marsyard.sim.cache import hide_folders
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (

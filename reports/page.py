@@ -25,6 +25,7 @@ from marsyard.campaigns.definition.campaign_file import description_at
 from marsyard.reports import figures
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
+from marsyard.reports.hidden_folders import hide_folders
 from marsyard.reports.presentation import presentations, system_presentation
 from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
 from marsyard.reports.sampling_design import read_sampling_design
@@ -46,7 +47,6 @@ from marsyard.reports.wording import (
 )
 from marsyard.scenarios.columns import split_unit
 from marsyard.scenarios.systems import scenario, scenario_names
-from marsyard.sim.cache import hide_folders
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10

@@ -15,6 +15,9 @@ from pathlib import Path
 
 from marsyard.sim.cache import cache_directory
 
+#: The folders that contain kernels, in the source tree and in an installation.
+_FOLDERS = ("sim", "algorithms", "scenarios")
+
 
 @cache
 def processor_features() -> str:
@@ -24,10 +27,6 @@ def processor_features() -> str:
     extensions = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), "")
     flags = " ".join(sorted(extensions.split()))
     return f"{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:12]}"
-
-
-#: The folders that contain kernels, in the source tree and in an installation.
-_FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def set_cache_folders() -> None:

@@ -223,7 +223,7 @@ def estimate_motion(
         motion = kernels.MotionArrays(quaternion, translation, length_unit_m / start.depths)
         for scale_px, with_depths, tolerance in stages:
             matches = kernels.MatchArrays(first, second, focal_px, scale_px)
-            motion, cost, converged, _ = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
+            motion, cost, converged = kernels.solve(matches, motion, with_depths, ITERATIONS, tolerance)
         candidates.append((motion, cost, converged))
     best, _, converged = min(candidates, key=lambda candidate: candidate[1])
     second_from_first = rigid(Rotation.from_quat(best.q, scalar_first=True), length_unit_m * best.t)

@@ -22,9 +22,10 @@ from marsyard.campaigns.execution.work import Executor, TaskResult, Work, WorkLi
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
+from marsyard.reports.hidden_folders import hide_folders
 from marsyard.scenarios.interface import CaseResult, Scalar, recording_timelines
 from marsyard.scenarios.systems import scenario
-from marsyard.sim.cache import CacheWarning, hide_folders
+from marsyard.sim.cache import CacheWarning
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023

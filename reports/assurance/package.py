@@ -27,12 +27,12 @@ from marsyard.reports.assurance.signature import signature_path
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.fits import REGISTER as REGISTER_FILE
+from marsyard.reports.hidden_folders import hide_folders
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.report_file import REPORT_JSON, read_report
 from marsyard.reports.signature import SIGNATURE_FILE
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.validation_rows import VALIDATION_FILE
-from marsyard.sim.cache import hide_folders
 
 #: Files of the package that are computed from its evidence, and the file of the hashes.
 PAGE, CASE, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "manifest.json"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.sensor.imu import accumulate_quaternions, multiply_quaternions
+from marsyard.sim.quaternions import accumulate_quaternions, multiply_quaternions
 from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from tests.sim.sensor.motions import GRAVITY, Swaying

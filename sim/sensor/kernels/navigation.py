@@ -1,4 +1,4 @@
-"""Compiled error-state Kalman filter of `marsyard.sim.sensor.navigation`.
+"""Compiled error-state Kalman filter of `marsyard.sim.sensor.helicopter_navigation`.
 
 A state has 16 values: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias.
 Errors are true minus estimated; the attitude error is a rotation vector in world axes. The covariance is that of 15

@@ -29,8 +29,8 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, STANDARD_GRAVITY_M_S2, ImuParameters
-from marsyard.sim.sensor.navigation import kernels
-from marsyard.sim.sensor.satellite_navigation import RtkParameters, RtkSolutions, SolutionErrors
+from marsyard.sim.sensor.kernels import navigation as kernels
+from marsyard.sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
 
 
