@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from marsyard.algorithms.arrays import Vector2
-from marsyard.algorithms.dimes.binning import BinnedView
 from marsyard.algorithms.dimes.ground_view import pixels_from_ground
+from marsyard.algorithms.dimes.views import BinnedView
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 
 #: Lower limit of the flat field before division.

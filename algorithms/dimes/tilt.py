@@ -23,8 +23,10 @@ from jaxtyping import Bool, Float
 from scipy import optimize, special
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
-from marsyard.algorithms.dimes import binning, ground_view, overlap, rectification
+from marsyard.algorithms.dimes import ground_view, overlap, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.views import BinnedView
+from marsyard.algorithms.dimes.zero_phase import outside_zero_phase
 from marsyard.algorithms.image.registration import WindowSpline, register_template, spline_coefficients
 
 #: Unknowns of the fit; `Unknowns` names its parts.
@@ -60,11 +62,7 @@ class GroundTracks:
 
 
 def track_grid(
-    first: binning.BinnedView,
-    second: binning.BinnedView,
-    velocity_m_s: Vector2,
-    sun_direction: Vector3,
-    options: DimesOptions,
+    first: BinnedView, second: BinnedView, velocity_m_s: Vector2, sun_direction: Vector3, options: DimesOptions
 ) -> GroundTracks:
     """Track a grid of templates on the common ground, from the positions that a velocity (east, north) predicts.
 
@@ -105,14 +103,12 @@ def track_grid(
     )
 
 
-def _is_usable(
-    view: binning.BinnedView, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions
-) -> Flags:
+def _is_usable(view: BinnedView, ground: Points2, gsd_m: float, sun_direction: Vector3, options: DimesOptions) -> Flags:
     """Whether templates around ground points lie in a view and outside of its zero-phase spot."""
     outline = ground_view.square_outline((0.5 * options.grid_template_px + MARGIN_PX) * gsd_m, 3)
     squares = ground[:, None] + outline
     inside = ground_view.inside_frame(view, squares, options.border_px, options.max_off_nadir_rad)
-    outside = overlap.outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
+    outside = outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
     return np.asarray((inside & outside).all(axis=1))
 
 

@@ -13,18 +13,10 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.hda import structure
 from marsyard.algorithms.hda.estimator import find_site, match_structure
-from marsyard.algorithms.hda.motion import (
-    CameraMotion,
-    LandingScene,
-    Views,
-    assess_motion,
-    build_scene,
-    points_at_depth,
-    project_points,
-    undistort,
-)
+from marsyard.algorithms.hda.motion import CameraMotion, assess_motion
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.hda.preparation import covering_camera
+from marsyard.algorithms.hda.scene import LandingScene, Views, build_scene, points_at_depth, project_points, undistort
 from marsyard.algorithms.hda.tracking import Tracks
 from marsyard.algorithms.interface import SiteEstimate
 from marsyard.sim.camera import Cahv

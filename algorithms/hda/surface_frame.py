@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.arrays import Points3, Vector3
-from marsyard.algorithms.hda.motion import CameraView
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame
+from marsyard.algorithms.hda.scene import CameraView
 
 #: Number of random point triples for the robust plane through all points.
 PLANE_TRIALS = 200

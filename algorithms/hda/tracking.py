@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 
 from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Vector, Vector2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import CameraView
 from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
+from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.image.correlation import halve
 from marsyard.algorithms.image.interest import structure_tensor
 from marsyard.algorithms.image.registration import RegistrationLimits, register_template

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector, Vector3
-from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak
+from marsyard.algorithms.image.peaks import biquadratic_offset, highest_peak
 from marsyard.algorithms.image.registration import MARGIN_PX, RegistrationLimits, register_template
 from marsyard.algorithms.localisation import map_sampling
 from marsyard.algorithms.localisation.interface import MapProduct

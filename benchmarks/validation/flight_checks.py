@@ -23,7 +23,7 @@ from benchmarks.validation.image_statistics import (
     compute_pair_statistics,
 )
 from benchmarks.validation.records import Check, Measure
-from marsyard.algorithms.dimes.details import TRACK_COLUMNS
+from marsyard.algorithms.dimes.products import TRACK_COLUMNS
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.sim.sensor import preset

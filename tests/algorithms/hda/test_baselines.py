@@ -12,7 +12,7 @@ from marsyard.algorithms.hda.baselines import (
     semi_global_structure,
 )
 from marsyard.algorithms.hda.estimator import motion_from_tracks
-from marsyard.algorithms.hda.motion import LandingScene, build_scene
+from marsyard.algorithms.hda.scene import LandingScene, build_scene
 from marsyard.algorithms.hda.tracking import select_features, track_features
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.sim.frames import rigid
