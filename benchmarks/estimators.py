@@ -1,7 +1,5 @@
 """Run times of velocity estimators on the same rendered descents: DIMES and baselines."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass

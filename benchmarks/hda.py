@@ -3,8 +3,6 @@
 The times of the paper are for a MIPS R12000 processor at 400 MHz.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import cv2

@@ -1,7 +1,5 @@
 """Core-seconds of the stages of a case, measured by Python's profiler."""
 
-from __future__ import annotations
-
 import cProfile
 import time
 from collections.abc import Callable, Mapping

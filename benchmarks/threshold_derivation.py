@@ -10,8 +10,6 @@ The threshold is the smallest multiple of `step_m_s` that accepts the fraction `
 correct track in each pair, the minimum for DIMES. `benchmarks.dimes_threshold` stores the result.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

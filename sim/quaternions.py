@@ -1,7 +1,5 @@
 """Products of arrays of quaternions (x, y, z, w), faster than those of SciPy's `Rotation`."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float64
 

@@ -1,7 +1,5 @@
 """Commands of external programs under test: prefix, program and arguments."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from collections.abc import Mapping

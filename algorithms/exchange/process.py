@@ -4,8 +4,6 @@ Each program has its own process group and temporary folder. Its child processes
 removed. On Linux it is killed when its parent process ends.
 """
 
-from __future__ import annotations
-
 import os
 import selectors
 import shutil

@@ -3,8 +3,6 @@
 Figures are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

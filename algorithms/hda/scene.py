@@ -4,8 +4,6 @@ In a camera frame, z is the optical axis, x runs along columns and y along rows.
 (x / z, y / z). Equations are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Errors of an inertial unit as the navigation filter assumes them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

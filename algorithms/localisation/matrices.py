@@ -1,7 +1,5 @@
 """Matrices of the navigation filter: vector products, small rotations and covariances."""
 
-from __future__ import annotations
-
 import numpy as np
 from jaxtyping import Float
 

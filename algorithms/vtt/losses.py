@@ -3,8 +3,6 @@
 Sections and figures are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ templates of DIMES, and mast images of both rovers. Some terrains of `sim/terrai
 the agreement is no independent test. "Flown" values were measured in images from Mars.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations

@@ -1,7 +1,5 @@
 """Detector of a campaign: its values, or changes to those of a camera preset or of a datasheet."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Camera optics: point spread and stray light, natural fall-off, and dust on the camera window."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 from typing import Annotated
 

@@ -8,8 +8,6 @@ Sources: the field-test paper III.B; the target tracking paper section 3 (resear
 Maki et al. 2003, "Mars Exploration Rover Engineering Cameras" (MER). Assumed values are marked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial

@@ -17,8 +17,6 @@ factor of 14.3, but the fraction in the paper by 9.1. `DARK_E_S` is chosen such 
 The field-test paper is Johnson et al., "Field Testing of the MER DIMES".
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
