@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
@@ -26,7 +27,6 @@ from marsyard.reports.convergence import convergence_section
 from marsyard.reports.driver_section import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.gallery import CASES_PER_GROUP, gallery_views
-from marsyard.reports.hidden_folders import hide_folders
 from marsyard.reports.overall import OverallVerdict, multiplicity_text
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.presentation import presentations

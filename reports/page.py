@@ -22,10 +22,10 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.faults import Fault
 from marsyard.campaigns.definition.campaign_file import description_at
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.reports import figures
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
-from marsyard.reports.hidden_folders import hide_folders
 from marsyard.reports.presentation import presentations, system_presentation
 from marsyard.reports.rates import CONFIDENCE, engine_failed, population_mask, terrain_groups
 from marsyard.reports.sampling_design import read_sampling_design

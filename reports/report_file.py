@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from marsyard.campaigns.definition.evidence import Evidence
-from marsyard.reports.hidden_folders import hide_folders
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.samples import ErrorSummary

@@ -1,4 +1,6 @@
-"""Cache folders of compiled code: one folder per version of the kernel sources for numba, and one folder for Dr.Jit.
+"""Cache folders of compiled code, and markers of scenarios whose code is compiled.
+
+numba has one folder per version of the kernel sources, Dr.Jit one folder.
 
 numba recompiles a function when its file changes, but not when a function that it calls in another file changes. The
 cached function would then return outdated results. Therefore a change of any kernel source selects a new folder. Dr.Jit

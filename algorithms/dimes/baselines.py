@@ -114,8 +114,8 @@ def rectify_pair(first: BinnedView, second: BinnedView, options: CommonOptions) 
     square = find_common_square(first, second, options)
     if square is None:
         return None
-    patches = (rectification.rectify_patch(view, *square) for view in (first, second))
-    return PairPatches(*patches, square.gsd_m)
+    first_patch, second_patch = (rectification.rectify_patch(view, *square) for view in (first, second))
+    return PairPatches(first_patch, second_patch, square.gsd_m)
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:

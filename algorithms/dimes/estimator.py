@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
 from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
+from marsyard.algorithms.dimes.ground_tracks import track_grid
 from marsyard.algorithms.dimes.ground_view import pixels_from_ground
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.rectification import rectify_patch
@@ -150,7 +151,7 @@ def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: Dime
     selected = (details.selected.first, details.selected.second)
     velocities = [pair.tracks[index].velocity_m_s for pair, index in zip(details.pairs, selected, strict=True)]
     grids = [
-        tilt.track_grid(*pair.views, velocity, sun_direction, options)
+        track_grid(*pair.views, velocity, sun_direction, options)
         for pair, velocity in zip(details.pairs, velocities, strict=True)
     ]
     if min(len(grid.first) for grid in grids) < tilt.MIN_TRACKS:

@@ -18,10 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
+from marsyard.algorithms.awake_clock import AwakeClock
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.sandbox import sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.processes import AwakeClock, descendants, end_with_parent, kill, resident_bytes, worker_device
+from marsyard.algorithms.processes import descendants, end_with_parent, kill, resident_bytes
+from marsyard.algorithms.worker_device import worker_device
 
 #: Interval of the checks of time, memory and output, and of the files' size, seconds.
 _POLL_S, _FILES_POLL_S = 0.02, 0.5
@@ -190,11 +192,9 @@ class RunningProgram:
         elapsed_s, now_s = self._clock.elapsed_s(), time.monotonic()
         if elapsed_s > self._time_s:
             is_total = self._time_s == self.left_s
-            message = (
-                f"no answers to the case within {self.limits.total_s:g} s"
-                if is_total
-                else (f"no answer within {self._time_s:g} s")
-            )
+            message = f"no answer within {self._time_s:g} s"
+            if is_total:
+                message = f"no answers to the case within {self.limits.total_s:g} s"
             raise self._end_with_fault(Fault.TIMED_OUT, message)
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")

@@ -12,6 +12,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector3
 from marsyard.algorithms.hda.kernels import motion as kernels
+from marsyard.algorithms.hda.kernels.elevation import SIGMA_PER_MEDIAN
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.sim.frames import rigid
 
@@ -173,8 +174,10 @@ def _has_plausible_depth(first: Points2, inverse_depths: Vector, has_small_resid
             return mask
         plane = design @ np.linalg.lstsq(design[mask], inverse_depths[mask], rcond=None)[0]
         deviations = np.abs(inverse_depths - plane)
-        # 1.4826 times the median absolute deviation is the standard deviation of a normal distribution; the limit is
-        # at least 0.1 % of the median, because the deviations of a perfect plane are rounding errors
-        limit = max(3.0 * 1.4826 * float(np.median(deviations[mask])), 1e-3 * float(np.median(inverse_depths[mask])))
+        # three standard deviations of a normal distribution; the limit is at least 0.1 % of the median, because the
+        # deviations of a perfect plane are rounding errors
+        limit = max(
+            3.0 * SIGMA_PER_MEDIAN * float(np.median(deviations[mask])), 1e-3 * float(np.median(inverse_depths[mask]))
+        )
         mask = has_small_residual & (inverse_depths > 0.0) & (deviations <= limit)
     return np.asarray((inverse_depths > 0.0) & (deviations <= MAX_INVERSE_DEPTH_FRACTION * np.abs(plane)))

@@ -5,6 +5,7 @@ An offset is the true minus the estimated horizontal position (east, north), met
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -93,8 +94,8 @@ def verify_candidate(
             if rows:
                 members, near = [patches[k] for k in rows], candidate.offset_m
                 matches = _match_near(near, members, view, grid, appearance, half, options)
-                offsets[rows], scores[rows] = matches[:2]
-                surfaces += matches[2]
+                offsets[rows], scores[rows] = matches.offsets_m, matches.scores
+                surfaces += matches.surfaces
         candidate = _find_consensus(candidate.offset_m, offsets, scores, options)
         if not candidate.count:
             return candidate
@@ -110,6 +111,19 @@ def _compute_repetition(surfaces: Sequence[Surface], exclusion_px: float) -> flo
     return second_peak(mean, peak, exclusion_px) / peak.value if peak.value > 0.0 else 0.0
 
 
+class NearMatches(NamedTuple):
+    """Matches of one image's patches near an offset.
+
+    - offsets_m: offset (east, north) of each patch
+    - scores: its normalised correlation; -1 without a match
+    - surfaces: surfaces of correlation that the map's border does not cut
+    """
+
+    offsets_m: Points2
+    scores: Vector
+    surfaces: list[Surface]
+
+
 def _match_near(
     offset_m: Vector2,
     patches: Sequence[ImagePatch],
@@ -118,11 +132,8 @@ def _match_near(
     appearance: Raster,
     half: int,
     options: LvsOptions,
-) -> tuple[Points2, Vector, list[Surface]]:
-    """Offsets (east, north) and scores of one image's patches near an offset; the score is -1 if there is no match.
-
-    Also returns the surfaces of correlation that the map's border does not cut.
-    """
+) -> NearMatches:
+    """Match one image's patches within `half` coarse pixels of an offset (east, north)."""
     shift = np.rint(offset_m / grid.pixel_m)
     corners = np.array([patch.corner for patch in patches]) + shift
     values, inside = rectify_patches(view, grid, corners, patches[0].side, offset_m)
@@ -145,7 +156,7 @@ def _match_near(
         found = np.array([peak.row, peak.column]) + biquadratic_offset(surface, peak)
         offsets[k] = offset_m + grid.pixel_m * np.array([low_column + found[1] - column, low_row + found[0] - row])
         scores[k] = peak.value
-    return offsets, scores, surfaces
+    return NearMatches(offsets, scores, surfaces)
 
 
 def _find_consensus(start_m: Vector2, offsets_m: Points2, scores: Vector, options: LvsOptions) -> OffsetCandidate:

@@ -19,10 +19,10 @@ from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.work import Executor, TaskResult, Work, WorkLimits
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
-from marsyard.reports.hidden_folders import hide_folders
 from marsyard.scenarios.interface import CaseResult, Scalar, recording_timelines
 from marsyard.scenarios.systems import scenario
 from marsyard.sim.cache import CacheWarning

@@ -17,6 +17,7 @@ from markupsafe import Markup
 
 from marsyard.campaigns.definition.identity import hash_sources
 from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.confirmations import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
@@ -27,7 +28,6 @@ from marsyard.reports.assurance.signature import signature_path
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.fits import REGISTER as REGISTER_FILE
-from marsyard.reports.hidden_folders import hide_folders
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.report_file import REPORT_JSON, read_report
 from marsyard.reports.signature import SIGNATURE_FILE

@@ -21,7 +21,8 @@ from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.process import RunningProgram, temporary_folder
 from marsyard.algorithms.exchange.serving import acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
-from marsyard.algorithms.processes import children, processor_time_s, worker_device
+from marsyard.algorithms.processes import children, processor_time_s
+from marsyard.algorithms.worker_device import worker_device
 from marsyard.scenarios.imports import source_root
 from marsyard.scenarios.isolation.plain import decode
 from marsyard.scenarios.isolation.transport import Sender

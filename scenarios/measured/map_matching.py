@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.stats import rankdata
 
 from marsyard.algorithms.arrays import Points2
-from marsyard.algorithms.dimes import baselines as orb
+from marsyard.algorithms.dimes import homography as orb
 from marsyard.algorithms.image.correlation import normalized_correlation
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 from marsyard.algorithms.image.peaks import highest_peak
