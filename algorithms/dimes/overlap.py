@@ -17,6 +17,11 @@ from marsyard.algorithms.dimes.views import BinnedView
 from marsyard.algorithms.dimes.zero_phase import outside_zero_phase
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 
+#: Lower limit of the mean signal before division, as a fraction of the full scale.
+MIN_SIGNAL_FRACTION = 0.01
+#: Number of pixels along each side of an image's border that are projected for its outline.
+_BORDER_PIXELS = 8
+
 
 @dataclass(frozen=True)
 class SearchGeometry:
@@ -55,10 +60,6 @@ def search_geometry(first: BinnedView, second: BinnedView, options: DimesOptions
     max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
     search_px = int(np.ceil(max_displacement_m / gsd)) + options.search_margin_px
     return SearchGeometry(max_displacement_m, gsd, options.template_px, search_px)
-
-
-#: Number of pixels along each side of an image's border that are projected for its outline.
-_BORDER_PIXELS = 8
 
 
 def border_pixels(size: tuple[int, int]) -> Points2:
@@ -172,10 +173,6 @@ def searchable_positions(
     inside = ground_view.inside_frame(second, lattice, options.border_px, options.max_off_nadir_rad)
     half = geometry.template_px // 2
     return np.asarray(ndimage.minimum_filter(inside, size=geometry.template_px)[half:-half, half:-half])
-
-
-#: Lower limit of the mean signal before division, as a fraction of the full scale.
-MIN_SIGNAL_FRACTION = 0.01
 
 
 def template_contrasts(view: BinnedView, pixels: Points2, support: int) -> Vector:
