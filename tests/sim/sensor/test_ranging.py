@@ -1,4 +1,4 @@
-"""Tests of radar altimeter and laser altimeter: errors, time tags and measured ranges."""
+"""Tests of radar and laser altimeter, and of errors and time tags that the GPS receiver shares with the radar."""
 
 from collections.abc import Callable
 
@@ -24,10 +24,6 @@ from marsyard.sim.terrain import Surface
 from tests.sim.scenes import flat_ground, make_ground
 from tests.sim.sensor.motions import Swaying
 
-#: A carrier-phase (RTK) receiver with a nearby base station, resolved integer ambiguities and errors of 2 cm.
-RTK = GpsParameters(
-    horizontal_noise_m=0.01, vertical_noise_m=0.015, horizontal_wander_m=0.01, vertical_wander_m=0.02, correlation_s=120
-)
 DESCENT = Swaying(position_m=(2500.0, 2500.0, 2000.0), velocity_m_s=(10.0, 0.0, -75.0))
 #: Samples per side of a surface, their spacing and the coordinate of its centre, m.
 SIDE, SPACING = 1024, 5.0
