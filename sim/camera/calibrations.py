@@ -82,12 +82,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
         return super().compose_node(parent, index)
 
 
-# YAML tags of OpenCV's matrices; the second is that of one-dimensional matrices in OpenCV 5
-for _kind in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(
-        f"tag:yaml.org,2002:{_kind}",
-        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
-    )
+def _construct_matrix(loader: _Loader, node: Any) -> Any:
+    """Construct OpenCV's matrix: a table with its elements in `data`; None for another node with this tag."""
+    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _construct_matrix)
+# one-dimensional matrices in OpenCV 5
+_Loader.add_constructor("tag:yaml.org,2002:opencv-nd-matrix", _construct_matrix)
 
 
 def is_calibration(head: bytes) -> bool:
