@@ -83,9 +83,9 @@ class DescentPath:
     ) -> DescentPath:
         """Integrate from a state at time 0: back by `lead_s`, and forward until `event` is zero or for `max_s`.
 
-        `constants` are from `kernels.pack_constants`. Raises ValueError if the integration fails.
+        `event` has the attribute `terminal` of SciPy's events. `constants` are from `kernels.pack_constants`. Raises
+        ValueError if the integration fails.
         """
-        event.terminal = True  # type: ignore[attr-defined]
         solutions = []
         for end_s, events in ((-lead_s, None), (max_s, (event,))):
             solution = pysolve_ivp(
@@ -178,6 +178,7 @@ class SwingDescent(Trajectory):
         def remaining_height(_t: float, y: StateVector, *_constants: Float64[np.ndarray, "..."]) -> float:
             return _compute_camera_height(y, chain) - firing_m + BELOW_FIRING_M
 
+        remaining_height.terminal = True  # type: ignore[attr-defined]
         # the fall takes about this height / rate; three times as long ends a flight that does not fall
         max_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
         path = DescentPath.integrate(state, lead_s, max_s, remaining_height, kernels.pack_constants(chain, wind.field))
