@@ -1,4 +1,4 @@
-"""Processes: their children and memory from Linux's /proc (empty or zero elsewhere), clocks, and a worker's device."""
+"""Other processes: their children, memory, processor time and end, by Linux's /proc (empty or zero elsewhere)."""
 
 import ctypes
 import os
@@ -10,31 +10,10 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-#: Environment variable: number of a worker process, counted from 0.
-WORKER_NUMBER = "MARSYARD_WORKER_NUMBER"
 #: Options of Linux's `prctl`: send a signal at the parent's end; become the parent of orphaned descendants.
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 #: Loaded here, because nothing should be loaded between a fork and the execution of another program.
 _libc = ctypes.CDLL(None)
-#: Maximum time between two readings of an `AwakeClock` that is counted, s.
-_MAX_STEP_S = 1.0
-
-
-class AwakeClock:
-    """Clock that counts only the time during which this process reads it at least once a second.
-
-    If this process is suspended, together with the process that it monitors, the time of the suspension is not counted.
-    """
-
-    def __init__(self) -> None:
-        self._elapsed_s, self._last_s = 0.0, time.monotonic()
-
-    def elapsed_s(self) -> float:
-        """Return the counted time since the creation of the clock."""
-        now_s = time.monotonic()
-        self._elapsed_s += min(now_s - self._last_s, _MAX_STEP_S)
-        self._last_s = now_s
-        return self._elapsed_s
 
 
 def processor_time_s(process: int) -> float:
@@ -109,8 +88,3 @@ def _read_kilobytes(process: int, file: str, fields: str) -> float:
     except OSError:
         return 0.0
     return float(sum(int(size) for size in re.findall(rf"^{fields}:\s+(\d+) kB", text, re.MULTILINE)))
-
-
-def worker_device(devices: Sequence[str]) -> str:
-    """Return the device of this worker process; the workers receive the devices in turn."""
-    return devices[int(os.environ.get(WORKER_NUMBER, "0")) % len(devices)]

@@ -1,7 +1,5 @@
 """Run all benchmarks, print and store the measurements: ``python -m benchmarks``."""
 
-from __future__ import annotations
-
 import argparse
 import datetime as dt
 import json

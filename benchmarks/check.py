@@ -8,8 +8,6 @@ than the factor `ALLOWED_GROWTH`. The false alarm rate is `FALSE_ALARM_RATE` for
 valid for one type of processor; the file contains those of each type on which an earlier version was measured.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime as dt
 import json

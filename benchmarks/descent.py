@@ -1,7 +1,5 @@
 """Run times of a descent image, a new terrain and a complete case of the descent scenario."""
 
-from __future__ import annotations
-
 import itertools
 from functools import partial
 

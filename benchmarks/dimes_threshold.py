@@ -3,8 +3,6 @@
 Writes `algorithms/dimes/imu_threshold.json`; a test compares it with the option's default. Takes about ten minutes.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from importlib.metadata import version

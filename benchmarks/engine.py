@@ -1,7 +1,5 @@
 """Measure the overhead of campaigns: time per case, memory of the parent process, writing a table of a million rows."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Sequence

@@ -7,8 +7,6 @@
 - Core-seconds of a report as a function of the number of cases
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Steps of one image: ``python -m benchmarks.image_steps`` draws docs/images/image-steps.png."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Run times of rendered images, and memory of a process that renders."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

@@ -1,7 +1,5 @@
 """Run times of complete localisation cases, and of their stages."""
 
-from __future__ import annotations
-
 import itertools
 from functools import partial
 

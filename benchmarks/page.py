@@ -5,8 +5,6 @@ rates of another machine are scaled by the time of its reference workload before
 ``python -m benchmarks.page`` writes the page again.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Wall-clock times of a newcomer's commands: set-up with demo, and all checks and tests, in a new clone."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import time

@@ -5,8 +5,6 @@ Cycles is measured if the variable `MARSYARD_BLENDER` names a Python with ``bpy`
 because it needs an older NumPy). VTK and Blender run in separate processes with their own OpenGL and threads.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os

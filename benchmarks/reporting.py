@@ -1,7 +1,5 @@
 """Time, memory and size of reports of large and small campaigns, and of a dashboard of a thousand campaigns."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

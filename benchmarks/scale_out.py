@@ -12,8 +12,6 @@ a process of its own; the processor time of each process counts. A simulation of
 times and cases of random duration, is compared with (1).
 """
 
-from __future__ import annotations
-
 import heapq
 import json
 import socket

@@ -3,8 +3,6 @@
 `benchmarks.dimes_threshold` uses them as inputs of the derivation of DIMES' threshold.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

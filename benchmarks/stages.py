@@ -1,7 +1,5 @@
 """Core-seconds of the stages of a case, measured by Python's profiler."""
 
-from __future__ import annotations
-
 import cProfile
 import time
 from collections.abc import Callable, Mapping
@@ -20,7 +18,11 @@ DESCENT_STAGES: Stages = {
     "shadow of the ground": (("render/ground_shadow.py", "compute_ground_shadow"),),
     "shading": (("render/renderer.py", "shade_hits"),),
     "rays in edge pixels": (("render/renderer.py", "trace_subpixels"),),
-    "detector": (("sensor/detector.py", "draw"), ("sensor/detector.py", "expose"), ("sensor/optics.py", "from_camera")),
+    "detector": (
+        ("sensor/detector.py", "draw"),
+        ("sensor/detector.py", "expose"),
+        ("sensor/image_motion.py", "from_camera"),
+    ),
     "instruments": (("descent/measurement.py", "draw"), ("descent/measurement.py", "measure")),
     "DIMES": (("dimes/estimator.py", "estimate"),),
     "feasible overlap": (("descent/overlap.py", "overlap_row"),),

@@ -1,7 +1,5 @@
 """Run times of starting the command line, of compiling kernels after installation, and of the first campaign."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

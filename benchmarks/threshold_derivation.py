@@ -10,19 +10,17 @@ The threshold is the smallest multiple of `step_m_s` that accepts the fraction `
 correct track in each pair, the minimum for DIMES. `benchmarks.dimes_threshold` stores the result.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import BinnedView
 from marsyard.algorithms.dimes.ground_view import ground_from_pixels
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.overlap import best_candidates, search_geometry, template_candidates
 from marsyard.algorithms.dimes.validity import rank_combinations
+from marsyard.algorithms.dimes.views import BinnedView
 from marsyard.sim.camera import Cahv, CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorCalibration

@@ -1,7 +1,5 @@
 """Results of a benchmark with their limits, and the measurement of processor time."""
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Callable

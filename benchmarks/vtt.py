@@ -1,7 +1,5 @@
 """Run times of visual target tracking: a tracking update, its template search (also by OpenCV), and a rover run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

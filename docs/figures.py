@@ -1,7 +1,5 @@
 """Figures of the documentation (distortion, reflectance, sample sizes), drawn with Marsyard's own functions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import matplotlib as mpl

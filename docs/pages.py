@@ -1,7 +1,5 @@
 """Generated pages of the documentation: commands, parameters of scenarios, catalogue, folders of `marsyard ingest`."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib

@@ -12,8 +12,6 @@ than the present ones, or if a sentence that names one stored campaign contains 
 campaign file contains.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.reports import common_sections, explorer, page
 from marsyard.reports.boundary import boundary_section
@@ -44,7 +45,6 @@ from marsyard.reports.traceability import junit_xml, read_algorithms, requiremen
 from marsyard.reports.validity import validity_section
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count, label, number
-from marsyard.sim.cache import hide_folders
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (

@@ -22,6 +22,7 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.faults import Fault
 from marsyard.campaigns.definition.campaign_file import description_at
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.reports import figures
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
@@ -46,7 +47,6 @@ from marsyard.reports.wording import (
 )
 from marsyard.scenarios.columns import split_unit
 from marsyard.scenarios.systems import scenario, scenario_names
-from marsyard.sim.cache import hide_folders
 
 #: Maximum number of rows of the tables of single cases.
 _MAX_CASES = 10

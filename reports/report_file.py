@@ -8,13 +8,13 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from marsyard.campaigns.definition.evidence import Evidence
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.sampling_design import SamplingDesign
 from marsyard.reports.statistics.samples import ErrorSummary
 from marsyard.reports.traceability import Algorithm
 from marsyard.reports.validity import Validity
 from marsyard.reports.verdicts import Verdict
-from marsyard.sim.cache import hide_folders
 
 #: Files of a report: the page, and its data.
 PAGE_FILE, REPORT_JSON = "report.html", "report.json"

@@ -8,8 +8,9 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms import exchange
 from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchStatus, Safety
-from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
+from marsyard.algorithms.hda.essential_matrix import EssentialMatrixEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
+from marsyard.algorithms.hda.semi_global import SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.offline_algorithms import SITE_FORMAT

@@ -26,7 +26,7 @@ from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms import exchange
-from marsyard.algorithms.processes import worker_device
+from marsyard.algorithms.worker_device import worker_device
 from marsyard.scenarios.imports import import_object, source_files
 from marsyard.scenarios.isolation.host import construct, reset
 from marsyard.scenarios.isolation.remote import AlgorithmDescription, RemoteAlgorithm, describe_in_process

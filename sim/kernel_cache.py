@@ -1,4 +1,6 @@
-"""Cache folders of compiled code: one folder per version of the kernel sources for numba, and one folder for Dr.Jit.
+"""Cache folders of compiled code, and markers of scenarios whose code is compiled.
+
+numba has one folder per version of the kernel sources, Dr.Jit one folder.
 
 numba recompiles a function when its file changes, but not when a function that it calls in another file changes. The
 cached function would then return outdated results. Therefore a change of any kernel source selects a new folder. Dr.Jit
@@ -15,6 +17,9 @@ from pathlib import Path
 
 from marsyard.sim.cache import cache_directory
 
+#: The folders that contain kernels, in the source tree and in an installation.
+_FOLDERS = ("sim", "algorithms", "scenarios")
+
 
 @cache
 def processor_features() -> str:
@@ -24,10 +29,6 @@ def processor_features() -> str:
     extensions = next((line.split(":", 1)[1] for line in lines if line.startswith(("flags", "Features"))), "")
     flags = " ".join(sorted(extensions.split()))
     return f"{platform.machine()}-{hashlib.sha256(flags.encode()).hexdigest()[:12]}"
-
-
-#: The folders that contain kernels, in the source tree and in an installation.
-_FOLDERS = ("sim", "algorithms", "scenarios")
 
 
 def set_cache_folders() -> None:

@@ -1,4 +1,4 @@
-"""Measurements, the only input of an algorithm, the targets that operators select, and drive commands.
+"""Flight interface: measurements, which are the only input of an algorithm, and commands: targets and drives.
 
 Measurements contain no ground truth: camera models are calibrated ones, times are time tags, and attitudes and
 altitudes contain measurement errors.

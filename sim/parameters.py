@@ -1,26 +1,10 @@
-"""Base class and field types of all user parameters."""
+"""Base class and field types of all user parameters; merging of nested parameters, and alternatives of their types."""
 
-import tomllib
 import types
 from collections.abc import Mapping
-from functools import cache
-from pathlib import Path
 from typing import Annotated, Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-
-
-@cache
-def _stream_names() -> Mapping[str, str]:
-    """Read the names of streams that differ from those of their parameters."""
-    names: dict[str, str] = tomllib.loads(Path(__file__).with_name("stream_names.toml").read_text(encoding="utf-8"))
-    return names
-
-
-def stream_name(path: str) -> str:
-    """Return the name of the random stream of a dispersed parameter."""
-    return _stream_names().get(path, path)
-
 
 Positive = Annotated[float, Field(gt=0.0)]
 NonNegative = Annotated[float, Field(ge=0.0)]

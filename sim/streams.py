@@ -8,9 +8,11 @@ several cases, so that the normal and uniform numbers change continuously with t
 """
 
 import hashlib
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,18 @@ def hash_words(text: str) -> tuple[int, ...]:
     """Return the first 128 bits of a text's SHA-256 hash as four 32-bit words for the spawn key of `SeedSequence`."""
     digest = hashlib.sha256(text.encode()).digest()
     return tuple(int.from_bytes(digest[i : i + 4], "little") for i in range(0, 16, 4))
+
+
+@cache
+def _stream_names() -> Mapping[str, str]:
+    """Read the names of streams that differ from those of their parameters."""
+    names: dict[str, str] = tomllib.loads(Path(__file__).with_name("stream_names.toml").read_text(encoding="utf-8"))
+    return names
+
+
+def stream_name(path: str) -> str:
+    """Return the name of the random stream of a dispersed parameter."""
+    return _stream_names().get(path, path)
 
 
 def stream_key(campaign: str, case: int, name: str) -> tuple[int, ...]:

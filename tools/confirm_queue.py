@@ -7,8 +7,6 @@ the program stops if tracked files have changes, or if the log (``queue.log``) w
 if all campaigns are complete, with any verdict; 1 if one is not; 2 for invalid input.
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime as dt
 import hashlib

@@ -11,13 +11,16 @@ from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
-from marsyard.algorithms.dimes.binning import BinnedView, build_views
 from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
+from marsyard.algorithms.dimes.ground_tracks import track_grid
 from marsyard.algorithms.dimes.ground_view import pixels_from_ground
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.rectification import rectify_patch
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
-from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, highest_peak, pseudo_normalized_correlation
+from marsyard.algorithms.dimes.views import BinnedView, build_views
+from marsyard.algorithms.dimes.zero_phase import zero_phase_pixel
+from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
+from marsyard.algorithms.image.peaks import Peak, biquadratic_offset, highest_peak
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
 
@@ -84,7 +87,7 @@ def track_pair(
         tracks.append(track)
     return PairDetails(
         overlap_polygon=overlap.overlap_polygon(first, second, options),
-        zero_phase_pixels=np.stack([overlap.zero_phase_pixel(view, sun_direction) for view in (first, second)]),
+        zero_phase_pixels=np.stack([zero_phase_pixel(view, sun_direction) for view in (first, second)]),
         gsd_m=geometry.gsd_m,
         tracks=tuple(tracks),
         views=(first, second),
@@ -148,7 +151,7 @@ def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: Dime
     selected = (details.selected.first, details.selected.second)
     velocities = [pair.tracks[index].velocity_m_s for pair, index in zip(details.pairs, selected, strict=True)]
     grids = [
-        tilt.track_grid(*pair.views, velocity, sun_direction, options)
+        track_grid(*pair.views, velocity, sun_direction, options)
         for pair, velocity in zip(details.pairs, velocities, strict=True)
     ]
     if min(len(grid.first) for grid in grids) < tilt.MIN_TRACKS:

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Flags, Points2
-from marsyard.algorithms.dimes.binning import BinnedView
+from marsyard.algorithms.dimes.views import BinnedView
 
 
 def ground_from_pixels(view: BinnedView, pixels: Points2, max_off_nadir_rad: float) -> tuple[Points2, Flags]:

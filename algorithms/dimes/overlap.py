@@ -1,7 +1,6 @@
 """Template candidates in the overlap region of two views, and their selection (section II.A).
 
-Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot is the ground around the
-anti-solar point, which the opposition surge brightens; it moves with the lander and is masked.
+Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot (`zero_phase`) is masked.
 """
 
 from dataclasses import dataclass
@@ -12,9 +11,16 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
-from marsyard.algorithms.dimes import binning, ground_view, rectification
+from marsyard.algorithms.dimes import ground_view, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.views import BinnedView
+from marsyard.algorithms.dimes.zero_phase import outside_zero_phase
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
+
+#: Lower limit of the mean signal before division, as a fraction of the full scale.
+MIN_SIGNAL_FRACTION = 0.01
+#: Number of pixels along each side of an image's border that are projected for its outline.
+_BORDER_PIXELS = 8
 
 
 @dataclass(frozen=True)
@@ -48,7 +54,7 @@ class SearchGeometry:
         return 0.5 * self.window_px * self.gsd_m
 
 
-def search_geometry(first: binning.BinnedView, second: binning.BinnedView, options: DimesOptions) -> SearchGeometry:
+def search_geometry(first: BinnedView, second: BinnedView, options: DimesOptions) -> SearchGeometry:
     """Compute the sizes of template and search window from the second view, the image interval and the options."""
     gsd = float(second.centre[2]) * second.camera.pixel_angle_rad
     max_displacement_m = options.max_speed_m_s * (second.time_s - first.time_s)
@@ -56,15 +62,15 @@ def search_geometry(first: binning.BinnedView, second: binning.BinnedView, optio
     return SearchGeometry(max_displacement_m, gsd, options.template_px, search_px)
 
 
-def border_pixels(size: tuple[int, int], per_side: int = 8) -> Points2:
+def border_pixels(size: tuple[int, int]) -> Points2:
     """Pixels along the border of an image of `size` (columns, rows), in order."""
-    steps, zeros, ones = np.arange(per_side) / per_side, np.zeros(per_side), np.ones(per_side)
+    steps, zeros, ones = np.arange(_BORDER_PIXELS) / _BORDER_PIXELS, np.zeros(_BORDER_PIXELS), np.ones(_BORDER_PIXELS)
     column_fractions = np.concatenate([steps, ones, 1.0 - steps, zeros])
     row_fractions = np.concatenate([zeros, steps, ones, 1.0 - steps])
     return np.column_stack([column_fractions * (size[0] - 1.0), row_fractions * (size[1] - 1.0)])
 
 
-def overlap_polygon(first: binning.BinnedView, second: binning.BinnedView, options: DimesOptions) -> Points2:
+def overlap_polygon(first: BinnedView, second: BinnedView, options: DimesOptions) -> Points2:
     """Project the second view's border into the first view at zero horizontal motion.
 
     Returns pixels (u, v) in order along the border, without invisible points.
@@ -80,32 +86,8 @@ def grid_pixels(size: tuple[int, int], step: int) -> Points2:
     return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
 
 
-def anti_solar_direction(sun_direction: Vector3) -> Vector3:
-    """Unit vector from the lander to the centre of the zero-phase spot, world axes."""
-    length = float(np.linalg.norm(sun_direction))
-    return -np.asarray(sun_direction, dtype=np.float64) / (length if length > 0.0 else 1.0)
-
-
-def zero_phase_pixel(view: binning.BinnedView, sun_direction: Vector3) -> Vector2:
-    """Pixel (u, v) of the centre of the zero-phase spot, in or out of frame; NaN if the camera cannot image it."""
-    # a point at 10 000 km represents infinity
-    pixels, visible = view.camera.project((view.centre + 1e7 * anti_solar_direction(sun_direction))[None, :])
-    return np.asarray(pixels[0]) if visible[0] else np.full(2, np.nan)
-
-
-def outside_zero_phase(
-    view: binning.BinnedView, ground: Float[np.ndarray, "*shape 2"], sun_direction: Vector3, radius_rad: float
-) -> Bool[np.ndarray, "*shape"]:
-    """Whether ground points (east, north) are farther than `radius_rad` from the anti-solar direction."""
-    spot = anti_solar_direction(sun_direction)
-    east, north, height = ground[..., 0], ground[..., 1], view.centre[2]
-    ranges = np.sqrt(east**2 + north**2 + height**2)
-    dot_products = east * spot[0] + north * spot[1] - height * spot[2]
-    return np.asarray(dot_products < np.cos(radius_rad) * ranges)
-
-
 def overlap_width_m(
-    first: binning.BinnedView, second: binning.BinnedView, gsd_m: float, sun_direction: Vector3, options: DimesOptions
+    first: BinnedView, second: BinnedView, gsd_m: float, sun_direction: Vector3, options: DimesOptions
 ) -> float:
     """Compute the diameter of the largest circle of ground in both views at zero motion, outside the zero-phase spot.
 
@@ -146,11 +128,7 @@ class Candidates:
 
 
 def template_candidates(
-    first: binning.BinnedView,
-    second: binning.BinnedView,
-    geometry: SearchGeometry,
-    sun_direction: Vector3,
-    options: DimesOptions,
+    first: BinnedView, second: BinnedView, geometry: SearchGeometry, sun_direction: Vector3, options: DimesOptions
 ) -> Candidates:
     """Find all feasible template positions on the coarse grid.
 
@@ -164,7 +142,7 @@ def template_candidates(
     visible &= width_m >= geometry.max_displacement_m
     pixels, ground = pixels[visible], ground[visible]
 
-    def fits(view: binning.BinnedView, half_m: float) -> Flags:
+    def fits(view: BinnedView, half_m: float) -> Flags:
         outline = ground_view.square_outline(half_m, 3)
         return np.asarray(
             ground_view.inside_frame(view, ground[:, None] + outline, options.border_px, limit).all(axis=1)
@@ -175,7 +153,7 @@ def template_candidates(
     feasible = fits(first, geometry.template_half_m)
     pixels, ground = pixels[feasible], ground[feasible]
 
-    def is_outside_spot(view: binning.BinnedView, half_m: float, per_side: int) -> Flags:
+    def is_outside_spot(view: BinnedView, half_m: float, per_side: int) -> Flags:
         points = ground[:, None] + ground_view.square_lattice(half_m, per_side)
         outside = outside_zero_phase(view, points, sun_direction, options.zero_phase_radius_rad)
         return np.asarray(outside.all(axis=1))
@@ -188,7 +166,7 @@ def template_candidates(
 
 
 def searchable_positions(
-    second: binning.BinnedView, centre: Vector2, geometry: SearchGeometry, options: DimesOptions
+    second: BinnedView, centre: Vector2, geometry: SearchGeometry, options: DimesOptions
 ) -> Bool[np.ndarray, "s s"]:
     """Whether the second view shows the complete template at each position of the search around `centre` (ground)."""
     lattice = rectification.ground_lattice(centre, geometry.window_px, geometry.gsd_m)
@@ -197,11 +175,7 @@ def searchable_positions(
     return np.asarray(ndimage.minimum_filter(inside, size=geometry.template_px)[half:-half, half:-half])
 
 
-#: Lower limit of the mean signal before division, as a fraction of the full scale.
-MIN_SIGNAL_FRACTION = 0.01
-
-
-def template_contrasts(view: binning.BinnedView, pixels: Points2, support: int) -> Vector:
+def template_contrasts(view: BinnedView, pixels: Points2, support: int) -> Vector:
     """Harris interest over squares of `support` pixels around whole pixels (u, v), divided by their mean signal.
 
     The image is not corrected: the frame-transfer smear is smooth along columns and its effect is negligible.
@@ -232,7 +206,7 @@ def best_candidates(
 
 
 def select_templates(
-    view: binning.BinnedView, candidates: Candidates, options: DimesOptions
+    view: BinnedView, candidates: Candidates, options: DimesOptions
 ) -> tuple[list[int], Float[np.ndarray, "k"]]:
     """Indices of the selected candidates, best first, and their contrasts."""
     contrasts, pixels = template_contrasts(view, candidates.pixels, options.template_px), candidates.pixels

@@ -18,23 +18,21 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from marsyard.algorithms.arrays import Vector2
-from marsyard.algorithms.dimes.binning import BinnedView
 from marsyard.algorithms.dimes.ground_view import pixels_from_ground
+from marsyard.algorithms.dimes.views import BinnedView
 from marsyard.algorithms.image.frame_transfer import remove_frame_transfer
 
 #: Lower limit of the flat field before division.
 MIN_RESPONSE = 0.02
+#: Margin of the spline around a patch, pixels. The influence of a pixel decreases by 2 - sqrt(3) = 0.268 per pixel:
+#: pixels outside the margin change the result by about 1e-6 of their value.
+SPLINE_MARGIN = 10
 
 
 def correct_patch(view: BinnedView, rows: slice, columns: slice) -> Float[np.ndarray, "_ _"]:
     """Correct part of a view for the frame-transfer smear and the flat field, counts, float64."""
     exposure_signal = remove_frame_transfer(view.signal[:, columns], view.calibration, view.rows_summed)
     return np.asarray(exposure_signal[rows] / np.maximum(view.flat_field[rows, columns], MIN_RESPONSE))
-
-
-#: Margin of the spline around a patch, pixels. The influence of a pixel decreases by 2 - sqrt(3) = 0.268 per pixel:
-#: pixels outside the margin change the result by about 1e-6 of their value.
-SPLINE_MARGIN = 10
 
 
 def ground_lattice(centre: Vector2, side_px: int, gsd_m: float) -> Float[np.ndarray, "side side 2"]:

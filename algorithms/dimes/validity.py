@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from marsyard.algorithms.arrays import Raster, Vector2
 from marsyard.algorithms.dimes.options import DimesOptions
-from marsyard.algorithms.image.correlation import Peak, peak_width, second_peak
+from marsyard.algorithms.image.peaks import Peak, peak_width, second_peak
 
 
 class ValidityCheck(Enum):
@@ -96,14 +96,3 @@ def rank_combinations(
         for (first_index, first_velocity), (second_index, second_velocity) in product(first, second)
     ]
     return tuple(sorted(combinations, key=lambda combination: combination.discrepancy_m_s))
-
-
-def propagate_velocity(
-    velocity_m_s: Vector2, inertial_at_estimate_m_s: Vector2, inertial_at_end_m_s: Vector2
-) -> Vector2:
-    """Propagate a horizontal velocity by the IMU, for example to thruster firing near 100 m (section I), m/s.
-
-    `inertial_at_estimate_m_s` is the mean inertial velocity over the interval of the estimate (second pair),
-    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. An error common to both has no effect.
-    """
-    return np.asarray(velocity_m_s + (inertial_at_end_m_s - inertial_at_estimate_m_s))

@@ -15,6 +15,8 @@ from marsyard.algorithms.faults import bad_answer
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome, VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import LandingMeasurements
 
+#: Numbers of at least this magnitude count as infinite; JSON's integers have no limit.
+_MAX_NUMBER = 1e300
 Member = TypeVar("Member", bound=Enum)
 Answer = TypeVar("Answer")
 
@@ -98,7 +100,7 @@ def read_numbers(answer: Mapping[str, Any], name: str, shape: tuple[int, ...]) -
 def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
     """Whether a value is a finite number (empty shape) or a nested list of finite numbers of this shape."""
     if not shape:
-        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_NUMBER
     return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(item, shape[1:]) for item in value)
 
 

@@ -1,30 +1,29 @@
-"""External programs under test: parsing of their commands, and execution within limits (time, memory, output, files).
+"""Execution of external programs under test within limits (time, memory, output, files).
 
 Each program has its own process group and temporary folder. Its child processes are killed with it, and the folder is
 removed. On Linux it is killed when its parent process ends.
 """
 
-from __future__ import annotations
-
 import os
 import selectors
-import shlex
 import shutil
 import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import IO
 
+from marsyard.algorithms.awake_clock import AwakeClock
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.sandbox import sandbox_words
 from marsyard.algorithms.faults import AlgorithmError, Fault
-from marsyard.algorithms.processes import AwakeClock, descendants, end_with_parent, kill, resident_bytes, worker_device
+from marsyard.algorithms.processes import descendants, end_with_parent, kill, resident_bytes
+from marsyard.algorithms.worker_device import worker_device
 
 #: Interval of the checks of time, memory and output, and of the files' size, seconds.
 _POLL_S, _FILES_POLL_S = 0.02, 0.5
@@ -36,54 +35,6 @@ _EXIT_GRACE_S = 0.5
 _CHUNK_BYTES = 1 << 16
 #: Environment variable: device that a program may use.
 DEVICE_VARIABLE = "MARSYARD_DEVICE"
-
-
-@dataclass(frozen=True)
-class Command:
-    """Command line of an external program under test; a hashable key of its idle processes.
-
-    - words: The program and its arguments
-    - persistent: Whether one process of the program answers many cases
-    - stream: Whether the program receives a descent's images one by one
-    """
-
-    words: tuple[str, ...]
-    persistent: bool
-    stream: bool = False
-
-    def start(self, limits: ExecutableLimits) -> RunningProgram:
-        """Start a program that receives requests. Raises AlgorithmError if it cannot be started."""
-        return RunningProgram(self.words, limits)
-
-
-#: Prefixes of commands, with `Command.persistent` and `Command.stream`.
-PREFIXES: Mapping[str, tuple[bool, bool]] = {
-    "exec:": (False, False),
-    "serve:": (True, False),
-    "exec-stream:": (False, True),
-    "serve-stream:": (True, True),
-}
-
-
-def parse_command(text: str) -> Command | None:
-    """Parse a command (for example `exec:./program --flag`); None for a text without one of `PREFIXES`.
-
-    Raises ValueError if the program does not exist or a quote is not closed.
-    """
-    prefix = next((prefix for prefix in PREFIXES if text.startswith(prefix)), None)
-    if prefix is None:
-        return None
-    try:
-        words = shlex.split(text.removeprefix(prefix))
-    except ValueError as error:
-        raise ValueError(f"'{text}' cannot be parsed: {error}") from error
-    if not words:
-        raise ValueError(f"'{text}' contains no program; expected {prefix}PROGRAM, followed by its arguments")
-    if shutil.which(words[0]) is None:
-        path_problem = "is not on the PATH; for a program in this folder write ./ in front of its name"
-        problem = "does not exist or is not executable" if "/" in words[0] else path_problem
-        raise ValueError(f"no program for '{text}': {words[0]} {problem}")
-    return Command(tuple(words), *PREFIXES[prefix])
 
 
 @dataclass(frozen=True)
@@ -241,11 +192,9 @@ class RunningProgram:
         elapsed_s, now_s = self._clock.elapsed_s(), time.monotonic()
         if elapsed_s > self._time_s:
             is_total = self._time_s == self.left_s
-            message = (
-                f"no answers to the case within {self.limits.total_s:g} s"
-                if is_total
-                else (f"no answer within {self._time_s:g} s")
-            )
+            message = f"no answer within {self._time_s:g} s"
+            if is_total:
+                message = f"no answers to the case within {self.limits.total_s:g} s"
             raise self._end_with_fault(Fault.TIMED_OUT, message)
         if len(self._stdout) + len(self._stderr) > self.limits.output_mb * 1e6:
             raise self._end_with_fault(Fault.TOO_MUCH_OUTPUT, f"it wrote more than {self.limits.output_mb:g} MB")

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from marsyard.algorithms.exchange.command import Command
 from marsyard.algorithms.exchange.files import EXCHANGE_VERSION
 from marsyard.algorithms.exchange.limits import ExecutableLimits
-from marsyard.algorithms.exchange.process import Command, Output, RunningProgram, shorten, temporary_folder
+from marsyard.algorithms.exchange.process import Output, RunningProgram, shorten, temporary_folder
 from marsyard.algorithms.faults import AlgorithmError, Fault
 
 

@@ -13,18 +13,9 @@ from marsyard.algorithms.arrays import Points2, Points3, Vector3
 from marsyard.algorithms.hda import footprints, hazards
 from marsyard.algorithms.hda.details import HdaDetails, MappedGround
 from marsyard.algorithms.hda.elevation import elevation_map, fill_small_holes
-from marsyard.algorithms.hda.motion import (
-    CameraMotion,
-    LandingScene,
-    MotionStart,
-    build_scene,
-    estimate_motion,
-    plane_depths,
-    points_at_depth,
-    range_starts,
-    undistort,
-)
+from marsyard.algorithms.hda.motion import CameraMotion, MotionStart, estimate_motion, plane_depths, range_starts
 from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
+from marsyard.algorithms.hda.scene import LandingScene, build_scene, points_at_depth, undistort
 from marsyard.algorithms.hda.structure import Matches, dense_structure, scale_factor
 from marsyard.algorithms.hda.surface_frame import surface_from_camera, up_direction, world_from_surface
 from marsyard.algorithms.hda.tracking import Tracks, select_features, track_features, window_half_px

@@ -166,20 +166,19 @@ class HdaOptions:
 #: Names of the options by their minimum value.
 _NAMES_BY_MINIMUM = {
     0: (
-        *("depth_margin", "hazard_growth", "unknown_growth", "margin_deviations"),
-        *("match_error_px", "level_error_rad", "seed"),
-        *("max_baseline_fraction", "max_tilt_change_rad", "max_roll_change_rad", "max_height_change_fraction"),
+        "depth_margin", "hazard_growth", "unknown_growth", "margin_deviations", "match_error_px", "level_error_rad",
+        "seed", "max_baseline_fraction", "max_tilt_change_rad", "max_roll_change_rad", "max_height_change_fraction",
     ),
     1: ("grid_px", "search_half_px", "plane_trials"),
     2: ("template_half_px", "window_half_px", "block_px"),
     4: ("min_points",),
     6: ("min_tracks",),
-}
+}  # fmt: skip
 #: Names of the options that must be positive.
 _POSITIVE_NAMES = (
-    *("robust_px", "max_forward_backward_px", "narrowest_hazard", "max_residual_px"),
-    *("lander_diameter_m", "max_slope_rad", "max_roughness_m"),
-)
+    "robust_px", "max_forward_backward_px", "narrowest_hazard", "max_residual_px", "lander_diameter_m",
+    "max_slope_rad", "max_roughness_m",
+)  # fmt: skip
 
 
 #: Options of `hda-plus` that differ from the published algorithm.

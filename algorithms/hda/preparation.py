@@ -10,8 +10,8 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.arrays import Vector2
-from marsyard.algorithms.hda.motion import CameraView, Views
 from marsyard.algorithms.hda.options import HdaOptions
+from marsyard.algorithms.hda.scene import CameraView, Views
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
 

@@ -12,9 +12,10 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Flags, Points2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import CameraMotion, CameraView, Views, points_at_depth, project_points, undistort
+from marsyard.algorithms.hda.motion import CameraMotion
 from marsyard.algorithms.hda.options import HdaOptions
 from marsyard.algorithms.hda.preparation import prepare_views
+from marsyard.algorithms.hda.scene import CameraView, Views, points_at_depth, project_points, undistort
 
 
 class MatchStatus(IntEnum):

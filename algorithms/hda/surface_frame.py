@@ -9,8 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.arrays import Points3, Vector3
-from marsyard.algorithms.hda.motion import CameraView
+from marsyard.algorithms.hda.kernels.elevation import INLIER_DEVIATIONS, SIGMA_PER_MEDIAN
 from marsyard.algorithms.hda.options import HdaOptions, SurfaceFrame
+from marsyard.algorithms.hda.scene import CameraView
 
 #: Number of random point triples for the robust plane through all points.
 PLANE_TRIALS = 200
@@ -31,8 +32,8 @@ def up_direction(first: CameraView, up_camera: Vector3, points: Points3, options
 def plane_normal(points: Points3, seed: int) -> Vector3:
     """Unit normal, towards the origin, of the least-median-of-squares plane through at least four points.
 
-    The best plane through random triples is refined by least squares over the points within 2.5 standard deviations.
-    The standard deviation is 1.4826 (1 + 5 / (n - 3)) times the median distance (Rousseeuw & Leroy 1987).
+    The best plane through random triples is refined by least squares over the points within `INLIER_DEVIATIONS`.
+    The standard deviation is `SIGMA_PER_MEDIAN` (1 + 5 / (n - 3)) times the median distance (Rousseeuw & Leroy 1987).
     """
     rng = np.random.default_rng(seed)
     corners = points[rng.integers(0, len(points), (PLANE_TRIALS, 3))]
@@ -45,7 +46,8 @@ def plane_normal(points: Points3, seed: int) -> Vector3:
     distances = np.abs(points @ normals.T - np.sum(normals * corners[:, 0], axis=1))
     medians = np.median(distances, axis=0)
     best = int(np.argmin(medians))
-    inliers = points[distances[:, best] <= 2.5 * 1.4826 * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]]
+    sigma = SIGMA_PER_MEDIAN * (1.0 + 5.0 / max(len(points) - 3, 1)) * medians[best]
+    inliers = points[distances[:, best] <= INLIER_DEVIATIONS * sigma]
     normal = normals[best]
     if len(inliers) >= 3:
         normal = np.linalg.svd(inliers - inliers.mean(axis=0), full_matrices=False)[2][2]

@@ -10,8 +10,8 @@ from jaxtyping import Float, Int
 
 from marsyard.algorithms.arrays import Counts, Flags, Points2, Raster, Vector, Vector2
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import CameraView
 from marsyard.algorithms.hda.options import HdaOptions, TrackSeed
+from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.image.correlation import halve
 from marsyard.algorithms.image.interest import structure_tensor
 from marsyard.algorithms.image.registration import RegistrationLimits, register_template
@@ -23,6 +23,9 @@ MIN_HALF_PX = 2
 #: only a few positions in the image (three at level 6 of 640 x 480 pixels), which cover large displacements, and
 #: templates of different features are nearly the same. Without coarse levels, the larger window has more wrong peaks.
 MAX_TEMPLATE_FRACTION = 0.25
+#: Limits of an alignment: a height change of 20 % stretches the image by 25 %, and the first steps overshoot. The
+#: default limits of `RegistrationLimits` rejected 20 % of the correct tracks after a descent by 20 % of the height.
+ALIGNMENT_LIMITS = RegistrationLimits(shift_px=2.5, stretch=0.5, steps=30)
 
 
 @dataclass(frozen=True)
@@ -117,11 +120,6 @@ def select_features(counts: Counts, options: HdaOptions) -> Points2:
     row, column = row + best // side, column + best % side
     has_feature = np.isfinite(blocks.max(axis=(2, 3)))
     return np.column_stack([column[has_feature], row[has_feature]]).astype(np.float64)
-
-
-#: Limits of an alignment: a height change of 20 % stretches the image by 25 %, and the first steps overshoot. The
-#: default limits of `RegistrationLimits` rejected 20 % of the correct tracks after a descent by 20 % of the height.
-ALIGNMENT_LIMITS = RegistrationLimits(shift_px=2.5, stretch=0.5, steps=30)
 
 
 @dataclass(frozen=True)

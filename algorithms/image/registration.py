@@ -22,13 +22,6 @@ from marsyard.algorithms.image.kernels import registration as kernels
 ORDER: Final = 5
 #: Margin around a patch for its spline; pixels outside it change the result by less than 1e-4 px.
 MARGIN_PX = 12
-
-
-def spline_coefficients(image: Raster) -> Raster:
-    """Compute the coefficients of the quintic spline through the image, mirrored at its outermost pixels."""
-    return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
-
-
 #: Model of the registration: shift; shift and linear map; shift, linear and quadratic map of the offsets.
 Warp = Literal["shift", "stretch", "bend"]
 _ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
@@ -36,6 +29,11 @@ _ORDERS: dict[Warp, int] = {"shift": 0, "stretch": 1, "bend": 2}
 REGISTRATION_TOLERANCE_PX = 3e-3
 #: Minimum pivot of the normal equations with unit diagonal; below it the texture does not determine the unknowns.
 MIN_PIVOT = 1e-4
+
+
+def spline_coefficients(image: Raster) -> Raster:
+    """Compute the coefficients of the quintic spline through the image, mirrored at its outermost pixels."""
+    return np.asarray(ndimage.spline_filter(image, order=ORDER, output=np.float64, mode="mirror"))
 
 
 @dataclass(frozen=True)

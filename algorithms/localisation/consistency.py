@@ -27,7 +27,8 @@ from jaxtyping import Float, Int
 from scipy.special import bdtrc, chdtri
 
 from marsyard.algorithms.arrays import Flags, Points2, Points3, Vector
-from marsyard.algorithms.localisation.inertial_state import ATTITUDE, POSITION, VELOCITY, cross_matrix
+from marsyard.algorithms.localisation.inertial_state import ATTITUDE, POSITION, VELOCITY
+from marsyard.algorithms.localisation.matrices import cross_matrix
 
 #: Coordinates of an offset.
 _AXES = 2

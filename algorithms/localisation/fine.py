@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from marsyard.algorithms.arrays import Points2, Points3, Vector, Vector3
-from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak
+from marsyard.algorithms.image.peaks import biquadratic_offset, highest_peak
 from marsyard.algorithms.image.registration import MARGIN_PX, RegistrationLimits, register_template
 from marsyard.algorithms.localisation import map_sampling
 from marsyard.algorithms.localisation.interface import MapProduct
@@ -38,10 +38,8 @@ _ACQUISITION_TOLERANCE = 1.5
 class LandmarkMatches:
     """Landmarks of the map found in one image. Pixels are those of the delivered image.
 
-    - indices: indices in the map's landmarks
     - points_m: positions in the world frame, as on the map
     - measured_px: measured positions in the image (u, v)
-    - predicted_px: positions predicted from the estimated pose (u, v)
     - scores: normalised correlations
     - residuals_px: measured positions minus those predicted after the common correction of the pose
     - working_pixel: pixels of the delivered image per pixel of the working scale
@@ -50,10 +48,8 @@ class LandmarkMatches:
     - translation_m, rotation_rad: the common correction of position and attitude, world axes
     """
 
-    indices: Int[np.ndarray, "n"]
     points_m: Points3
     measured_px: Points2
-    predicted_px: Points2
     scores: Vector
     residuals_px: Points2
     working_pixel: int
@@ -260,13 +256,10 @@ def _build_matches(
     points = landmarks.points_m[search.indices[rows]]
     factor = search.factor
     working_px = search.predicted_px[rows] + search.displacements_px[rows]
-    predicted, _ = image.world_camera.project(points)
     rotation = (corrected.world_from_body * image.world_from_body.inv()).as_rotvec()
     return LandmarkMatches(
-        indices=search.indices[rows],
         points_m=points,
         measured_px=factor * (working_px + 0.5) - 0.5,
-        predicted_px=predicted,
         scores=search.scores[rows],
         residuals_px=factor * fit.residuals_px[fit.consistent],
         working_pixel=factor,
@@ -281,17 +274,5 @@ def _no_matches(factor: int, search: _SearchResult) -> LandmarkMatches:
     """Return the result of a search whose matches are too few or inconsistent."""
     points, pixels = np.empty((0, 3)), np.empty((0, 2))
     accepted = int(np.count_nonzero(search.accepted))
-    empty = np.empty(0, dtype=np.int64)
-    return LandmarkMatches(
-        empty,
-        points,
-        pixels,
-        pixels,
-        np.empty(0),
-        pixels,
-        factor,
-        len(search.indices),
-        accepted,
-        np.zeros(3),
-        np.zeros(3),
-    )
+    attempted = len(search.indices)
+    return LandmarkMatches(points, pixels, np.empty(0), pixels, factor, attempted, accepted, np.zeros(3), np.zeros(3))

@@ -23,76 +23,19 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from marsyard.algorithms.arrays import Vector3
+from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
+from marsyard.algorithms.localisation.matrices import cross_matrix, left_jacobian, symmetrise
+
 #: Blocks of the error vector: position (m), velocity (m/s), attitude (rad), gyro bias (rad/s), accelerometer bias
 #: (m/s2).
 POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
 ERRORS = 15  #: Number of errors.
 
-_DEG_H = np.radians(1.0) / 3600.0
-_DEG_SQRT_H = np.radians(1.0) / 60.0
-_STANDARD_GRAVITY_M_S2 = 9.80665
 
-Vector = Float[np.ndarray, "3"]
 ErrorVector = Float[np.ndarray, "15"]
 ErrorMatrix = Float[np.ndarray, "15 15"]
-
-
-@dataclass(frozen=True)
-class ImuErrorModel:
-    """Errors of an inertial unit as assumed by the filter; standard deviations per axis.
-
-    The defaults are those of an LN-200 (Northrop Grumman's data sheet: bias repeatability from 1 deg/h and from 0.3 mg,
-    bias instability, random walks, scale factors, misalignment).
-
-    - gyro_wander_deg_h, gyro_wander_s: standard deviation and correlation time of a Gauss-Markov bias that is added to
-      the constant bias; the same for accelerometer_wander_mg and accelerometer_wander_s
-    - sensitivity_correlation_s: time over which rate and force are nearly constant, assumed. An error of scale or
-      misalignment s acts like white noise of the density s * force * sqrt(2 * sensitivity_correlation_s).
-    """
-
-    angular_random_walk_deg_sqrt_h: float = 0.07
-    gyro_bias_deg_h: float = 1.0
-    gyro_wander_deg_h: float = 0.35
-    gyro_wander_s: float = 100.0
-    gyro_scale_ppm: float = 100.0
-    gyro_misalignment_mrad: float = 0.1
-    velocity_random_walk_ug_sqrt_hz: float = 50.0
-    accelerometer_bias_mg: float = 0.3
-    accelerometer_wander_mg: float = 0.05
-    accelerometer_wander_s: float = 60.0
-    accelerometer_scale_ppm: float = 300.0
-    accelerometer_misalignment_mrad: float = 0.1
-    sensitivity_correlation_s: float = 10.0
-
-    @property
-    def initial_bias_variances(self) -> Float[np.ndarray, "6"]:
-        """Variances of gyro biases, (rad/s)^2, and accelerometer biases, (m/s2)^2: constant part and wander."""
-        gyro = (self.gyro_bias_deg_h**2 + self.gyro_wander_deg_h**2) * _DEG_H**2
-        milli_g = 1e-3 * _STANDARD_GRAVITY_M_S2
-        accelerometer = (self.accelerometer_bias_mg**2 + self.accelerometer_wander_mg**2) * milli_g**2
-        return np.repeat([gyro, accelerometer], 3)
-
-    @property
-    def white_densities(self) -> ErrorVector:
-        """Spectral densities of white noise that does not depend on the motion, squared units of the errors per s."""
-        angle = self.angular_random_walk_deg_sqrt_h * _DEG_SQRT_H
-        velocity = 1e-6 * self.velocity_random_walk_ug_sqrt_hz * _STANDARD_GRAVITY_M_S2
-        # over times much shorter than its correlation time a Gauss-Markov bias is a random walk of this density
-        gyro = (self.gyro_wander_deg_h * _DEG_H) ** 2 * 2.0 / self.gyro_wander_s
-        wander = 1e-3 * self.accelerometer_wander_mg * _STANDARD_GRAVITY_M_S2
-        accelerometer = wander**2 * 2.0 / self.accelerometer_wander_s
-        return np.repeat([0.0, velocity**2, angle**2, gyro, accelerometer], 3)
-
-    def sensitivity_densities(self, body_rate_rad_s: Vector, force_m_s2: Vector) -> tuple[Vector, Vector]:
-        """Compute densities of the noise by scale and misalignment per body axis: angle, rad^2/s; velocity, m^2/s^3."""
-        rate_squares, force_squares = body_rate_rad_s**2, force_m_s2**2
-        gyro_scale, gyro_cross = 1e-6 * self.gyro_scale_ppm, 1e-3 * self.gyro_misalignment_mrad
-        scale, cross = 1e-6 * self.accelerometer_scale_ppm, 1e-3 * self.accelerometer_misalignment_mrad
-        angle = gyro_scale**2 * rate_squares + gyro_cross**2 * (rate_squares.sum() - rate_squares)
-        velocity = scale**2 * force_squares + cross**2 * (force_squares.sum() - force_squares)
-        factor = 2.0 * self.sensitivity_correlation_s
-        return factor * angle, factor * velocity
 
 
 @dataclass(frozen=True)
@@ -100,11 +43,11 @@ class NavigationState:
     """Estimated state at a time, with the covariance of its 15 errors; position and velocity in world axes."""
 
     time_s: float
-    position_m: Vector
-    velocity_m_s: Vector
+    position_m: Vector3
+    velocity_m_s: Vector3
     world_from_body: Rotation
-    gyro_bias_rad_s: Vector
-    accelerometer_bias_m_s2: Vector
+    gyro_bias_rad_s: Vector3
+    accelerometer_bias_m_s2: Vector3
     covariance: ErrorMatrix
 
     def correct(self, errors: ErrorVector, covariance: ErrorMatrix) -> NavigationState:
@@ -194,7 +137,7 @@ def propagate_states(
 
 
 def compute_transition(
-    delta_velocity: Vector, delta_position: Vector, rotation_integral: Float[np.ndarray, "3 3"], step_s: float
+    delta_velocity: Vector3, delta_position: Vector3, rotation_integral: Float[np.ndarray, "3 3"], step_s: float
 ) -> ErrorMatrix:
     """Compute the transition matrix of the errors over a step, to first order in the errors.
 
@@ -217,8 +160,8 @@ def compute_transition(
 
 def _compute_noise(
     errors: ImuErrorModel,
-    body_rate: Vector,
-    delta_velocity: Vector,
+    body_rate: Vector3,
+    delta_velocity: Vector3,
     rotation_integral: Float[np.ndarray, "3 3"],
     step_s: float,
 ) -> ErrorMatrix:
@@ -231,27 +174,7 @@ def _compute_noise(
     return noise
 
 
-def cross_matrix(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
-    """Return the matrices of the vector product: ``cross_matrix(a) @ b`` is a x b."""
-    matrices = np.zeros((*vectors.shape, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    matrices[..., 0, 1], matrices[..., 0, 2], matrices[..., 1, 2] = -z, y, -x
-    matrices[..., 1, 0], matrices[..., 2, 0], matrices[..., 2, 1] = z, -y, x
-    return matrices
-
-
-def left_jacobian(rotation_vector: Vector) -> Float[np.ndarray, "3 3"]:
-    """Compute the left Jacobian of a small rotation, to second order: exp(d + r) = exp(J r) exp(d)."""
-    matrix = cross_matrix(rotation_vector)
-    return np.asarray(np.eye(3) + 0.5 * matrix + matrix @ matrix / 6.0)
-
-
-def symmetrise(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Return the symmetric part of a matrix."""
-    return np.asarray(0.5 * (matrix + matrix.T))
-
-
-def _accumulate(start: Vector, steps: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+def _accumulate(start: Vector3, steps: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
     """Compute the values after 0, 1, 2, ... n steps."""
     return np.cumsum(np.concatenate([start[None], steps]), axis=0)
 

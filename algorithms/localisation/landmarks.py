@@ -14,6 +14,8 @@ from marsyard.sim.camera import CameraModel
 
 #: Minimum number of cells in the image's footprint per selected landmark; determines the level of the cells.
 _CANDIDATES_PER_LANDMARK = 6
+#: Largest level of a landmark: the cells are doubled at most this many times.
+_MAX_LEVEL = 6
 
 
 @dataclass(frozen=True)
@@ -66,12 +68,12 @@ def _best_of_cells(interest: Raster, side: int) -> tuple[Int[np.ndarray, "n"], I
 
 
 def _compute_levels(
-    rows: Int[np.ndarray, "n"], columns: Int[np.ndarray, "n"], values: Vector, side: int, max_level: int = 6
+    rows: Int[np.ndarray, "n"], columns: Int[np.ndarray, "n"], values: Vector, side: int
 ) -> Int[np.ndarray, "n"]:
     """Compute `Landmarks.levels`: at each level, the best landmark of each doubled cell remains."""
     levels = np.zeros(len(values), dtype=np.int64)
     remaining = np.argsort(-values, kind="stable")
-    for level in range(1, max_level + 1):
+    for level in range(1, _MAX_LEVEL + 1):
         # one integer per cell, from the cell's row and column
         cells = (rows[remaining] // (side << level)) * (1 << 32) + columns[remaining] // (side << level)
         remaining = remaining[np.sort(np.unique(cells, return_index=True)[1])]

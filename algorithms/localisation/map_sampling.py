@@ -7,6 +7,9 @@ from jaxtyping import Bool, Float, Float32
 from marsyard.algorithms.arrays import Vector2
 from marsyard.algorithms.localisation.interface import MapProduct
 
+#: Iterations of the intersection of rays with the elevation.
+_ITERATIONS = 5
+
 
 def map_pixels(map_product: MapProduct, points: Float[np.ndarray, "*shape 2"]) -> Float[np.ndarray, "*shape 2"]:
     """Map pixels (column, row) of horizontal world points (x, y), metres."""
@@ -42,14 +45,11 @@ def sample_averages(
     return np.asarray((0.25 * total).reshape(patches, side, side))
 
 
-def inside_map(
-    map_product: MapProduct, points: Float[np.ndarray, "*shape 2"], margin_px: float = 0.0
-) -> Bool[np.ndarray, "*shape"]:
-    """Whether horizontal world points lie inside the map, at least `margin_px` from its outermost pixels' centres."""
+def inside_map(map_product: MapProduct, points: Float[np.ndarray, "*shape 2"]) -> Bool[np.ndarray, "*shape"]:
+    """Whether horizontal world points lie inside the map, between the centres of its outermost pixels."""
     rows, columns = map_product.appearance.shape
     pixels = map_pixels(map_product, points)
-    upper = np.array([columns - 1.0, rows - 1.0]) - margin_px
-    return np.asarray(np.all((pixels >= margin_px) & (pixels <= upper), axis=-1))
+    return np.asarray(np.all((pixels >= 0.0) & (pixels <= np.array([columns - 1.0, rows - 1.0])), axis=-1))
 
 
 def elevation_at(map_product: MapProduct, point: Vector2) -> float:
@@ -63,7 +63,6 @@ def intersect_elevation(
     origins: Float[np.ndarray, "n m 3"],
     directions: Float[np.ndarray, "n m 3"],
     start_m: Float[np.ndarray, "n 1"],
-    iterations: int = 5,
 ) -> Float[np.ndarray, "n m 2"]:
     """Intersect rays with the map's elevation by fixed-point iteration over the elevation; return (x, y), metres.
 
@@ -74,7 +73,7 @@ def intersect_elevation(
     slopes = directions[..., :2] / directions[..., 2:]
     offsets = origins[..., :2] - origins[..., 2:] * slopes
     elevation: Float[np.ndarray, "n m"] = np.broadcast_to(start_m, directions.shape[:2])
-    for _ in range(iterations):
+    for _ in range(_ITERATIONS):
         points = offsets + elevation[..., np.newaxis] * slopes
         elevation = sample_raster(map_product.elevation_m, map_pixels(map_product, points))
     return np.asarray(offsets + elevation[..., np.newaxis] * slopes)

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from marsyard.algorithms.arrays import Flags, Points2, Points3, Vector3
+from marsyard.algorithms.localisation.matrices import cross_matrix
 from marsyard.sim.camera import CameraModel
 
 #: Factor of the control parameter between iterations (Yang et al. 2020, remark 5), and maximum number of iterations.
@@ -42,10 +43,7 @@ def pose_jacobian(camera: CameraModel, position_m: Vector3, points_m: Points3) -
     by_point = camera.projection_jacobian(points_m)
     offsets = points_m - position_m
     # d x rotation = [d]x rotation
-    cross = np.zeros((len(offsets), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -offsets[:, 2], offsets[:, 1], -offsets[:, 0]
-    cross -= np.swapaxes(cross, 1, 2)
-    return np.concatenate([-by_point, by_point @ cross], axis=2)
+    return np.concatenate([-by_point, by_point @ cross_matrix(offsets)], axis=2)
 
 
 def fit_pose(

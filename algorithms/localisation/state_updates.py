@@ -22,16 +22,8 @@ from scipy import linalg
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
-from marsyard.algorithms.localisation.inertial_state import (
-    ATTITUDE,
-    ERRORS,
-    POSITION,
-    ErrorMatrix,
-    NavigationState,
-    cross_matrix,
-    left_jacobian,
-    symmetrise,
-)
+from marsyard.algorithms.localisation.inertial_state import ATTITUDE, ERRORS, POSITION, ErrorMatrix, NavigationState
+from marsyard.algorithms.localisation.matrices import cross_matrix, left_jacobian, symmetrise
 from marsyard.sim.camera import CameraModel
 
 #: Height (m) and slope (east, north) of the map's ground: at the estimated position, or as a function of (x, y).

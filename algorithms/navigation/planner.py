@@ -107,15 +107,13 @@ def navigate(
     goal_m: Float[np.ndarray, "2"],
     step_m: float,
     options: NavigationOptions,
-    backwards: bool = False,
 ) -> NavigationPlan:
     """Plan the next step to a goal.
 
     - goal_m: Position (east, north) for the rover's origin, in the estimated world frame
     - step_m: Maximum path length to drive in this step
-    - backwards: Whether to drive backwards
     """
-    forward = world_from_rover.rotation.as_matrix()[:2, 0] * (-1.0 if backwards else 1.0)
+    forward = world_from_rover.rotation.as_matrix()[:2, 0]
     position = world_from_rover.translation[:2]
     world_from_forward = _rotation_matrix(np.arctan2(forward[1], forward[0]))
     goal = np.asarray((goal_m - position) @ world_from_forward)
@@ -128,7 +126,7 @@ def navigate(
         lookahead_distances = np.arange(0.0, min(path.length_m, options.lookahead_m), _CHECK_STEP_M)
         lookahead_points = position + path.points(lookahead_distances) @ world_from_forward.T
         if _is_clear(lookahead_points, goodness, options):
-            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m, backwards))
+            return NavigationPlan(NavigationOutcome.PATH, path.commands(step_m))
     return NavigationPlan(NavigationOutcome.NO_PATH, ())
 
 
@@ -156,7 +154,7 @@ class _Path:
         points = np.where((distances_m > first_length_m)[:, None], second_arc, first_arc)
         return np.asarray(points @ _rotation_matrix(self.turn_rad).T)
 
-    def commands(self, step_m: float, backwards: bool) -> tuple[DriveCommand, ...]:
+    def commands(self, step_m: float) -> tuple[DriveCommand, ...]:
         """Drive commands for the turn and the first `step_m` metres of the arcs."""
         commands = [DriveCommand(turn_left_rad=self.turn_rad)] if self.turn_rad else []
         remaining_m = step_m
@@ -164,7 +162,7 @@ class _Path:
             length_m = min(length, remaining_m)
             remaining_m -= length_m
             if length_m > 0.0:
-                commands.append(DriveCommand(-length_m if backwards else length_m, 0.0, curvature * length_m))
+                commands.append(DriveCommand(length_m, 0.0, curvature * length_m))
         return tuple(commands)
 
 

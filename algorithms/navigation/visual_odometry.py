@@ -21,6 +21,13 @@ from marsyard.algorithms.navigation.stereo import RectifiedPair, track_features
 from marsyard.sim.frames import rigid_from_axes, rotation_matrix
 from marsyard.sim.measurements import StereoMeasurement
 
+#: Iterations and confidence of the robust pose estimate.
+_RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 300, 0.999
+#: Number of adjustments, each followed by a rejection of outliers, and largest normalised distance of an inlier.
+_ADJUSTMENTS, _MAX_NORMALISED_DISTANCE = 3, 3.5
+#: Additional distance from the predicted position that is accepted, metres.
+_MAX_EXCESS_M = 0.05
+
 
 @dataclass(frozen=True)
 class VisualOdometryOptions:
@@ -74,14 +81,6 @@ class MotionEstimate:
     features: int
     inliers: int
     sigma_m: float
-
-
-#: Iterations and confidence of the robust pose estimate.
-_RANSAC_ITERATIONS, _RANSAC_CONFIDENCE = 300, 0.999
-#: Number of adjustments, each followed by a rejection of outliers, and largest normalised distance of an inlier.
-_ADJUSTMENTS, _MAX_NORMALISED_DISTANCE = 3, 3.5
-#: Additional distance from the predicted position that is accepted, metres.
-_MAX_EXCESS_M = 0.05
 
 
 def estimate_motion(

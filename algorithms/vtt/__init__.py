@@ -5,5 +5,15 @@ from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker, VttDetails
 
-__all__ = ["PURE_NCC", "ArmTarget", "GoalCriterion", "HandOff", "HandOffOutcome", "VisualTargetTracker", "VttDetails"]
-__all__ += ["VttOptions", "hand_off", "lucas_kanade_tracker"]
+__all__ = [
+    "PURE_NCC",
+    "ArmTarget",
+    "GoalCriterion",
+    "HandOff",
+    "HandOffOutcome",
+    "VisualTargetTracker",
+    "VttDetails",
+    "VttOptions",
+    "hand_off",
+    "lucas_kanade_tracker",
+]

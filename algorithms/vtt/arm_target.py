@@ -11,6 +11,9 @@ from marsyard.algorithms.vtt.accuracy import drift_error_m, stereo_range_error_m
 from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.sim.measurements import MastCalibration
 
+#: Assumed drift of the tracked point (paper: 2.5 px from 10 m to 2 m).
+DRIFT_PX = 2.5
+
 
 class HandOffOutcome(Enum):
     """Outcome of a hand-off. All members except HANDED_OFF are expected failures: the arm receives no target."""
@@ -48,11 +51,10 @@ class GoalCriterion:
         return abs(float(np.hypot(position_rover[0], position_rover[1])) - self.distance_m) <= self.tolerance_m
 
 
-def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration, drift_px: float = 2.5) -> HandOff:
+def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration) -> HandOff:
     """Hand the target off to the arm if it is tracked and the rover is at its goal.
 
-    `drift_px` is the assumed drift (paper: 2.5 px from 10 m to 2 m). The error is computed for the range from the
-    mast's elevation axis.
+    The error is computed for the drift `DRIFT_PX` and the range from the mast's elevation axis.
     """
     position = update.position_rover
     if not update.tracked or position is None:
@@ -63,6 +65,6 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration, d
     range_m = float(np.linalg.norm(position - axis))
     error = tracked_approach_error_m(
         stereo_range_error_m(range_m, disparity_px_m(mast.left, mast.right), 1.0),
-        drift_error_m(range_m, mast.left.focal_lengths[0], drift_px),
+        drift_error_m(range_m, mast.left.focal_lengths[0], DRIFT_PX),
     )
     return HandOff(HandOffOutcome.HANDED_OFF, ArmTarget(position, error))

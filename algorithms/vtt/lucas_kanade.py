@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from marsyard.algorithms.arrays import Vector2
-from marsyard.algorithms.vtt.matching import Match, Sighting, ViewChange, extract_patch, search_window, window_fits
+from marsyard.algorithms.vtt.matching import Match, Sighting, extract_patch, search_window, window_fits
 from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.prediction import ViewChange
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker
 from marsyard.sim.measurements import MastImage
 

@@ -1,4 +1,4 @@
-"""Target tracker: prediction of position, magnification and roll (sections 4.1, 4.3.1); matching (4.3.2, 4.3.3).
+"""Matching of the target in a new image (sections 4.3.2, 4.3.3).
 
 Sections and equations are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
@@ -12,12 +12,13 @@ from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
-from marsyard.algorithms.image.correlation import Peak, biquadratic_offset, coarse_to_fine_peak, normalized_correlation
+from marsyard.algorithms.image.correlation import coarse_to_fine_peak, normalized_correlation
+from marsyard.algorithms.image.peaks import Peak, biquadratic_offset
 from marsyard.algorithms.image.registration import MARGIN_PX, Warp, build_spline, register_template, similarity_patch
 from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.prediction import ViewChange, bearing_rad
 from marsyard.sim.camera import CameraModel
-from marsyard.sim.frames import SITE_FROM_WORLD, compose
-from marsyard.sim.measurements import MastImage, RoverTarget, SiteTarget
+from marsyard.sim.measurements import MastImage
 
 
 @dataclass(frozen=True)
@@ -50,14 +51,6 @@ class Sighting:
     def azimuth_world_rad(self) -> float:
         """Direction from the camera to the target in the estimated world frame, clockwise from north."""
         return bearing_rad(self.world_from_head.as_matrix()[:3, :3] @ (self.position_head - self.camera.c))
-
-
-@dataclass(frozen=True)
-class ViewChange:
-    """Change of the target's image since the last match: magnification (Eq. 6), and clockwise roll (Eq. 10)."""
-
-    magnification: float = 1.0
-    roll_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -182,66 +175,3 @@ def match_by_correlation(
             offset = biquadratic_offset(normalized_correlation(template, neighbourhood), Peak(1, 1, peak.value, False))
         best = refine_match(template, image, corner, offset, peak, options)
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
-
-
-def designated_position_world(target: RoverTarget | SiteTarget, world_from_rover: RigidTransform) -> Vector3:
-    """Convert a target designated by position to world coordinates; `world_from_rover` is the pose at designation."""
-    if isinstance(target, RoverTarget):
-        return np.asarray(world_from_rover.apply(target.position_rover.copy()))
-    return np.asarray(SITE_FROM_WORLD.inv().apply(target.position_site.copy()))
-
-
-def pose_change(old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform) -> RigidTransform:
-    """Transform from a moving frame at its old pose to the same frame at its new pose."""
-    return compose(new_world_from_frame.inv(), old_world_from_frame)
-
-
-def predicted_position(
-    position: Vector3, old_world_from_frame: RigidTransform, new_world_from_frame: RigidTransform
-) -> Vector3:
-    """Predict the position of a static point in a moving frame (rover or mast head) from its old position."""
-    return np.asarray(pose_change(old_world_from_frame, new_world_from_frame).apply(position.copy()))
-
-
-def bearing_rad(direction_world: Vector3) -> float:
-    """Azimuth of a direction, clockwise from north, radians in (-pi, pi]."""
-    return float(np.arctan2(direction_world[0], direction_world[1]))
-
-
-def magnification(old_position: Vector3, old_centre: Vector3, new_position: Vector3, new_centre: Vector3) -> float:
-    """Scale factor, Eq. 6: the target's old distance from the camera divided by the new one.
-
-    Each position and camera centre is in the rover frame of its stop.
-    """
-    return float(np.linalg.norm(old_position - old_centre) / np.linalg.norm(new_position - new_centre))
-
-
-def horizontal_axis(camera: CameraModel) -> Vector3:
-    """Unit vector Hx along the image's x axis, Eqs. 7 to 9; A and H of the camera model may not be perpendicular."""
-    # horizontal focal length and image centre of the CAHV model, pixels
-    h_s = np.linalg.norm(np.cross(camera.a, camera.h))
-    h_c = camera.a @ camera.h
-    return np.asarray((camera.h - h_c * camera.a) / h_s)
-
-
-def roll_points(
-    old_position: Vector3,
-    old_camera: CameraModel,
-    new_camera: CameraModel,
-    new_from_old: RigidTransform,
-    offset_m: float,
-) -> Float[np.ndarray, "2 2"] | None:
-    """Project the target and an auxiliary point to pixels (u, v) of the new image; their direction defines the roll.
-
-    The auxiliary point has a distance of `offset_m` (k in the paper, before Eq. 10) from the target along the old
-    image's x axis. Each camera is in the frame of its stop. None if the new camera cannot image one of the points.
-    """
-    points = np.stack([old_position, old_position + offset_m * horizontal_axis(old_camera)])
-    pixels, visible = new_camera.project(np.asarray(new_from_old.apply(points)))
-    return pixels if np.all(visible) else None
-
-
-def roll_angle(reference_px: Float[np.ndarray, "2 2"]) -> float:
-    """Clockwise roll of the target's image, radians, from the pixels of `roll_points` (Eq. 10 and following text)."""
-    delta_u, delta_v = reference_px[1] - reference_px[0]
-    return float(np.arctan2(delta_v, delta_u))

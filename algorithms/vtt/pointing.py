@@ -63,12 +63,12 @@ def _compute_offset(
     axes = ((np.array([0.0, 0.0, -1.0]), mast.base_m), (-left_direction, elbow))
     derivatives = np.stack([-to_head @ np.cross(axis, position_rover - origin) for axis, origin in axes], axis=-1)
     position_head = rover_from_head.inv().apply(position_rover.copy())
-    offsets = [camera.project(position_head)[0] - image_centre(camera) for camera in cameras]
+    offsets = [camera.project(position_head)[0] - frame_centre(camera) for camera in cameras]
     jacobians = [camera.projection_jacobian(position_head) @ derivatives for camera in cameras]
     return np.mean(offsets, axis=0), np.mean(jacobians, axis=0)
 
 
-def image_centre(camera: CameraModel) -> Vector2:
+def frame_centre(camera: CameraModel) -> Vector2:
     """Centre of the full frame, pixels."""
     return 0.5 * (np.array(camera.size, dtype=np.float64) - 1.0)
 

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from marsyard.algorithms.arrays import Patch, Points2, Vector2, Vector3
-from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, normalized_correlation
+from marsyard.algorithms.image.correlation import normalized_correlation
+from marsyard.algorithms.image.peaks import biquadratic_offset, highest_peak
 from marsyard.algorithms.vtt.matching import Refinement, refine_match
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.sim.camera import CameraModel

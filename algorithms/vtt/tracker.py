@@ -1,15 +1,14 @@
-"""Visual target tracker: the tracking loop of section 4.1, its states, and the loss criteria.
+"""Visual target tracker: the tracking loop of section 4.1.
 
-The steps of the loop are functions in `pointing`, `matching`, `stereo` and `accuracy`. The tracker stores its state in
-an immutable `TargetTrack` and replaces it in each update. The "seed" is the first update, which extracts the first
-template.
+The steps of the loop are functions in `pointing`, `prediction`, `matching`, `stereo` and `losses`. The tracker stores
+its state in an immutable `TargetTrack` and replaces it in each update. The "seed" is the first update, which extracts
+the first template.
 
 Sections, equations and figures are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -18,106 +17,14 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Counts, Patch, Vector2, Vector3
 from marsyard.algorithms.interface import MastAim, TargetLoss, TargetUpdate, TrackingState
-from marsyard.algorithms.vtt import matching
-from marsyard.algorithms.vtt.accuracy import stereo_range_error_m
+from marsyard.algorithms.vtt import matching, prediction
+from marsyard.algorithms.vtt.losses import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.options import VttOptions
 from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position
-from marsyard.algorithms.vtt.stereo import (
-    StereoMatch,
-    disparity_px_m,
-    epipolar_pixels,
-    nearest_point,
-    point_stereo,
-    search_ranges,
-)
+from marsyard.algorithms.vtt.stereo import StereoMatch, epipolar_pixels, nearest_point, point_stereo, search_ranges
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import MastCalibration, PixelTarget, RoverMeasurements, TargetDesignation
-
-
-@dataclass(frozen=True)
-class Distances:
-    """Distances that determine the tolerances of an update.
-
-    - seed_m, last_m, current_m: Distance from camera to target at the seed, at the last match, and in this update
-    - step_m, driven_m: Rover displacement since the last match, and path length since the seed
-    """
-
-    seed_m: float
-    last_m: float
-    current_m: float
-    step_m: float
-    driven_m: float
-
-
-@dataclass(frozen=True)
-class Tolerances:
-    """Maximum accepted corrections (see `MatchEvidence`): of the target's distance and of its position, metres."""
-
-    distance_m: float
-    position_m: float
-
-
-def tolerances(distances: Distances, left: CameraModel, right: CameraModel, options: VttOptions) -> Tolerances:
-    """Compute the tolerances of Fig. 5 for this update: a minimum plus the root sum square of the errors."""
-    focal_times_baseline = disparity_px_m(left, right)
-
-    def compute_tolerance(reference_m: float, motion_m: float, lateral_m: float) -> float:
-        error_px = options.stereo_disparity_error_px
-        errors_m = [
-            stereo_range_error_m(range_m, focal_times_baseline, 1.0, error_px)
-            for range_m in (reference_m, distances.current_m)
-        ]
-        return options.min_tolerance_m + math.hypot(*errors_m, options.pose_error * motion_m, lateral_m)
-
-    return Tolerances(
-        distance_m=compute_tolerance(distances.last_m, distances.step_m, 0.0),
-        position_m=compute_tolerance(
-            distances.seed_m, distances.driven_m, options.direction_error_rad * distances.current_m
-        ),
-    )
-
-
-@dataclass(frozen=True)
-class MatchEvidence:
-    """Input of the four loss criteria.
-
-    - match_score, stereo_score: Normalised correlations of the template match and of the stereo match
-    - distance_correction_m: Measured minus predicted distance of the target
-    - position_correction_m: Distance of the target from its position at the seed, in the estimated world frame
-    """
-
-    match_score: float
-    stereo_score: float
-    distance_correction_m: float
-    position_correction_m: float
-
-
-def find_losses(evidence: MatchEvidence, allowed: Tolerances, options: VttOptions) -> tuple[TargetLoss, ...]:
-    """Return the reasons for a loss: low scores, or corrections above their tolerances."""
-    criteria = {
-        TargetLoss.LOW_MATCH_SCORE: evidence.match_score < options.min_match_score,
-        TargetLoss.LOW_STEREO_SCORE: evidence.stereo_score < options.min_stereo_score,
-        TargetLoss.DISTANCE_JUMP: abs(evidence.distance_correction_m) > allowed.distance_m,
-        TargetLoss.POSITION_JUMP: evidence.position_correction_m > allowed.position_m,
-    }
-    return tuple(loss for loss, is_exceeded in criteria.items() if is_exceeded)
-
-
-def next_state(state: TrackingState, lost_updates: int, is_matched: bool, limit: int) -> tuple[TrackingState, int]:
-    """Return the state after an update, and the number of updates since the loss (Fig. 6).
-
-    `is_matched`: whether the update matched the target. After a loss the state is LOST. Up to `limit` further updates
-    can recover the target; afterwards the state is FAILURE until the target is cleared.
-    """
-    if state in (TrackingState.FAILURE, TrackingState.NO_TARGET):
-        return state, lost_updates
-    if is_matched:
-        return TrackingState.NORMAL, 0
-    if state is TrackingState.NORMAL:
-        return (TrackingState.LOST, 0) if limit else (TrackingState.FAILURE, 0)
-    attempts = lost_updates + 1
-    return (TrackingState.FAILURE if attempts >= limit else TrackingState.LOST), attempts
 
 
 @dataclass(frozen=True)
@@ -144,7 +51,7 @@ class VttDetails:
     predicted_pixel: Vector2 | None
     window: Counts | None = None
     window_corner: tuple[int, int] | None = None
-    change: matching.ViewChange | None = None
+    change: prediction.ViewChange | None = None
     match: matching.Match | None = None
     template: Patch | None = None
     stereo: StereoMatch | None = None
@@ -206,7 +113,7 @@ class VisualTargetTracker:
         if isinstance(target, PixelTarget):
             self.track = TargetTrack(target, world_from_rover)
         else:
-            self.track = TargetTrack(matching.designated_position_world(target, world_from_rover), world_from_rover)
+            self.track = TargetTrack(prediction.designated_position_world(target, world_from_rover), world_from_rover)
 
     def clear(self) -> None:
         """Clear the target."""
@@ -283,7 +190,7 @@ def expected_position(track: TargetTrack, world_from_frame: RigidTransform) -> V
     """Predict the target position in the rover or head frame of this pose; None for a pixel target before the seed."""
     last = track.sighting
     if last is not None:
-        return matching.predicted_position(last.position_head, last.world_from_head, world_from_frame)
+        return prediction.predicted_position(last.position_head, last.world_from_head, world_from_frame)
     if isinstance(track.designated, PixelTarget):
         return None
     return np.asarray(world_from_frame.inv().apply(track.designated.copy()))
@@ -320,18 +227,18 @@ def follow_track(
 ) -> TrackResult:
     """Match and triangulate the target (actions 1 to 6 of section 4.1 without pointing); check the loss criteria."""
     stop = StereoStop.from_measurements(measurements)
-    new_from_old = matching.pose_change(last.world_from_head, stop.world_from_head)
+    new_from_old = prediction.pose_change(last.world_from_head, stop.world_from_head)
     expected = np.asarray(new_from_old.apply(last.position_head.copy()))
-    points = matching.roll_points(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
+    points = prediction.roll_points(last.position_head, last.camera, stop.left, new_from_old, options.roll_lever_m)
     if points is None:
         return TrackResult((TargetLoss.OUT_OF_VIEW,), VttDetails(False, None))
     predicted = points[0]
-    magnification = matching.magnification(last.position_head, last.camera.c, expected, stop.left.c)
-    change = matching.ViewChange(magnification, matching.roll_angle(points))
+    magnification = prediction.magnification(last.position_head, last.camera.c, expected, stop.left.c)
+    change = prediction.ViewChange(magnification, prediction.roll_angle(points))
     window, window_corner = matching.search_window(measurements.left, predicted, options.search_px)
     details = VttDetails(False, predicted, window, window_corner, change)
     applied_magnification = change.magnification if options.scale else 1.0
-    applied_change = matching.ViewChange(applied_magnification, change.roll_rad if options.roll else 0.0)
+    applied_change = prediction.ViewChange(applied_magnification, change.roll_rad if options.roll else 0.0)
     match = matcher(last, measurements.left, predicted, applied_change, options)
     if match is None:
         return TrackResult((TargetLoss.OUT_OF_VIEW,), details)

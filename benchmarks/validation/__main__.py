@@ -4,8 +4,6 @@ Usage: ``python -m benchmarks.validation [--only NAME]``, or with ``--pages`` to
 measured properties of the simulation with limits (`records`).
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -1,7 +1,5 @@
 """Checks of campaigns: rows do not depend on the executor or on interruptions, and misbehaving cases are isolated."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

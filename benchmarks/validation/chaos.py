@@ -1,7 +1,5 @@
 """A scenario with random faults of a custom algorithm: exception, endless loop, memory overrun, abort."""
 
-from __future__ import annotations
-
 import os
 import re
 import time

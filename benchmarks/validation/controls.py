@@ -4,8 +4,6 @@ The controls are algorithms that use no image, refuse, answer without regard to 
 (`marsyard.algorithms.controls`). A campaign whose requirements a control meets gives a PASS without meaning.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Checks of intervals of skewed quantities: contributions to an error budget, and differences of two algorithms."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 

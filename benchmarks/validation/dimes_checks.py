@@ -1,7 +1,5 @@
 """Checks of DIMES' IMU check, and comparison of DIMES with standard registration methods on the same descents."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

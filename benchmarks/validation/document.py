@@ -3,8 +3,6 @@
 The packaged rows (`marsyard.reports.validation_rows`) also contain the conditions of each row.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform

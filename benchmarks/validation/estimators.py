@@ -3,8 +3,6 @@
 They validate the renderer and share no code with the algorithms under test.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -5,8 +5,6 @@ templates of DIMES. Some terrains of `sim/terrain/sites.toml` are fitted to them
 the agreement is no independent test. "Flown" values were measured in images from Mars.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import combinations
@@ -23,7 +21,7 @@ from benchmarks.validation.image_statistics import (
     compute_pair_statistics,
 )
 from benchmarks.validation.records import Check, Measure
-from marsyard.algorithms.dimes.details import TRACK_COLUMNS
+from marsyard.algorithms.dimes.products import TRACK_COLUMNS
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.descent.scenario import DescentScenario
 from marsyard.sim.sensor import preset

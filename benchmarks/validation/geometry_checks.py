@@ -1,7 +1,5 @@
 """Checks of geometry: markers, world points, and ranges against independent ray casting."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -3,8 +3,6 @@
 The limits are ranges around the values of the images from Mars; each row states these "flown" values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A scenario with faults of a custom algorithm that damage the process or other cases; used by the soak test."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import re

@@ -1,7 +1,5 @@
 """Accuracy of the hazard detection on noise-free rendered image pairs: camera motion and elevation map."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Checks of the illumination in images: opposition peak, cast shadows, reflectance law, cloud shadows, sun disc."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 A limit state returns the margins of cases, which are negative if the requirement is violated.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass

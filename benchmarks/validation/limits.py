@@ -4,8 +4,6 @@ A wider limit would detect only gross faults. The values repeat to a few per cen
 allows for other processors and OpenGL libraries. Document the reason for every increased entry.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 #: Limit divided by the measured value.

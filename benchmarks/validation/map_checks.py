@@ -4,8 +4,6 @@ The flown values are those of five frames of Mars 2020's landing camera, 4 to 3 
 pixel from orbital images (public copies), measured by the same function (`compute_map_statistics`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import cv2

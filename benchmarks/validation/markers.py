@@ -7,8 +7,6 @@ As a program, this module measures all cameras with one backend and prints the e
 only one backend.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of the motion of rendered images: all sites from 2 km, and rocks from a mast."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 

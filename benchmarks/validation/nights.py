@@ -3,8 +3,6 @@
 The campaigns differ in the assignment of cases to terrains: cases on one terrain are correlated.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from tempfile import TemporaryDirectory
 

@@ -3,8 +3,6 @@
 The checks measure the coverage of the intervals, and the cost.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 

@@ -4,8 +4,6 @@ The verdicts come from the function of the product (`decide_rare`). Random cases
 with the known probability, so that only the replicates evaluate margins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial

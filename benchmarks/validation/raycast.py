@@ -4,8 +4,6 @@ It shares no code with the renderer: heights are from `scipy.ndimage.map_coordin
 solving for barycentric coordinates.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import map_coordinates
 

@@ -1,7 +1,5 @@
 """Records of validation checks: claim, limit and measured value."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal

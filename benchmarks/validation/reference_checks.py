@@ -4,8 +4,6 @@ Needs the extra `validate`. Mitsuba renders the triangles of objects and a mesh 
 finer than its samples, with interpolated normals. Both renderers use the same rays.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path

@@ -4,8 +4,6 @@ A case fails in a region of standard normal variables z; a change shifts or scal
 known, and so is the change after which it equals the permitted rate.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 NumPy's `SeedSequence` computes one seed per call; this module contains a vectorised version of its algorithm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 World axes: x east, y north, z up. Body axes of a camera on a mast: x forward, y left, z up.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

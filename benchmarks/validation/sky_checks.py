@@ -1,7 +1,5 @@
 """Checks of the sky that a rover, rocks and relief hide from the ground, by casting rays."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

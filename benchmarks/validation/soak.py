@@ -3,8 +3,6 @@
 Its results are compared with the same campaign without faults. `benchmarks.validation.hostile` defines the faults.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 The coverage of an interval is the fraction of simulated samples whose interval contains the true value.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 

@@ -4,8 +4,6 @@ The tracking paper is Kim et al., "Targeted Driving Using Visual Tracking". Its 
 proportional to the disparity error and the square of the range.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count, islice

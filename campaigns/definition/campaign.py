@@ -24,8 +24,7 @@ from marsyard.campaigns.sampling.dispersions import CyclicInteger, Derived, Fixe
 from marsyard.campaigns.sampling.study_points import StudyPoint, transform_to_uniform
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.interface import Scenario
-from marsyard.sim.parameters import stream_name
-from marsyard.sim.streams import Streams
+from marsyard.sim.streams import Streams, stream_name
 
 #: Name of the record of confirmations in the current folder.
 CONFIRMATIONS_FILE = "confirmations.jsonl"

@@ -19,13 +19,13 @@ from marsyard.campaigns.definition.identity import own_limits
 from marsyard.campaigns.errors import CRASHED, ENGINE_FAILURES, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.work import Executor, TaskResult, Work, WorkLimits
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store.products import PackedProducts, ProductSelection, pack_products
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar, recording_timelines
 from marsyard.scenarios.systems import scenario
 from marsyard.sim.array_cache import CacheWarning
-from marsyard.sim.cache import hide_folders
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023

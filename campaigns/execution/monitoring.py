@@ -19,8 +19,9 @@ from typing import Any
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from marsyard.algorithms.processes import WORKER_NUMBER, descendants, used_memory
+from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.algorithms.processes import kill as kill_processes
+from marsyard.algorithms.worker_device import WORKER_NUMBER
 from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, find_marked_processes, is_stopped

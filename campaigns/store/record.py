@@ -12,10 +12,10 @@ from typing import Any
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import Identity
 from marsyard.campaigns.errors import StoreError, report_write_errors
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.machine import describe_machine, git_commit
 from marsyard.campaigns.store.rows import ROWS_FILE, is_empty_store
 from marsyard.campaigns.store.temporary_files import replace_file
-from marsyard.sim.cache import hide_folders
 
 #: Version of the layout of a campaign's folder.
 SCHEMA = 1

@@ -8,8 +8,6 @@
 docs/custom-parts.md describes the inputs and results of each kind of part.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar
 

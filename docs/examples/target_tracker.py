@@ -8,8 +8,6 @@ match is then searched in the right image. The target is the point nearest to bo
 Marsyard's readers for files; a program in another language reads the files itself (docs/custom-algorithms.md).
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

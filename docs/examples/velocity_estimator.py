@@ -7,8 +7,6 @@ Templates of the second image are searched in the third image, around the positi
 Each match gives a velocity over level ground. The answer is the median velocity, with a covariance from the scatter.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -15,8 +15,6 @@ answer is the inertial velocity at the last image minus its error, with a covari
 `IntegratedShifts` integrates the inertial velocity from inertial increments, if the descent has them.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 

@@ -17,6 +17,7 @@ from markupsafe import Markup
 
 from marsyard.campaigns.definition.identity import hash_sources
 from marsyard.campaigns.errors import CampaignError, StoreError
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.confirmations import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
@@ -32,7 +33,6 @@ from marsyard.reports.report_file import REPORT_JSON, read_report
 from marsyard.reports.signature import SIGNATURE_FILE
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
 from marsyard.reports.validation_rows import VALIDATION_FILE
-from marsyard.sim.cache import hide_folders
 
 #: Files of the package that are computed from its evidence, and the file of the hashes.
 PAGE, CASE, DRAWING, MANIFEST = "index.html", "case.json", "case.svg", "manifest.json"

@@ -11,7 +11,8 @@ from marsyard.scenarios.descent.recorded import END_MARGIN_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, MotionInputs
 from marsyard.sim.dynamics import State, Trajectory
-from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError
+from marsyard.sim.dynamics.pose_files import TrajectoryFileError
+from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.dynamics.swing import SwingDescent
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import Surface

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.recorded_axes import RecordedAxes
 from marsyard.scenarios.user_files import UserFile
-from marsyard.sim.dynamics.recorded import RecordedMotion, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.pose_files import TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.parameters import bounded_field
 
 #: Required duration of the flight after the last image, s.

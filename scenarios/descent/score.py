@@ -8,7 +8,7 @@ from jaxtyping import UInt16
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import propagate_velocity
-from marsyard.algorithms.dimes.binning import altitudes_at_images
+from marsyard.algorithms.dimes.views import altitudes_at_images
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.condition_columns import attitude_rate_deg_s, off_nadir_deg, sun_columns
 from marsyard.scenarios.descent.flight import mean_velocities

@@ -21,9 +21,9 @@ from marsyard.sim.render import CloudParameters
 from marsyard.sim.render.backend import Backend, default_backend
 from marsyard.sim.sensor import DetectorChoice, preset
 from marsyard.sim.sensor.detector import BURST_DN, BURST_PX, BurstParameters, DetectorParameters
+from marsyard.sim.sensor.gps import POST_PROCESSED, GpsParameters
 from marsyard.sim.sensor.imu import ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
-from marsyard.sim.sensor.satellite_navigation import POST_PROCESSED, GpsParameters
 from marsyard.sim.terrain import TerrainParameters, site
 
 Count = Annotated[int, Field(ge=0, le=100000)]

@@ -21,10 +21,10 @@ from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Motion
 from marsyard.sim.dynamics.helicopter import draw_helicopter_flight
 from marsyard.sim.render import CloudLayer, Objects
+from marsyard.sim.sensor.gps import Gps
 from marsyard.sim.sensor.imu import DEG_H, Imu
 from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.sensor.instrument import Clock
-from marsyard.sim.sensor.satellite_navigation import Gps
 from marsyard.sim.terrain import Surface, site
 
 #: Number of points on the flight line whose mean ground height is the reference of the flight's heights.

@@ -15,12 +15,14 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
+from marsyard.algorithms.exchange.command import Command
 from marsyard.algorithms.exchange.forms import read_member
 from marsyard.algorithms.exchange.limits import ExecutableLimits
-from marsyard.algorithms.exchange.process import Command, RunningProgram, temporary_folder
+from marsyard.algorithms.exchange.process import RunningProgram, temporary_folder
 from marsyard.algorithms.exchange.serving import acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
-from marsyard.algorithms.processes import children, processor_time_s, worker_device
+from marsyard.algorithms.processes import children, processor_time_s
+from marsyard.algorithms.worker_device import worker_device
 from marsyard.scenarios.imports import source_root
 from marsyard.scenarios.isolation.plain import decode
 from marsyard.scenarios.isolation.transport import Sender

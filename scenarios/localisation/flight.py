@@ -59,6 +59,8 @@ _UP = np.array([0.0, 0.0, 1.0])
 #: Signs of the conjugate of a quaternion.
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 
+#: Upper limit of `SwingParameters.thruster_firing_m`.
+_MAX_FIRING_M = 1000.0
 #: Mars 2020 under its parachute, a rigid vehicle with its backshell: coning with the parachute, and nodding about the
 #: confluence of the bridles. Parachute: 50 m long with its lines, 82 kg (public summaries of NASA); all other values
 #: are assumed.
@@ -66,7 +68,7 @@ PARACHUTE = SwingParameters(
     altitude_first_m=4200.0, descent_rate_m_s=90.0, wind_east_m_s=8.0, wind_north_m_s=3.0, gust_intensity_m_s=1.5,
     cone_angle_deg=5.0, nod_rate_deg_s=6.0, line_length_m=50.0, bridle_length_m=7.0, canopy_mass_kg=120.0,
     backshell_mass_kg=0.0, lander_mass_kg=3000.0, mass_centre_m=6.0, gyration_transverse_m=1.3, gyration_axial_m=1.3,
-    arm_length_m=7.0, thruster_firing_m=1000.0,
+    arm_length_m=7.0, thruster_firing_m=_MAX_FIRING_M,
 )  # fmt: skip
 
 
@@ -151,8 +153,8 @@ class LanderFlight(Trajectory):
                 f"start_m is {start_altitude:.1f} m above the ground; allowed: above the separation, at "
                 f"{p.altitude_separation_m:.6g} m"
             )
-        # the parachute descent is simulated to a little below the separation
-        firing_m = min(p.altitude_separation_m, 1000.0)
+        # the parachute descent is simulated to below the separation: its end follows from the firing height
+        firing_m = min(p.altitude_separation_m, _MAX_FIRING_M)
         swing = p.parachute.model_copy(update={"thruster_firing_m": firing_m})
         parachute = SwingDescent.simulate(
             swing, start_m, rng, ground_height_m=ground_height_m, gravity_m_s2=gravity_m_s2, lead_s=LEAD_S

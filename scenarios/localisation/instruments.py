@@ -21,7 +21,8 @@ from marsyard.sim.error_sources import CALIBRATION
 from marsyard.sim.measurements import AltitudeMeasurement
 from marsyard.sim.parameters import Parameters, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, RadarAltimeter, RadarParameters
-from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
+from marsyard.sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.radiometry import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath
 
 #: Margin of the inertial increments before the first and after the last time tag of the other clocks, s: the time tags
 #: of the inertial unit have an offset of 0.2 ms rms.

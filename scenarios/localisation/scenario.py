@@ -43,7 +43,7 @@ from marsyard.sim.measurements import AltitudeMeasurement, DetectorImage, ImuInc
 from marsyard.sim.render.renderer import return_freed_memory
 from marsyard.sim.sensor import ClockParameters, Detector, Imu
 from marsyard.sim.sensor.instrument import Clock
-from marsyard.sim.sensor.ranging import RadarAltimeter
+from marsyard.sim.sensor.radar import RadarAltimeter
 from marsyard.sim.streams import Streams
 
 #: The inertial data begin `LEAD_S` before the start of localisation and end `MARGIN_S` after the last image, s. The

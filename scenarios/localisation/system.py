@@ -15,6 +15,7 @@ SYSTEM = System(
     folder=_FOLDER,
     columns={"localisation": "marsyard.scenarios.localisation.columns:COLUMNS"},
     compilation_campaigns={
+        # small terrain, map and image: the cases only compile the kernels
         "loc-smoke": (
             "terrain.samples=1024",
             "map.side_px=512",
@@ -25,7 +26,7 @@ SYSTEM = System(
         )
     },
     report="marsyard.reports.localisation.presentation:LOCALISATION",
-    # sources of values, in the notation of `System.conditions`
+    # sources of each quantity, in the notation of `System.conditions`; 4200 m is the default of `altitude_start_m`
     conditions={
         "site": ("terrain.source.dtm|site",),
         "camera": ("=lander vision camera",),

@@ -16,9 +16,10 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.stats import rankdata
 
 from marsyard.algorithms.arrays import Points2
-from marsyard.algorithms.dimes import baselines as orb
-from marsyard.algorithms.image.correlation import highest_peak, normalized_correlation
+from marsyard.algorithms.dimes import homography as orb
+from marsyard.algorithms.image.correlation import normalized_correlation
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
+from marsyard.algorithms.image.peaks import highest_peak
 from marsyard.algorithms.localisation.features import extract_map_features, flatten, match_descriptors
 from marsyard.algorithms.localisation.fine import LandmarkMatches, match_landmarks
 from marsyard.algorithms.localisation.interface import MapProduct

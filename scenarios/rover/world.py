@@ -15,13 +15,15 @@ from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenar
 from marsyard.scenarios.rover.points import RockOutline
 from marsyard.scenarios.views import SiteGround, Viewpoint, select_rocks, site_scene
 from marsyard.sim.camera import CameraModel
+from marsyard.sim.dynamics.driven_ground import DrivenGround, RockyGround
 from marsyard.sim.dynamics.driving import Drive, Soil, drive
-from marsyard.sim.dynamics.rover import MER, ROCKY_8, DrivenGround, RockyGround, RoverParameters, Stance, settle
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, Stance, settle
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, MastCalibration
 from marsyard.sim.render import CloudLayer, PixelRays, Scene
-from marsyard.sim.sensor.mast import Mast, MastState, StereoHead
+from marsyard.sim.sensor.mast import Mast, MastState
 from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
+from marsyard.sim.sensor.stereo_head import StereoHead
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, TerrainParameters, site
 from marsyard.sim.terrain.landforms import Ramp

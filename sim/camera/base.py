@@ -146,7 +146,7 @@ class CameraModel(ABC):
         if not new_from_old.single:
             raise ValueError("a camera is transformed by a single transform, not by an array of transforms")
         matrix = new_from_old.as_matrix()
-        vectors = {name: matrix[:3, :3] @ getattr(self, name) for name in ("a", "h", "v", "o") if hasattr(self, name)}
+        vectors = {name: matrix[:3, :3] @ getattr(self, name) for name in self._vectors if name in "ahvo"}
         return self._with(c=matrix[:3, :3] @ self.c + matrix[:3, 3], **vectors)
 
     def bin(self: M, columns: int, rows: int) -> M:
@@ -247,18 +247,21 @@ class CameraModel(ABC):
         fractions = np.arange(steps)[:, np.newaxis] / steps
         return np.concatenate([start + fractions * (end - start) for start, end in pairwise(corners)])
 
+    @property
+    def _vectors(self) -> str:
+        """Names of the model's vectors: the letters of its name; "a", "h", "v" and "o" are directions."""
+        return type(self).__name__.lower()
+
     def __post_init__(self) -> None:
-        for field in fields(cast(Any, self)):
-            if field.name in ("size", "linearity"):
-                continue
+        for name in self._vectors:
             # the sum is a copy, and converts -0.0 to 0.0, so that equal cameras have equal hashes
-            vector = np.asarray(getattr(self, field.name), dtype=np.float64) + 0.0
+            vector = np.asarray(getattr(self, name), dtype=np.float64) + 0.0
             if vector.shape != (3,):
-                raise ValueError(f"{field.name} must have three components, not shape {vector.shape}")
+                raise ValueError(f"{name} must have three components, not shape {vector.shape}")
             if not np.all(np.isfinite(vector)):
-                raise ValueError(f"{field.name} must be finite, not {vector.tolist()}")
+                raise ValueError(f"{name} must be finite, not {vector.tolist()}")
             vector.flags.writeable = False
-            object.__setattr__(self, field.name, vector)
+            object.__setattr__(self, name, vector)
         columns, rows = self.size
         if int(columns) != columns or int(rows) != rows or columns < 1 or rows < 1:
             raise ValueError(f"size must be two positive integers (columns, rows), not {self.size}")

@@ -8,16 +8,12 @@ Each is converted to the names of OpenCV's YAML files (`camera_matrix`, `distort
 import re
 from collections.abc import Mapping
 from typing import Any
-from xml.etree import ElementTree
 
-from marsyard.sim.camera.source import CALIBRATION_FILES, FORMATS, Source
+from marsyard.sim.camera.source import CALIBRATION_FILES, Source
+from marsyard.sim.camera.xml_files import parse_xml
 
 Values = Mapping[str, Any]
 
-#: Start of an XML file, and the first element: an optional declaration, comments, and a name with an optional prefix.
-_XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|!--|!DOCTYPE|[A-Za-z_][\w:.-]*[\s>/])")
-_XML_ROOT = re.compile(rb"<(?:[A-Za-z_][\w.-]*:)?(?P<root>[A-Za-z_][\w.-]*)")
-_XML_PROLOGUE = re.compile(rb"<\?.*?\?>|<!--.*?-->", re.DOTALL)
 #: Root element of OpenCV's files.
 OPENCV_ROOT = "opencv_storage"
 #: First line of a camera in COLMAP's file, after comments; start of a camera of Ames Stereo Pipeline.
@@ -37,23 +33,7 @@ _COLMAP_MODELS: dict[str, tuple[str, bool]] = {
 }
 #: Axes of the image of Ames Stereo Pipeline that are OpenCV's.
 _PINHOLE_AXES = {"u_direction": (1.0, 0.0, 0.0), "v_direction": (0.0, 1.0, 0.0), "w_direction": (0.0, 0.0, 1.0)}
-#: Names of which a CSM ISD (image support data in JSON) contains at least one.
-_ISD_NAMES = (
-    *(b'"name_model"', b'"m_modelName"', b'"isis_camera_version"', b'"name_sensor"', b"USGS_ASTRO"),
-    *(b'"image_lines"', b'"detector_sample_summing"', b'"center_ephemeris_time"', b'"body_rotation"'),
-)
 _ASSIGNMENT = re.compile(r"^\s*(?P<name>\w+)\s*=\s*(?P<value>.*?)\s*$")
-
-
-def is_xml(head: bytes) -> bool:
-    """Return whether the first bytes of a file are XML."""
-    return _XML_START.match(head) is not None
-
-
-def xml_root(head: bytes) -> str:
-    """Return the name of the first element in the first bytes of an XML file; empty if there is none."""
-    match = _XML_ROOT.search(_XML_PROLOGUE.sub(b"", head))
-    return "" if match is None else match["root"].decode()
 
 
 def is_colmap(head: bytes) -> bool:
@@ -64,17 +44,6 @@ def is_colmap(head: bytes) -> bool:
 def is_stereo_pipeline(head: bytes) -> bool:
     """Return whether the first bytes are those of a pinhole model of Ames Stereo Pipeline (`.tsai`)."""
     return _PINHOLE.match(head) is not None
-
-
-def parse_xml(source: Source, allowed: str) -> ElementTree.Element:
-    """Parse an XML file. Raises CameraFileError; `allowed` describes the file."""
-    text = source.read_text()
-    if "<!ENTITY" in text:  # camera files do not need entities, and nested entities can fill the memory
-        raise source.error("label", "declares entities", f"{allowed}, which has none")
-    try:
-        return ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
-    except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise source.error("label", f"cannot be parsed ({error})", f"{allowed}, which is XML") from error
 
 
 def read_opencv_xml(source: Source) -> Values:
@@ -160,25 +129,6 @@ def read_stereo_pipeline(source: Source, size: tuple[int, int] | None) -> Values
         "image_width": size[0],
         "image_height": size[1],
     }
-
-
-def foreign_format(head: bytes) -> str | None:
-    """Return the name of a known format that is not read; None for other files."""
-    if head.startswith(b"LBLSIZE="):
-        return "a VICAR file without a PDS label"
-    if is_xml(head):
-        root = xml_root(head)
-        names = {"document": "a Metashape project", "calibration": "a Metashape calibration", "isd": "a CSM ISD"}
-        return names.get(root)
-    is_isd = head.lstrip().startswith(b"{") and any(name in head for name in _ISD_NAMES)
-    return "a CSM ISD" if is_isd else None
-
-
-def refuse_foreign(source: Source, head: bytes) -> None:
-    """Raise CameraFileError for a known format that is not read; the message lists the supported ones."""
-    name = foreign_format(head)
-    if name is not None:
-        raise source.error("file", f"is {name}, which is not supported", FORMATS)
 
 
 def _matrix(fx: float, fy: float, cx: float, cy: float) -> list[list[float]]:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from jaxtyping import Float
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera.base import CameraModel
@@ -26,15 +27,14 @@ from marsyard.sim.camera.calibration_formats import (
     OPENCV_ROOT,
     is_colmap,
     is_stereo_pipeline,
-    is_xml,
     read_colmap,
     read_opencv_xml,
     read_stereo_pipeline,
-    refuse_foreign,
-    xml_root,
 )
+from marsyard.sim.camera.foreign_formats import refuse_foreign
 from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
 from marsyard.sim.camera.source import CALIBRATION_FILES, Source
+from marsyard.sim.camera.xml_files import is_xml, xml_root
 
 #: Maximum residual of the fitted camera: RMS over the frame, similar to the residual of a calibration (0.1 to 0.5 px);
 #: and at any pixel (the maximum is in a corner).
@@ -82,12 +82,14 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
         return super().compose_node(parent, index)
 
 
-# YAML tags of OpenCV's matrices; the second is that of one-dimensional matrices in OpenCV 5
-for _kind in ("opencv-matrix", "opencv-nd-matrix"):
-    _Loader.add_constructor(
-        f"tag:yaml.org,2002:{_kind}",
-        lambda loader, node: loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None,
-    )
+def _construct_matrix(loader: _Loader, node: Any) -> Any:
+    """Construct OpenCV's matrix: a table with its elements in `data`; None for another node with this tag."""
+    return loader.construct_mapping(node, deep=True) if isinstance(node, yaml.MappingNode) else None
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _construct_matrix)
+# one-dimensional matrices in OpenCV 5
+_Loader.add_constructor("tag:yaml.org,2002:opencv-nd-matrix", _construct_matrix)
 
 
 def is_calibration(head: bytes) -> bool:
@@ -153,24 +155,12 @@ class _Reader:
 
     def read_calibration(self, name: str, pose: RigidTransform | None) -> Calibration:
         """Read the camera; its lens model follows from the model's name and, in OpenCV's files, the coefficients."""
+        is_fisheye = False
         if "intrinsics" in self.data or _CHAIN.match(self.prefix.removesuffix(".")):  # EuRoC, Kalibr
-            model = self.data.get("camera_model", "pinhole")
-            if model != "pinhole":
-                raise self.error("camera_model", f"{model!r}", "pinhole")
-            intrinsics = self.read_numbers(("intrinsics",), "fx, fy, cx, cy")
-            if len(intrinsics) != 4:
-                raise self.error("intrinsics", f"has {len(intrinsics)} numbers", "fx, fy, cx, cy")
-            fx, fy, cx, cy = intrinsics
-            matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+            matrix = self.read_intrinsics()
             names: tuple[str, ...] = ("distortion_coeffs", "distortion_coefficients")
-            is_fisheye = False
         else:
-            flat = self.read_numbers(
-                ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k"), "a matrix of 3 x 3 numbers"
-            )
-            if len(flat) != 9:
-                raise self.error("camera_matrix", f"has {len(flat)} numbers", "3 x 3")
-            matrix = np.array(flat, dtype=np.float64).reshape(3, 3)
+            matrix = self.read_matrix()
             names = ("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "dist_coeffs", "D", "d")
             is_fisheye = bool(self.data.get("fisheye_model", False))
         coefficients = self.read_numbers(names, "a list of numbers", default=[])
@@ -198,6 +188,26 @@ class _Reader:
             return Calibration(name, camera, residual)
         camera, binning = self.apply_readout(camera)
         return Calibration(name, camera, Residual(residual.rms_px / binning, residual.max_px / binning))
+
+    def read_intrinsics(self) -> Float[np.ndarray, "3 3"]:
+        """Read the camera matrix from the numbers fx, fy, cx, cy of EuRoC and Kalibr, pixels."""
+        model = self.data.get("camera_model", "pinhole")
+        if model != "pinhole":
+            raise self.error("camera_model", f"{model!r}", "pinhole")
+        intrinsics = self.read_numbers(("intrinsics",), "fx, fy, cx, cy")
+        if len(intrinsics) != 4:
+            raise self.error("intrinsics", f"has {len(intrinsics)} numbers", "fx, fy, cx, cy")
+        fx, fy, cx, cy = intrinsics
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def read_matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Read the camera matrix of OpenCV and ROS, pixels."""
+        flat = self.read_numbers(
+            ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k"), "a matrix of 3 x 3 numbers"
+        )
+        if len(flat) != 9:
+            raise self.error("camera_matrix", f"has {len(flat)} numbers", "3 x 3")
+        return np.array(flat, dtype=np.float64).reshape(3, 3)
 
     def apply_readout(self, camera: CameraModel) -> tuple[CameraModel, int]:
         """Crop and bin the camera as `roi`, `binning_x` and `binning_y` of ROS say; return also the smaller binning.

@@ -26,7 +26,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+from marsyard.sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.models import Cahv, Cahvor
 
 Array = NDArray[np.float64]
 C = TypeVar("C", bound=CameraModel)
@@ -37,6 +38,11 @@ _SAMPLES_PER_SIDE = 33
 _EXACT_PX = 1e-9
 #: Residual during the fit of a direction that is not visible in the camera.
 _INVISIBLE_PX = 1e3
+#: Inversion of a distortion by Newton's method: maximum number of steps, step that ends it, and accepted error, all in
+#: units of the plane z = 1 or radians.
+_NEWTON_STEPS, _STEP_TOLERANCE, _INVERSION_TOLERANCE = 50, 1e-14, 1e-9
+#: Number of angles at which the fisheye's distortion is tested for a fold.
+_FOLD_TEST_ANGLES = 1000
 
 
 @dataclass(frozen=True)
@@ -162,16 +168,16 @@ def _invert_fisheye(points: Array, coefficients: Array) -> Array:
     """Invert OpenCV's fisheye model by Newton's method: directions (z is the axis) of points (x, y), shape (n, 2)."""
     distance = np.hypot(points[:, 0], points[:, 1])
     theta = np.minimum(distance, np.pi)
-    for _ in range(50):
+    for _ in range(_NEWTON_STEPS):
         gain, slope = _compute_fisheye_gain(theta, coefficients)
         step = (theta * gain - distance) / slope
         theta = np.clip(theta - step, 0.0, np.pi)
-        if np.max(np.abs(step)) < 1e-14:
+        if np.max(np.abs(step)) < _STEP_TOLERANCE:
             break
-    angles = np.linspace(0.0, float(theta.max()), 1000)
+    angles = np.linspace(0.0, float(theta.max()), _FOLD_TEST_ANGLES)
     recomputed_distance = theta * _compute_fisheye_gain(theta, coefficients)[0]
     if not (
-        np.max(np.abs(recomputed_distance - distance)) < 1e-9
+        np.max(np.abs(recomputed_distance - distance)) < _INVERSION_TOLERANCE
         and np.all(_compute_fisheye_gain(angles, coefficients)[1] > 0)
     ):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
@@ -191,14 +197,14 @@ def _project_directions(camera: CameraModel, directions: Array) -> Array:
 def _invert_pinhole_distortion(distorted_points: Array, coefficients: Array) -> Array:
     """Invert the pinhole distortion by Newton's method in two dimensions."""
     points = distorted_points.copy()
-    for _ in range(50):
+    for _ in range(_NEWTON_STEPS):
         image, slope = _apply_pinhole_distortion(points, coefficients)
         step = np.linalg.solve(slope, (image - distorted_points)[..., np.newaxis])[..., 0]
         points -= step
-        if np.max(np.abs(step)) < 1e-14:
+        if np.max(np.abs(step)) < _STEP_TOLERANCE:
             break
     image, slope = _apply_pinhole_distortion(points, coefficients)
-    if not (np.max(np.abs(image - distorted_points)) < 1e-9 and np.all(np.linalg.det(slope) > 0)):
+    if not (np.max(np.abs(image - distorted_points)) < _INVERSION_TOLERANCE and np.all(np.linalg.det(slope) > 0)):
         raise ValueError("the distortion folds over within the frame: some pixels have no direction, or several")
     return points
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from marsyard.sim.camera.base import CameraModel
-from marsyard.sim.camera.calibration_formats import parse_xml
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     CoordinateSystem,
@@ -19,8 +18,8 @@ from marsyard.sim.camera.label_frames import (
     resolve_camera,
     transform_from_label,
 )
-from marsyard.sim.camera.pds import SUBFRAME
-from marsyard.sim.camera.source import MODELS, Source, create_camera, linearity_of_type
+from marsyard.sim.camera.source import MODELS, SUBFRAME, Source, create_camera, linearity_of_type
+from marsyard.sim.camera.xml_files import parse_xml
 
 #: Names in the geometry dictionary.
 _PARAMETERS = "Camera_Model_Parameters"
@@ -62,27 +61,9 @@ def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> t
     models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]
     if not models:
         raise source.error(_PARAMETERS, "missing", "a PDS4 label with at least one such class with a model_type")
-    arrays = _find_elements(root, "Array_2D_Image", "Array_3D_Image")
-    if not arrays:
-        raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
-    extents = {}
-    for axis in (element for element in arrays[0] if _local_name(element) == "Axis_Array"):
-        axis_name, count = _element_text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
-        if axis_name in ("Line", "Sample") and count is not None:
-            if not (_element_text(count).isdecimal() and int(_element_text(count)) > 0):
-                raise source.error("Axis_Array.elements", f"{_element_text(count)!r}", "a positive integer")
-            extents[axis_name] = int(_element_text(count))
-    if set(extents) != {"Line", "Sample"}:
-        raise source.error("Axis_Array", f"names {sorted(extents)}", "the axes Line and Sample")
-    size = extents["Sample"], extents["Line"]
-    parts = [part for imaging in _find_elements(root, "Imaging") for part in imaging]
-    for part in (
-        part for part in parts if _local_name(part) in ("Subframe", "Downsampling") and not subframe_folded_in
-    ):
-        for field in _find_elements(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
-            if _element_text(field) not in ("", "1"):
-                name = f"{_local_name(part)}.{_local_name(field)}"
-                raise source.error(name, f"{_element_text(field)}: {SUBFRAME}", "1, or subframe_folded_in = true")
+    size = _read_size(root, source)
+    if not subframe_folded_in:
+        _refuse_subframe(root, source)
     systems, identified = _read_systems(root, source)
     reference = "Coordinate_Space_Reference"
     return tuple(
@@ -95,6 +76,33 @@ def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> t
         )
         for element in models
     )
+
+
+def _read_size(root: ElementTree.Element, source: Source) -> tuple[int, int]:
+    """Read (columns, rows) of the label's first image array. Raises CameraFileError."""
+    arrays = _find_elements(root, "Array_2D_Image", "Array_3D_Image")
+    if not arrays:
+        raise source.error("Array_2D_Image", "missing", "an image array of lines and samples")
+    extents = {}
+    for axis in (element for element in arrays[0] if _local_name(element) == "Axis_Array"):
+        axis_name, count = _element_text(_find_child(axis, "axis_name")), _find_child(axis, "elements")
+        if axis_name in ("Line", "Sample") and count is not None:
+            if not (_element_text(count).isdecimal() and int(_element_text(count)) > 0):
+                raise source.error("Axis_Array.elements", f"{_element_text(count)!r}", "a positive integer")
+            extents[axis_name] = int(_element_text(count))
+    if set(extents) != {"Line", "Sample"}:
+        raise source.error("Axis_Array", f"names {sorted(extents)}", "the axes Line and Sample")
+    return extents["Sample"], extents["Line"]
+
+
+def _refuse_subframe(root: ElementTree.Element, source: Source) -> None:
+    """Raise CameraFileError for the label of an image that ground processing cropped or averaged."""
+    parts = [part for imaging in _find_elements(root, "Imaging") for part in imaging]
+    for part in (part for part in parts if _local_name(part) in ("Subframe", "Downsampling")):
+        for field in _find_elements(part, "first_line", "first_sample", "height_pixels", "width_pixels"):
+            if _element_text(field) not in ("", "1"):
+                name = f"{_local_name(part)}.{_local_name(field)}"
+                raise source.error(name, f"{_element_text(field)}: {SUBFRAME}", "1, or subframe_folded_in = true")
 
 
 def _read_systems(root: ElementTree.Element, source: Source) -> tuple[list[CoordinateSystem], dict[str, LabelFrame]]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from marsyard.sim.camera.base import CameraModel, Number
-from marsyard.sim.camera.models import Cahv, Cahvor, Cahvore
+from marsyard.sim.camera.cahvore import Cahvore
+from marsyard.sim.camera.models import Cahv, Cahvor
 from marsyard.sim.files import open_regular
 
 #: Maximum size of a camera file; some labels have several megabytes.
@@ -20,6 +21,8 @@ FORMATS = (
     f"a PDS3 or PDS4 label, a JPL text file (Model = CAHVOR, ...), {CALIBRATION_FILES}, COLMAP's cameras.txt, or a "
     "pinhole model of Ames Stereo Pipeline (.tsai)"
 )
+#: End of the message for images that are refused by default.
+SUBFRAME = "of a part of the detector or of averaged pixels"
 #: Names of the models; each letter of a name is the name of one of the model's vectors.
 MODELS = ("CAHV", "CAHVOR", "CAHVORE")
 

@@ -22,7 +22,8 @@ from jaxtyping import Float64
 from pydantic import Field
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.sim.dynamics.rover import DrivenGround, RoverParameters, Stance, settle
+from marsyard.sim.dynamics.driven_ground import DrivenGround
+from marsyard.sim.dynamics.rover import RoverParameters, Stance, settle
 from marsyard.sim.error_sources import SLIP
 from marsyard.sim.frames import compose, rotation_matrix
 from marsyard.sim.measurements import DriveCommand

@@ -122,7 +122,7 @@ class Modes:
         rigid_first, rigid_second = p._moments(p.line_length_m + p.mass_centre_m)
         rigid_second += inertia
         length = rigid_second / rigid_first
-        # kappa = a + 2 ratio V omega and kappa = l omega^2: see the docstring of this module
+        # kappa = a + 2 ratio V omega and kappa = l omega^2: see the docstring of `swing`
         damping = p.cone_damping_ratio * p.descent_rate_m_s
         cone = (damping + np.sqrt(damping**2 + support * length)) / length
         normal = (mass - rigid_first**2 / rigid_second) * length * cone**2

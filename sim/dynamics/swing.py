@@ -64,6 +64,8 @@ BELOW_FIRING_M = 90.0
 MAX_LEAD_S = 30.0
 #: Relative and absolute tolerance of the integration: finite differences of the flight equal its derivatives to 1e-6.
 TOLERANCE = 1e-9
+#: Tolerance of the time at which an altitude is passed: 0.1 um at 100 m/s.
+_ALTITUDE_TIME_TOLERANCE_S = 1e-9
 #: Unit vector downwards, world axes.
 DOWN = np.array([0.0, 0.0, -1.0])
 
@@ -81,9 +83,9 @@ class DescentPath:
     ) -> DescentPath:
         """Integrate from a state at time 0: back by `lead_s`, and forward until `event` is zero or for `max_s`.
 
-        `constants` are from `kernels.pack_constants`. Raises ValueError if the integration fails.
+        `event` has the attribute `terminal` of SciPy's events. `constants` are from `kernels.pack_constants`. Raises
+        ValueError if the integration fails.
         """
-        event.terminal = True  # type: ignore[attr-defined]
         solutions = []
         for end_s, events in ((-lead_s, None), (max_s, (event,))):
             solution = pysolve_ivp(
@@ -147,8 +149,8 @@ class SwingDescent(Trajectory):
         rng: np.random.Generator,
         *,
         ground_height_m: float,
-        gravity_m_s2: float = 3.72,
-        lead_s: float = 10.0,
+        gravity_m_s2: float,
+        lead_s: float,
     ) -> SwingDescent:
         """Simulate from `lead_s` before the first image until more than a second after the thrusters' firing.
 
@@ -176,6 +178,8 @@ class SwingDescent(Trajectory):
         def remaining_height(_t: float, y: StateVector, *_constants: Float64[np.ndarray, "..."]) -> float:
             return _compute_camera_height(y, chain) - firing_m + BELOW_FIRING_M
 
+        remaining_height.terminal = True  # type: ignore[attr-defined]
+        # the fall takes about this height / rate; three times as long ends a flight that does not fall
         max_s = 3.0 * (start_m[2] - ground_height_m) / p.descent_rate_m_s
         path = DescentPath.integrate(state, lead_s, max_s, remaining_height, kernels.pack_constants(chain, wind.field))
         return cls(p, start_m, wind, ground_height_m, chain, path)
@@ -206,7 +210,7 @@ class SwingDescent(Trajectory):
         if not height_above(last) <= 0.0 <= height_above(first):
             highest, lowest = altitude_m + height_above(first), altitude_m + height_above(last)
             raise ValueError(f"altitude {altitude_m:.6g} m is not passed; allowed: {lowest:.6g} to {highest:.6g} m")
-        return float(brentq(height_above, first, last, xtol=1e-9))
+        return float(brentq(height_above, first, last, xtol=_ALTITUDE_TIME_TOLERANCE_S))
 
     @cached_property
     def thruster_firing_s(self) -> float:

@@ -20,9 +20,10 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.sim.error_sources import ACCELERATION, ATTITUDE
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.sensor.imu import Imu, Vector, Vectors, multiply_quaternions
+from marsyard.sim.quaternions import multiply_quaternions
+from marsyard.sim.sensor.imu import Imu
 from marsyard.sim.sensor.inertial import NavigationErrors
-from marsyard.sim.sensor.instrument import Times
+from marsyard.sim.sensor.instrument import Times, Vector, Vectors
 
 #: Propagation steps per second: at 2 rpm the relative error of the midpoint rule over the spin is 5e-5.
 STEPS_PER_S = 5.0

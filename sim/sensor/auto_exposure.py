@@ -12,6 +12,10 @@ from marsyard.sim.parameters import Parameters
 from marsyard.sim.sensor.detector import MAX_EXPOSURE_S, Detector
 from marsyard.sim.sensor.optics import Image
 
+#: Assumed: smallest and largest factor of the exposure time after a test image; the factor after a saturated one, whose
+#: brightness is unknown; and the fraction of full scale or full well from which the percentile is saturated.
+_FACTOR_LIMITS, _SATURATED_FACTOR, _SATURATED_FRACTION = (0.125, 8.0), 0.25, 0.99
+
 
 class AutoExposureParameters(Parameters):
     """Auto-exposure by a percentile of the counts, as on the MER rovers (Maki et al. 2003); the numbers are assumed."""
@@ -67,8 +71,8 @@ def auto_expose(
         counts = test_detector.expose(radiance, rng)
         level = float(np.percentile(counts, parameters.percentile))
         signal = max(level - p.offset_dn, 1.0)
-        factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, 0.125, 8.0))
-        factor = 0.25 if level >= 0.99 * saturation else factor
+        factor = float(np.clip((parameters.target * saturation - p.offset_dn) / signal, *_FACTOR_LIMITS))
+        factor = _SATURATED_FACTOR if level >= _SATURATED_FRACTION * saturation else factor
         converged = abs(factor - 1.0) <= parameters.tolerance
         next_exposure = float(np.clip(exposure * factor, parameters.min_exposure_s, parameters.max_exposure_s))
         if converged or next_exposure == exposure:

@@ -19,14 +19,8 @@ from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.measurements import DetectorCalibration
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive
 from marsyard.sim.sensor.companding import Counts, compand, expand
-from marsyard.sim.sensor.optics import (
-    Image,
-    ImageMotion,
-    OpticsParameters,
-    apply_point_spread,
-    dust_transmission,
-    moving_exposure,
-)
+from marsyard.sim.sensor.image_motion import ImageMotion, moving_exposure
+from marsyard.sim.sensor.optics import Image, OpticsParameters, apply_point_spread, dust_transmission
 
 #: Charge, electrons, from which `add_noise` draws both noises together.
 MIN_COMMON_E = 100.0
@@ -62,7 +56,7 @@ class DetectorParameters(Parameters):
     """A frame-transfer detector without mechanical shutter. Defaults: the MER descent camera as flown.
 
     Full well, gain, read noise and readout rate: Maki et al. 2003. Responsivity and dark current are calibrated (see
-    `marsyard.sim.sensor.optics`). The clearing time is assumed. The pattern `residual_spread` is no default.
+    `marsyard.sim.sensor.radiometry`). The clearing time is assumed. The pattern `residual_spread` is no default.
     """
 
     exposure_s: Annotated[float, Field(gt=0.0, le=MAX_EXPOSURE_S, description="exposure time, s")] = 0.004

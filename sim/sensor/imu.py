@@ -24,16 +24,14 @@ from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.error_sources import ACCELERATION, ATTITUDE
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import NonNegative, Parameters, Positive
-from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Times
+from marsyard.sim.quaternions import multiply_quaternions
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, GaussMarkov, Times, Vector, Vectors
 
 STANDARD_GRAVITY_M_S2 = 9.80665  #: Standard gravity, the unit of accelerometer specifications.
 MILLI_G = 1e-3 * STANDARD_GRAVITY_M_S2  #: 1 mg in m/s2.
 DEG_H = np.radians(1.0) / 3600.0  #: 1 deg/h in rad/s.
 DEG_SQRT_H = np.radians(1.0) / 60.0  #: 1 deg/sqrt(h) in rad/sqrt(s).
-Vector = Float64[np.ndarray, "3"]
-Vectors = Float64[np.ndarray, "n 3"]
 Boundaries = Float64[np.ndarray, "m"]
-Quaternions = Float64[np.ndarray, "n 4"]  #: In the order x, y, z, w.
 
 
 class WarmUp(Parameters):
@@ -249,29 +247,3 @@ def true_increments(trajectory: Trajectory, boundaries_s: Boundaries) -> tuple[V
     start_inverse = motion.attitudes[:-1].inv()
     rotations = Rotation.from_quat(multiply_quaternions(start_inverse.as_quat(), motion.attitudes[1:].as_quat()))
     return rotations.as_rotvec(), start_inverse.apply(velocity_increments)
-
-
-def multiply_quaternions(left: Quaternions, right: Quaternions) -> Quaternions:
-    """Multiply quaternions (x, y, z, w) pairwise, faster than `Rotation`; the right rotation is applied first."""
-    ax, ay, az, aw = left.T
-    bx, by, bz, bw = right.T
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by + ay * bw + az * bx - ax * bz
-    z = aw * bz + az * bw + ax * by - ay * bx
-    return np.stack([x, y, z, aw * bw - ax * bx - ay * by - az * bz], axis=1)
-
-
-def accumulate_quaternions(steps: Quaternions) -> Quaternions:
-    """Compute the products of the first 1, 2, ... n quaternions; each step multiplies from the right.
-
-    Recursion: the cumulative products of pairs are every second result; the others require one more product each.
-    """
-    count = len(steps)
-    if count == 1:
-        return steps
-    pair_products = accumulate_quaternions(multiply_quaternions(steps[: count - 1 : 2], steps[1::2]))
-    cumulative = np.empty((count, 4))
-    cumulative[0] = steps[0]
-    cumulative[1::2] = pair_products
-    cumulative[2::2] = multiply_quaternions(pair_products[: (count - 1) // 2], steps[2::2])
-    return cumulative

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.measurements import ImuIncrements
-from marsyard.sim.sensor.imu import Vector, Vectors, accumulate_quaternions
-from marsyard.sim.sensor.instrument import Times
+from marsyard.sim.quaternions import accumulate_quaternions
+from marsyard.sim.sensor.instrument import Times, Vector, Vectors
 
 
 @dataclass(frozen=True)

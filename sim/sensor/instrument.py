@@ -19,6 +19,8 @@ from marsyard.sim.parameters import Parameters
 KNOTS_PER_CORRELATION = 50
 _Deviation = Annotated[float, Field(ge=0.0, le=10.0)]
 Times = Float64[np.ndarray, "n"]  #: One time per row, seconds.
+Vector = Float64[np.ndarray, "3"]
+Vectors = Float64[np.ndarray, "n 3"]  #: One vector per row.
 
 
 @dataclass(frozen=True)

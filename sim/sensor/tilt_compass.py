@@ -19,8 +19,7 @@ from pydantic import Field
 from marsyard.sim.dynamics import Trajectory
 from marsyard.sim.error_sources import COMPASS
 from marsyard.sim.parameters import NonNegative, Parameters
-from marsyard.sim.sensor.imu import Vectors
-from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling, Times
+from marsyard.sim.sensor.instrument import Clock, ClockParameters, Sampling, Times, Vectors
 
 Degrees = Annotated[NonNegative, Field(le=90.0)]
 LAG_STEPS_PER_S = 100.0  #: Steps of the lag filter per second: twenty per default time constant.

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.binning import BinnedView, build_view
 from marsyard.algorithms.dimes.details import DimesTrack, PairDetails
 from marsyard.algorithms.dimes.estimator import combine_pairs
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.propagation import propagate_velocity
 from marsyard.algorithms.dimes.validity import (
     TrackMetrics,
     ValidityCheck,
     failed_checks,
-    propagate_velocity,
     rank_combinations,
     track_metrics,
 )
-from marsyard.algorithms.image.correlation import Peak
+from marsyard.algorithms.dimes.views import BinnedView, build_view
+from marsyard.algorithms.image.peaks import Peak
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.sim.measurements import DetectorImage
 from tests.algorithms.synthetic_descent import CAMERA, ROWS_SUMMED, make_calibration, valid_velocity

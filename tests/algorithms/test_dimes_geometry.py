@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.dimes import binning, ground_view, overlap, rectification
+from marsyard.algorithms.dimes import ground_view, overlap, rectification
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.views import BinnedView, build_view
+from marsyard.algorithms.dimes.zero_phase import zero_phase_pixel
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage
@@ -31,24 +33,22 @@ SUN_BELOW_HORIZON = direction(0.0, -1.0)
 
 def make_view(
     attitude: Rotation, altitude_m: float, time_s: float = 0.0, counts: np.ndarray | None = None
-) -> binning.BinnedView:
+) -> BinnedView:
     """Create a view of level ground; its image is uniform unless `counts` are given."""
     image = np.full((256, 1024), 1000, dtype=np.uint16) if counts is None else counts
-    return binning.build_view(
+    return build_view(
         DetectorImage(image, time_s, CAMERA.bin(1, ROWS_SUMMED), make_calibration()), attitude, altitude_m, (256, 256)
     )
 
 
 def make_views(
     first: Rotation, second: Rotation, altitudes: tuple[float, float] = (2000.0, 1719.0)
-) -> tuple[binning.BinnedView, binning.BinnedView]:
+) -> tuple[BinnedView, BinnedView]:
     """Create two views with these attitudes; the default altitudes differ by 75 m/s in 3.75 s."""
     return make_view(first, altitudes[0]), make_view(second, altitudes[1], INTERVAL_S)
 
 
-def find_candidates(
-    first: binning.BinnedView, second: binning.BinnedView, sun: np.ndarray = SUN_BELOW_HORIZON
-) -> overlap.Candidates:
+def find_candidates(first: BinnedView, second: BinnedView, sun: np.ndarray = SUN_BELOW_HORIZON) -> overlap.Candidates:
     """Find the template candidates of a pair."""
     return overlap.template_candidates(first, second, overlap.search_geometry(first, second, OPTIONS), sun, OPTIONS)
 
@@ -81,7 +81,7 @@ def test_camera_is_above_origin_for_any_mounting_position() -> None:
     lever_arm_m = np.array([0.5, -1.0, -2.0])
     camera = CAMERA.bin(1, ROWS_SUMMED).transform(RigidTransform.from_translation(lever_arm_m))
     image = DetectorImage(np.zeros((256, 1024), dtype=np.uint16), 0.0, camera, make_calibration())
-    view = binning.build_view(image, attitude, 1400.0, (256, 256))
+    view = build_view(image, attitude, 1400.0, (256, 256))
     np.testing.assert_allclose(view.camera.c, view.centre, atol=1e-9)
     np.testing.assert_allclose(view.centre, [0.0, 0.0, 1400.0 + attitude.apply(lever_arm_m)[2]], atol=1e-9)
 
@@ -216,9 +216,9 @@ def test_zero_phase_pixel_is_at_the_lander_shadow() -> None:
     shadow = np.array([[-2000.0 / np.tan(np.radians(60.0)), 0.0]])
     # A direction and a ground point along it project to the same pixel, except for rounding at distances of 1e7 m.
     np.testing.assert_allclose(
-        overlap.zero_phase_pixel(view, sun), ground_view.pixels_from_ground(view, shadow)[0][0], atol=1e-3
+        zero_phase_pixel(view, sun), ground_view.pixels_from_ground(view, shadow)[0][0], atol=1e-3
     )
-    assert np.all(np.isnan(overlap.zero_phase_pixel(view, -sun)))
+    assert np.all(np.isnan(zero_phase_pixel(view, -sun)))
 
 
 def test_templates_and_windows_avoid_zero_phase_spot() -> None:

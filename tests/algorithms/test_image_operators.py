@@ -8,15 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from marsyard.algorithms.image.correlation import (
-    Peak,
-    biquadratic_offset,
-    highest_peak,
-    peak_width,
-    pseudo_normalized_correlation,
-    second_peak,
-)
+from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
+from marsyard.algorithms.image.peaks import Peak, biquadratic_offset, highest_peak, peak_width, second_peak
 
 
 def correlate_directly(template: np.ndarray, window: np.ndarray) -> np.ndarray:

@@ -5,7 +5,8 @@ import time
 
 import pytest
 
-from marsyard.algorithms.processes import AwakeClock, processor_time_s
+from marsyard.algorithms.awake_clock import AwakeClock
+from marsyard.algorithms.processes import processor_time_s
 
 
 def test_suspension_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """Tests of the limit states with a known change to FAIL."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -45,7 +45,7 @@ from marsyard.scenarios.meshes import MeshFileError, read_mesh
 from marsyard.scenarios.offline_algorithms import VELOCITY_FORMAT, read_answers
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.sim.camera import CameraFileError, read_cameras
-from marsyard.sim.dynamics.recorded import COLUMNS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.pose_files import COLUMNS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
 from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 from tests.campaigns.fake_campaign import REQUIREMENT, TOP_LEVEL_KEYS

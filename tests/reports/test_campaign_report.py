@@ -13,11 +13,11 @@ import pytest
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.execution.executors import ExecutorConfig
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.machine import describe_machine
 from marsyard.reports.campaign import write_report
 from marsyard.reports.page import script_hash
 from marsyard.reports.report_file import SCHEMA
-from marsyard.sim.cache import hide_folders
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 
 VOID_ELEMENTS = {"meta", "link", "br", "img", "input", "hr", "path", "use", "circle", "line", "rect"}

@@ -21,7 +21,7 @@ from marsyard.scenarios.meshes import MAX_BYTES, MeshFileError, read_mesh
 from marsyard.scenarios.offline_algorithms import VELOCITY_FORMAT, read_answers
 from marsyard.scenarios.terrain_files import check_source
 from marsyard.sim.camera import read_cameras
-from marsyard.sim.dynamics.recorded import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.pose_files import COLUMNS, MAX_ROWS, TrajectoryFileError, read_poses
 from marsyard.sim.sensor import read_datasheet
 from marsyard.sim.terrain.rasters import RealTerrain
 

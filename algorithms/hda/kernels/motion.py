@@ -17,6 +17,10 @@ START_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-3, 1e-12, 1e12
 #: Regularisation added to the Hessian diagonal of each inverse depth, as a fraction of the squared focal length. It
 #: keeps inverse depths fixed that are not observable because the camera does not move.
 DEPTH_CURVATURE = 1e-14
+#: The same for rotation and translation.
+MOTION_CURVATURE = 1e-15
+#: Smallest component along the optical axis of a projected feature; below it the feature is behind the camera.
+MIN_FORWARD = 1e-6
 
 
 class MatchArrays(NamedTuple):
@@ -79,7 +83,7 @@ def residuals(matches: MatchArrays, motion: MotionArrays) -> Array:
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] + rho * t[0]
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] + rho * t[1]
         pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] + rho * t[2]
-        if pz <= 1e-6:
+        if pz <= MIN_FORWARD:
             result[i, 0] = result[i, 1] = math.inf
             continue
         result[i, 0] = focal * (px / pz - second[i, 0])
@@ -155,7 +159,7 @@ def _compute_step(
                 S[a, b] -= mixed[i, a] * mixed[i, b] * inverse_curvature
     # damping, and a small regularisation of unknowns that are not observable
     for a in range(6):
-        S[a, a] += damping * diagonal[a] + 1e-15 * focal**2
+        S[a, a] += damping * diagonal[a] + MOTION_CURVATURE * focal**2
     step, depth_steps = np.full(6, math.nan), np.zeros(n)
     if np.all(np.isfinite(S)) and np.all(np.isfinite(g)):
         step = -np.linalg.solve(S, g)
@@ -168,18 +172,18 @@ def _compute_step(
 @njit(cache=True)
 def solve(
     matches: MatchArrays, start: MotionArrays, with_depths: bool, iterations: int, tolerance: float
-) -> tuple[MotionArrays, float, bool, int]:
+) -> tuple[MotionArrays, float, bool]:
     """Minimise Cauchy's cost from the motion `start`; inverse depths have the inverse unit of the translation.
 
-    Returns the motion with inverse depths, its cost, whether the iteration converged, and the number of steps. The
-    iteration converges if the norm of the step of rotation (radians) and translation is below `tolerance`. With
-    `with_depths` the inverse depths are estimated; otherwise they are fixed.
+    Returns the motion with inverse depths, its cost, and whether the iteration converged: whether the norm of the step
+    of rotation (radians) and translation is below `tolerance`. With `with_depths` the inverse depths are estimated;
+    otherwise they are fixed.
     """
     motion = start
     r = residuals(matches, motion)
     cost = cauchy_cost(r, matches.scale)
     damping = START_DAMPING
-    for iteration in range(iterations):
+    for _ in range(iterations):
         step, depth_steps = _compute_step(matches, r, motion, damping, with_depths)
         trial = MotionArrays(
             rotate_quaternion(motion.q, step[:3]), motion.t + step[3:], motion.inverse_depths + depth_steps
@@ -191,11 +195,11 @@ def solve(
             motion, r, cost = trial, new_r, new_cost
             damping = max(damping * 0.1, MIN_DAMPING)
             if step_length < tolerance:
-                return motion, cost, True, iteration + 1
+                return motion, cost, True
         elif step_length < tolerance:
-            return motion, cost, True, iteration + 1
+            return motion, cost, True
         else:
             damping *= 10.0
             if damping > MAX_DAMPING:
-                return motion, cost, False, iteration + 1
-    return motion, cost, False, iterations
+                return motion, cost, False
+    return motion, cost, False

@@ -4,8 +4,6 @@ Both images are resampled to one grid on level ground, around the position that 
 Each template of the earlier image is correlated with the later image. The maximum of the correlation is a match.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions, Matches
-from marsyard.algorithms.hda.motion import LandingScene, apply_flat_field, build_scene, project_points
 from marsyard.algorithms.hda.preparation import MEAN_WINDOW_PX, filter_view, resample_second
+from marsyard.algorithms.hda.scene import LandingScene, apply_flat_field, build_scene, project_points
 from marsyard.algorithms.hda.structure import dense_structure
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DetectorImage

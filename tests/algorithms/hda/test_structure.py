@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, HdaEstimator, HdaOptions, MatchStatus
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import CameraMotion, LandingScene, build_scene, undistort
+from marsyard.algorithms.hda.motion import CameraMotion
+from marsyard.algorithms.hda.scene import LandingScene, build_scene, undistort
 from marsyard.algorithms.hda.structure import (
     clip_to_image,
     dense_structure,

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaOptions, TrackSeed
 from marsyard.algorithms.hda.kernels import matching
-from marsyard.algorithms.hda.motion import CameraView
+from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.hda.tracking import (
     LevelSize,
     eigenvalue_test,
@@ -19,7 +19,8 @@ from marsyard.algorithms.hda.tracking import (
     track_features,
     window_half_px,
 )
-from marsyard.algorithms.image.correlation import biquadratic_offset, highest_peak, pseudo_normalized_correlation
+from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
+from marsyard.algorithms.image.peaks import biquadratic_offset, highest_peak
 from marsyard.sim.frames import rigid
 from tests.algorithms.hda.relief_scene import Pass, make_bumps, make_camera, make_plane, make_pose, render_image
 

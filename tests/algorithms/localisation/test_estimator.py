@@ -84,9 +84,7 @@ class Stages:
         found = visible & camera.in_frame(pixels) & is_found
         points, pixels = points[found], pixels[found]
         count, zero = len(points), np.zeros(3)
-        return LandmarkMatches(
-            np.arange(count), points, pixels, pixels, np.ones(count), np.zeros((count, 2)), 1, 49, count, zero, zero
-        )
+        return LandmarkMatches(points, pixels, np.ones(count), np.zeros((count, 2)), 1, 49, count, zero, zero)
 
 
 @pytest.fixture

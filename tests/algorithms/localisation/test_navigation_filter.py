@@ -10,8 +10,10 @@ from scipy.stats import chi2
 
 from marsyard.algorithms.localisation import inertial_state as inertial
 from marsyard.algorithms.localisation import state_updates as updates
-from marsyard.algorithms.localisation.inertial_state import ImuErrorModel, IncrementHistory, NavigationState
+from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
+from marsyard.algorithms.localisation.inertial_state import IncrementHistory, NavigationState
 from marsyard.algorithms.localisation.interface import InitialState
+from marsyard.algorithms.localisation.matrices import left_jacobian
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.algorithms.localisation.state_updates import UpdateOutcome
 from marsyard.sim.camera import Cahvore, mount_looking_down
@@ -257,7 +259,7 @@ def test_updates_of_position_and_altitude_are_those_of_a_kalman_filter(truth: De
         joseph = reduced @ prior.covariance @ reduced.T + gain @ covariance @ gain.T
         errors = gain @ residual
         reset = np.eye(15)
-        reset[6:9, 6:9] = inertial.left_jacobian(errors[6:9])
+        reset[6:9, 6:9] = left_jacobian(errors[6:9])
         deviations = np.sqrt(np.diag(joseph))
         difference = (posterior.covariance - reset @ joseph @ reset.T) / np.outer(deviations, deviations)
         assert np.abs(difference).max() < 1e-9
@@ -271,7 +273,7 @@ def test_left_jacobian_is_the_derivative_of_a_composed_rotation() -> None:
     rotation, rest = np.array([0.02, -0.03, 0.01]), np.array([1e-6, 2e-6, -3e-6])
     total = Rotation.from_rotvec(rotation + rest) * Rotation.from_rotvec(rotation).inv()
     # third order of the series: |d|^3 / 24, relative
-    np.testing.assert_allclose(total.as_rotvec(), inertial.left_jacobian(rotation) @ rest, atol=3e-6 * 2.2e-6)
+    np.testing.assert_allclose(total.as_rotvec(), left_jacobian(rotation) @ rest, atol=3e-6 * 2.2e-6)
 
 
 @pytest.mark.parametrize("pending", [False, True])

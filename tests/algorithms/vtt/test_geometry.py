@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.vtt.matching import (
+from marsyard.algorithms.vtt.options import VttOptions
+from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, frame_centre, mast_angles
+from marsyard.algorithms.vtt.prediction import (
     bearing_rad,
     designated_position_world,
     horizontal_axis,
@@ -15,8 +17,6 @@ from marsyard.algorithms.vtt.matching import (
     roll_angle,
     roll_points,
 )
-from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.pointing import aim_at_pixel, aim_at_position, image_centre, mast_angles
 from marsyard.algorithms.vtt.stereo import disparity_px_m, epipolar_pixels, search_ranges, triangulate
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import rigid
@@ -101,7 +101,7 @@ def test_pointing_centres_the_target(mast: MastCalibration) -> None:
         angles = mast_angles(target, mast)
         assert angles is not None
         target_in_head = mast.geometry.rover_from_head(*angles).inv().apply(target)
-        np.testing.assert_allclose(mast.left.project(target_in_head)[0], image_centre(mast.left), atol=1e-4)
+        np.testing.assert_allclose(mast.left.project(target_in_head)[0], frame_centre(mast.left), atol=1e-4)
 
 
 def test_pointing_a_pair_splits_the_disparity() -> None:
@@ -110,7 +110,7 @@ def test_pointing_a_pair_splits_the_disparity() -> None:
         angles = mast_angles(target, mast, use_both=True)
         assert angles is not None
         target_head = mast.geometry.rover_from_head(*angles).inv().apply(target)
-        left, right = (camera.project(target_head)[0] - image_centre(camera) for camera in (mast.left, mast.right))
+        left, right = (camera.project(target_head)[0] - frame_centre(camera) for camera in (mast.left, mast.right))
         np.testing.assert_allclose(left + right, 0.0, atol=1e-4)
         distance = float(np.linalg.norm(target_head))
         # The disparity is f B / R to second order in the small angles.
@@ -183,7 +183,7 @@ def test_image_roll_is_opposite_to_camera_roll(roll_deg: float) -> None:
     camera = navcam().left
     # The head rolls clockwise about its line of sight (+x forward): the image rolls counter-clockwise.
     roll_motion = rigid(Rotation.from_rotvec(np.deg2rad(roll_deg) * camera.a), np.zeros(3))
-    target = camera.c + 5.0 * camera.rays(image_centre(camera))[1]
+    target = camera.c + 5.0 * camera.rays(frame_centre(camera))[1]
     points = roll_points(target, camera, camera, roll_motion.inv(), 0.05)
     assert points is not None
     roll = roll_angle(points)

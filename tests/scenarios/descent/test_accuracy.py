@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesTrack
-from marsyard.algorithms.dimes.binning import altitudes_at_images
+from marsyard.algorithms.dimes.views import altitudes_at_images
 from marsyard.scenarios.descent.flight import create_flight, mean_velocities, states_at_images
 from marsyard.scenarios.descent.images import camera_optics, take_exposures
 from marsyard.scenarios.descent.measurement import DescentInstruments, measure

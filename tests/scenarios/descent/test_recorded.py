@@ -13,7 +13,7 @@ from marsyard.scenarios.descent.flight import create_flight
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import FlightFile
 from marsyard.scenarios.descent.world import DescentWorld
-from marsyard.sim.dynamics.recorded import COLUMNS
+from marsyard.sim.dynamics.pose_files import COLUMNS
 from marsyard.sim.streams import Streams
 from tests.scenarios.descent.descents import make_parameters, run_descent
 

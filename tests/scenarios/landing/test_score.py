@@ -11,7 +11,7 @@ from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety
 from marsyard.algorithms.hda.details import MappedGround
 from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.hazards import HazardMaps
-from marsyard.algorithms.hda.motion import CameraView
+from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics

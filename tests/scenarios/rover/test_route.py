@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.vtt import matching
+from marsyard.algorithms.vtt import prediction
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.rover import closed_loop as closed_loop
@@ -125,10 +125,10 @@ def test_drive_past_the_target_rolls_the_image_by_30_deg_in_few_steps() -> None:
         positions.append(np.asarray(heads[-1].inv().apply(target_world.copy())))
 
     def compute_roll_deg(first: int, second: int) -> float:
-        new_from_old: RigidTransform = matching.pose_change(heads[first], heads[second])
-        points = matching.roll_points(positions[first], mast.left, mast.left, new_from_old, 0.05)
+        new_from_old: RigidTransform = prediction.pose_change(heads[first], heads[second])
+        points = prediction.roll_points(positions[first], mast.left, mast.left, new_from_old, 0.05)
         assert points is not None
-        return abs(float(np.degrees(matching.roll_angle(points))))
+        return abs(float(np.degrees(prediction.roll_angle(points))))
 
     assert compute_roll_deg(0, len(steps_m)) == pytest.approx(30.0, abs=4.0)
     rolls_deg = [compute_roll_deg(*pair) for pair in pairwise(range(len(heads)))]

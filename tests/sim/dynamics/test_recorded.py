@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.dynamics import Trajectory
-from marsyard.sim.dynamics.recorded import COLUMNS, RecordedMotion, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.pose_files import COLUMNS, TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.recorded import RecordedMotion
 from tests.sim.sensor.motions import GRAVITY, Swaying, assert_derivatives
 
 #: The first two poses of freiburg1_xyz of the TUM RGB-D benchmark (Sturm et al. 2012), repeated after one second.

@@ -6,16 +6,8 @@ import trimesh
 from jaxtyping import Float64
 from pydantic import ValidationError
 
-from marsyard.sim.dynamics.rover import (
-    MER,
-    ROCKY_8,
-    WHEELS,
-    DrivenGround,
-    RockyGround,
-    RoverParameters,
-    compute_wheel_centres,
-    settle,
-)
+from marsyard.sim.dynamics.driven_ground import DrivenGround, RockyGround
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, WHEELS, RoverParameters, compute_wheel_centres, settle
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
 

@@ -9,7 +9,7 @@ import pytest
 import spiceypy
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.dynamics.recorded import TrajectoryFileError, read_poses
+from marsyard.sim.dynamics.pose_files import TrajectoryFileError, read_poses
 
 #: NAIF identifiers of bodies and of frames.
 LANDER, SITE, MARS = -999, 399999, 499

@@ -41,11 +41,9 @@ LARGE_MOTION = {
 }
 
 
-def _fly(seed: int = 1, /, **parameters: Any) -> SwingDescent:
-    rng = np.random.default_rng(seed)
-    return SwingDescent.simulate(
-        SwingParameters(**parameters), START, rng, ground_height_m=GROUND_M, gravity_m_s2=GRAVITY
-    )
+def _fly(seed: int = 1, start_m: np.ndarray = START, lead_s: float = 10.0, /, **parameters: Any) -> SwingDescent:
+    p, rng = SwingParameters(**parameters), np.random.default_rng(seed)
+    return SwingDescent.simulate(p, start_m, rng, ground_height_m=GROUND_M, gravity_m_s2=GRAVITY, lead_s=lead_s)
 
 
 def _compute_off_nadir_deg(descent: SwingDescent, times_s: np.ndarray) -> np.ndarray:
@@ -398,13 +396,11 @@ def test_error_messages_contain_the_allowed_values() -> None:
     with pytest.raises(ValueError, match=r"nod_rate_deg_s is 110; allowed: below \d+"):
         _fly(nod_rate_deg_s=110.0, mass_centre_m=0.2, gyration_transverse_m=1.0)
     with pytest.raises(ValueError, match=r"start_m is at z = 150\.0 m; allowed: above the thrusters' firing, 200\.0 m"):
-        SwingDescent.simulate(
-            SwingParameters(), np.array([0.0, 0.0, 150.0]), np.random.default_rng(0), ground_height_m=GROUND_M
-        )
+        _fly(1, np.array([0.0, 0.0, 150.0]))
     with pytest.raises(ValueError, match=r"gyration_transverse_m of 5 with mass_centre_m of 0\.1.*; allowed: nodding"):
         _fly(mass_centre_m=0.1, gyration_transverse_m=5.0, nod_rate_deg_s=0.0)
     with pytest.raises(ValueError, match="lead_s is 60; allowed: above 0, up to 30 s"):
-        SwingDescent.simulate(SwingParameters(), START, np.random.default_rng(0), ground_height_m=GROUND_M, lead_s=60.0)
+        _fly(1, START, 60.0)
     with pytest.raises(ValidationError, match="bridle_length_m is 60; allowed: up to line_length_m, 47"):
         SwingParameters(bridle_length_m=60.0)
 

@@ -7,7 +7,8 @@ import pytest
 from jaxtyping import Float64
 
 from marsyard.sim.dynamics import Motion, State
-from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuIncrements, ImuParameters, InertialSolution
+from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor import Approach, ApproachParameters, Imu, ImuParameters, InertialSolution
 from marsyard.sim.sensor.imu import true_increments
 from tests.sim.sensor.test_imu import make_parameters
 

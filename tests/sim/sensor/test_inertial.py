@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.sensor import Imu, ImuIncrements, ImuParameters, InertialSolution, NavigationErrors
+from marsyard.sim.measurements import ImuIncrements
+from marsyard.sim.sensor import Imu, ImuParameters, InertialSolution, NavigationErrors
 from marsyard.sim.sensor.imu import DEG_H
 from marsyard.sim.sensor.instrument import Clock, ClockParameters
 from tests.sim.sensor.motions import GRAVITY, Swaying

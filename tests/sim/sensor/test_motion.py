@@ -14,8 +14,8 @@ from marsyard.sim.render import Photometry, Scene, Sun, process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rays import PixelRays
 from marsyard.sim.sensor import ImageMotion, natural_fall_off
-from marsyard.sim.sensor.kernels import write_path_kernel
-from marsyard.sim.sensor.optics import moving_exposure
+from marsyard.sim.sensor.image_motion import moving_exposure
+from marsyard.sim.sensor.kernels.exposure import write_path_kernel
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from tests.sim.scenes import DOWN, FORWARD, descent_camera
 from tests.sim.sensor.motions import uniform_motion

@@ -16,11 +16,11 @@ from marsyard.sim.dynamics.rotorcraft import (
     TransitParameters,
     simulate_transit,
 )
+from marsyard.sim.sensor.helicopter_navigation import FilterParameters, NavigationFilter, NavigationSolution
 from marsyard.sim.sensor.imu import SMALL_UNIT, Imu, ImuParameters
 from marsyard.sim.sensor.instrument import ClockParameters
-from marsyard.sim.sensor.navigation import FilterParameters, NavigationFilter, NavigationSolution
-from marsyard.sim.sensor.navigation.kernels import POSITION_FIX, VELOCITY_FIX
-from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver
+from marsyard.sim.sensor.kernels.navigation import POSITION_FIX, VELOCITY_FIX
+from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters
 
 #: Gravity, m/s2; number of simulated flights.

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import RigidTransform
 
+from marsyard.sim.dynamics.driven_ground import DrivenGround
 from marsyard.sim.dynamics.driving import Drive, SlipParameters, Soil, drive
-from marsyard.sim.dynamics.rover import MER, DrivenGround, settle
+from marsyard.sim.dynamics.rover import MER, settle
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.sensor.odometry import EXACT, Odometer, OdometryParameters, PoseEstimate, VisualOdometryParameters
 from tests.sim.dynamics.grounds import NO_SLIP, Plane, uphill_east

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from marsyard.sim.sensor import AutoExposureParameters, Detector, DetectorParameters, auto_expose, preset
 from marsyard.sim.sensor.detector import dark_seconds, fill_bad_pixels
-from marsyard.sim.sensor.optics import DARK_E_S, DARKEST_RADIANCE_FACTOR, LightPath, solar_photons
+from marsyard.sim.sensor.radiometry import DARK_E_S, DARKEST_RADIANCE_FACTOR, LightPath, solar_photons
 
 FLIGHT_CAMERA, FIELD_CAMERA = preset("mer-descent-flown"), preset("mer-descent-field")
 

@@ -1,11 +1,9 @@
-"""Tests of the carrier-phase receiver, of clocks, and of the Gauss-Markov process of slowly varying errors."""
+"""Tests of the RTK receiver: errors, types of solution and outages."""
 
 import numpy as np
 import pytest
 
-from marsyard.sim.sensor import Clock, ClockParameters
-from marsyard.sim.sensor.instrument import GaussMarkov
-from marsyard.sim.sensor.satellite_navigation import Outage, RtkParameters, RtkReceiver, RtkSolutions
+from marsyard.sim.sensor.rtk import Outage, RtkParameters, RtkReceiver, RtkSolutions
 from tests.sim.sensor.motions import Swaying
 
 MOTION = Swaying(position_m=(10.0, 20.0, 30.0), velocity_m_s=(1.0, -0.5, 0.2), sway_m=1.0)
@@ -75,46 +73,3 @@ def test_outage_has_no_solutions() -> None:
 def test_too_short_fixed_solutions_are_rejected() -> None:
     with pytest.raises(ValueError, match="float_fraction"):
         RtkParameters(float_fraction=0.999, float_s=1.0)
-
-
-def test_clock_offset_is_common_and_jitter_is_independent() -> None:
-    parameters = ClockParameters(offset_s=0.1, offset_sd_s=0.02, jitter_sd_s=0.003)
-    offsets, jitters = [], []
-    for seed in range(400):
-        rng = np.random.default_rng(seed)
-        clock = Clock.draw(parameters, rng)
-        errors = clock.tags(np.array([1.0, 2.0]), rng) - [1.0, 2.0]
-        offsets.append(clock.offset_s)
-        jitters.append((errors[0] - errors[1]) / np.sqrt(2.0))
-        assert errors.mean() == pytest.approx(clock.offset_s, abs=0.015)
-    # The standard errors from 400 values are 3.5 % of the deviation and 0.001 s of the mean; tolerances are three times
-    # that.
-    assert np.mean(offsets) == pytest.approx(0.1, abs=0.003)
-    assert np.std(offsets) == pytest.approx(0.02, rel=0.11)
-    assert np.std(jitters) == pytest.approx(0.003, rel=0.11)
-
-
-def test_error_free_tags_are_exact() -> None:
-    rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(Clock.draw(ClockParameters(), rng).tags(np.array([1.5, 2.5]), rng), [1.5, 2.5])
-
-
-def test_process_is_stationary_from_the_start() -> None:
-    rng = np.random.default_rng(0)
-    process = GaussMarkov.draw(np.repeat([2.0, 5.0], 2000), 100.0, (-50.0, 250.0), rng)
-    early, later = process.at(np.array([-50.0])), process.at(np.array([50.0]))
-    # The standard errors from 2,000 channels are 1.6 % of the deviation and 0.02 of a correlation; tolerances are four
-    # times that.
-    for channels, sd in ((slice(0, 2000), 2.0), (slice(2000, 4000), 5.0)):
-        assert np.std(early[0, channels]) == pytest.approx(sd, rel=0.065)
-        assert np.std(later[0, channels]) == pytest.approx(sd, rel=0.065)
-        # The two times differ by one correlation time.
-        assert np.corrcoef(early[0, channels], later[0, channels])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.08)
-
-
-def test_process_rejects_times_outside_its_span() -> None:
-    process = GaussMarkov.draw(np.ones(3), 100.0, (0.0, 10.0), np.random.default_rng(0))
-    with pytest.raises(ValueError, match=r"outside the sampled errors, 0\.000 s"):
-        process.at(np.array([-1.0]))
-    with pytest.raises(ValueError, match="finite span"):
-        GaussMarkov.draw(np.ones(3), 100.0, (-np.inf, 10.0), np.random.default_rng(0))

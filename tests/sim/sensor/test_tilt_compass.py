@@ -1,10 +1,9 @@
-"""Tests of compass and inclinometers, and of quaternion products against SciPy's rotations."""
+"""Tests of compass and inclinometers."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.sensor.imu import accumulate_quaternions, multiply_quaternions
 from marsyard.sim.sensor.instrument import ClockParameters
 from marsyard.sim.sensor.tilt_compass import TiltCompass, TiltCompassParameters, TiltCompassReadings
 from tests.sim.sensor.motions import GRAVITY, Swaying
@@ -96,20 +95,3 @@ def test_stuck_instruments_repeat_their_last_reading() -> None:
     np.testing.assert_array_equal(stuck.headings_rad[:9], free.headings_rad[:9])
     np.testing.assert_array_equal(stuck.headings_rad[9:], free.headings_rad[8])
     np.testing.assert_array_equal(stuck.up_body[9:], np.tile(free.up_body[8], (7, 1)))
-
-
-def test_quaternion_products_match_rotations() -> None:
-    left, right = Rotation.random(50, rng=1), Rotation.random(50, rng=2)
-    product = Rotation.from_quat(multiply_quaternions(left.as_quat(), right.as_quat()))
-    np.testing.assert_allclose(product.as_matrix(), (left * right).as_matrix(), atol=1e-14)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 7, 8, 100])
-def test_accumulated_quaternions_equal_rotation_products(count: int) -> None:
-    steps = Rotation.random(count, rng=count)
-    product, expected = Rotation.identity(), []
-    for step in steps:
-        product = product * step
-        expected.append(product.as_matrix())
-    result = Rotation.from_quat(accumulate_quaternions(steps.as_quat()))
-    np.testing.assert_allclose(result.as_matrix(), expected, atol=1e-12)

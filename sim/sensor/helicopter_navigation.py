@@ -29,8 +29,8 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.parameters import Parameters, Positive
 from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, MILLI_G, STANDARD_GRAVITY_M_S2, ImuParameters
-from marsyard.sim.sensor.navigation import kernels
-from marsyard.sim.sensor.satellite_navigation import RtkParameters, RtkSolutions, SolutionErrors
+from marsyard.sim.sensor.kernels import navigation as kernels
+from marsyard.sim.sensor.rtk import RtkParameters, RtkSolutions, SolutionErrors
 from marsyard.sim.sensor.tilt_compass import TiltCompassParameters, TiltCompassReadings
 
 
@@ -184,7 +184,7 @@ class NavigationFilter:
         states, covariances, log = kernels.run(inputs, start.state, covariance, memory, tuning)
         blocks = [kernels.VELOCITY, kernels.QUATERNION, kernels.STATE_GYRO_BIAS, kernels.STATE_ACCELEROMETER_BIAS]
         positions, velocities, quaternions, gyro_biases, accelerometer_biases = np.split(states, blocks, axis=1)
-        kinds, axes = log[:, 1:3].astype(np.int64).T
+        kinds, axes = (log[:, column].astype(np.int64) for column in (kernels.LOG_TYPE, kernels.LOG_AXIS))
         return NavigationSolution(
             increments=increments,
             positions_m=positions,
@@ -194,7 +194,9 @@ class NavigationFilter:
             accelerometer_biases_m_s2=accelerometer_biases,
             covariance_indices=indices,
             covariances=covariances,
-            innovations=Innovations(log[:, 0], kinds, axes, log[:, 3], log[:, 4] == 1.0),
+            innovations=Innovations(
+                log[:, kernels.LOG_TIME], kinds, axes, log[:, kernels.LOG_NORMALISED], log[:, kernels.LOG_USED] == 1.0
+            ),
             end=FilterState(states[-1].copy(), covariance, memory),
         )
 

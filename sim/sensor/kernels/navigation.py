@@ -1,4 +1,4 @@
-"""Compiled error-state Kalman filter of `marsyard.sim.sensor.navigation`.
+"""Compiled error-state Kalman filter of `marsyard.sim.sensor.helicopter_navigation`.
 
 A state has 16 values: position, velocity, quaternion (x, y, z, w; world from body), gyro bias, accelerometer bias.
 Errors are true minus estimated; the attitude error is a rotation vector in world axes. The covariance is that of 15
@@ -32,7 +32,9 @@ POSITION_FIX, VELOCITY_FIX, COMPASS, INCLINOMETER = range(4)
 #: First indices in the filter's memory between runs, and its size: whether the last receiver solution was fixed (-1: no
 #: solution yet), filtered acceleration in world axes, and number of consecutive rejected solutions.
 LAST_FIX, FILTERED_ACCELERATION, REJECTED, MEMORY = 0, 1, 4, 5
-INNOVATION = 5  #: Number of columns of an innovation: time, type, axis, normalised innovation, whether it was used.
+#: Columns of a logged innovation: time, type, component of the reading, normalised innovation, whether it was used; and
+#: their number.
+LOG_TIME, LOG_TYPE, LOG_AXIS, LOG_NORMALISED, LOG_USED, LOG_COLUMNS = range(6)
 
 
 class Tuning(NamedTuple):
@@ -207,9 +209,9 @@ def update_scalar(estimate: Estimate, h: Array, residual: float, noise: float, g
     variance = noise * noise
     for i in range(ERRORS):
         variance += h[i] * ph[i]
-    log[3] = residual / math.sqrt(variance)
-    log[4] = 1.0 if abs(log[3]) < gate else 0.0
-    if log[4] == 0.0:
+    log[LOG_NORMALISED] = residual / math.sqrt(variance)
+    log[LOG_USED] = 1.0 if abs(log[LOG_NORMALISED]) < gate else 0.0
+    if log[LOG_USED] == 0.0:
         return
     # P - K h'P - P h K' + K s K', with K zero for considered errors
     for i in range(ERRORS):
@@ -269,13 +271,13 @@ def update_fix(row: Array, estimate: Estimate, change: Array, time: float, tunin
     for i in range(3):
         h[:] = 0.0
         h[POSITION + i], h[VELOCITY + i], h[POSITION_WANDER + i] = 1.0, row[TAG] - time, row[GPS_WANDER + i]
-        log[i, 0], log[i, 1], log[i, 2] = time, POSITION_FIX, i
+        log[i, LOG_TIME], log[i, LOG_TYPE], log[i, LOG_AXIS] = time, POSITION_FIX, i
         residual = row[GPS_POSITION + i] + change[i] - state[POSITION + i]
         update_scalar(estimate, h, residual, row[GPS_NOISE + i], tuning.gate, log[i])
     for i in range(3):
         h[:] = 0.0
         h[VELOCITY + i], h[VELOCITY_WANDER + i] = 1.0, 1.0
-        log[3 + i, 0], log[3 + i, 1], log[3 + i, 2] = time, VELOCITY_FIX, i
+        log[3 + i, LOG_TIME], log[3 + i, LOG_TYPE], log[3 + i, LOG_AXIS] = time, VELOCITY_FIX, i
         residual = row[GPS_VELOCITY + i] + change[3 + i] - state[VELOCITY + i]
         update_scalar(estimate, h, residual, tuning.velocity_noise_m_s[i], tuning.gate, log[3 + i])
 
@@ -293,7 +295,7 @@ def update_tilt(
         write_rotation_matrix(estimate.state[QUATERNION:], matrix)
         h[:] = 0.0
         h[ATTITUDE_ERROR], h[ATTITUDE_ERROR + 1], h[TILT_BIAS + i] = matrix[1, i], -matrix[0, i], 1.0
-        log[i, 0], log[i, 1], log[i, 2] = time, INCLINOMETER, i
+        log[i, LOG_TIME], log[i, LOG_TYPE], log[i, LOG_AXIS] = time, INCLINOMETER, i
         noise = math.hypot(tuning.tilt_noise_rad, disturbance_rad)
         update_scalar(estimate, h, row[UP + i] - matrix[2, i], noise, tuning.gate, log[i])
 
@@ -309,7 +311,7 @@ def update_heading(
     h[ATTITUDE_ERROR] = -matrix[2, 0] * matrix[0, 0] / horizontal
     h[ATTITUDE_ERROR + 1] = -matrix[2, 0] * matrix[1, 0] / horizontal
     h[ATTITUDE_ERROR + 2], h[HEADING_BIAS] = 1.0, 1.0
-    log[0, 0], log[0, 1], log[0, 2] = time, COMPASS, 0
+    log[0, LOG_TIME], log[0, LOG_TYPE], log[0, LOG_AXIS] = time, COMPASS, 0
     residual = row[YAW] - math.atan2(matrix[1, 0], matrix[0, 0])
     noise = math.hypot(tuning.heading_noise_rad, tuning.tan_dip * disturbance_rad)
     update_scalar(estimate, h, math.atan2(math.sin(residual), math.cos(residual)), noise, tuning.gate, log[0])
@@ -342,7 +344,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
     # position and velocity change since the start of the run, from the inertial unit only
     inertial = np.zeros((times.size, 6))
     covariances = np.empty((indices.size, ESTIMATED, ESTIMATED))
-    log = np.empty((6 * gps.shape[0] + 3 * compass.shape[0], INNOVATION))
+    log = np.empty((6 * gps.shape[0] + 3 * compass.shape[0], LOG_COLUMNS))
     log_count = next_fix = next_reading = covariance_count = 0
     states[0] = start
     for k in range(times.size):
@@ -367,7 +369,7 @@ def run(inputs: Inputs, start: Array, p: Array, memory: Array, tuning: Tuning) -
             if memory[REJECTED] >= tuning.max_rejected_fixes:
                 _restart(estimate, row, tuning)
             update_fix(row, estimate, fix_change, times[k], tuning, log[log_count : log_count + 6])
-            memory[REJECTED] = 0.0 if log[log_count : log_count + 6, 4].all() else memory[REJECTED] + 1.0
+            memory[REJECTED] = 0.0 if log[log_count : log_count + 6, LOG_USED].all() else memory[REJECTED] + 1.0
             log_count += 6
         east, north = memory[FILTERED_ACCELERATION], memory[FILTERED_ACCELERATION + 1]
         acceleration = math.sqrt(east**2 + north**2 + tuning.unmodelled_acceleration_m_s2**2)
