@@ -220,7 +220,7 @@ class Scene:
             )
         return Materials(
             RoughGround.of(self.relief),
-            PebbleField.of(self.pebbles) if self.pebbles is not None else None,
+            PebbleField.of(self.pebbles, self.surface) if self.pebbles is not None else None,
             self.ground_texture.octaves,
             self.object_texture.octaves,
             surfaces,

@@ -155,7 +155,8 @@ def shade(
     pebbles = None
     if materials.pebbles is not None:
         footprint = dr.select(is_ground, points.footprint, dr.inf)
-        pebbles = pebble_surface(materials.pebbles, points.position, footprint, Array3f(light.sun))
+        density = materials.pebbles.density_at(ground.albedo)
+        pebbles = pebble_surface(materials.pebbles, points.position, footprint, Array3f(light.sun), density)
         bump_x, bump_y = pebbles.normal.x / pebbles.normal.z, pebbles.normal.y / pebbles.normal.z
         bumped = Array3f(normal.x / normal.z + bump_x, normal.y / normal.z + bump_y, 1.0)
         normal = dr.select(is_ground, dr.normalize(bumped), normal)
