@@ -73,7 +73,7 @@ class PebbleField:
         """Copy pebbles to the device."""
         p, q = pebbles, pebbles.exponent
         octaves = max(math.ceil(math.log2(p.largest_m / p.smallest_m) - 1e-9), 1)
-        # mean square of the diameters of an octave, relative to the largest: their density is q D**-(q + 1) / (2**q - 1)
+        # mean square of the diameters of an octave relative to the largest, from their density q D**-(q+1) / (2**q - 1)
         excess = q - 2.0
         mean_square = (q * math.log(2.0) if excess == 0.0 else q * (2.0**excess - 1.0) / excess) / (2.0**q - 1.0)
         cell_coverage = 0.25 * math.pi * mean_square * _MEAN_AXIS_RATIO / CELL_DIAMETERS**2
@@ -232,7 +232,5 @@ def pebble_surface(
 
     state = (UInt32(0), Float64(pebbles.largest), Float(pebbles.probability), PebbleSurface.bare())
     return dr.while_loop(
-        state,
-        lambda octave, diameter, probability, total: (octave < pebbles.octaves) & (diameter > limit),
-        add_octave,
+        state, lambda octave, diameter, probability, total: (octave < pebbles.octaves) & (diameter > limit), add_octave
     )[3]
