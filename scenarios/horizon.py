@@ -1,70 +1,68 @@
-"""Distant hills, and occlusion of the ground at grazing view by rocks below the rendering resolution."""
+"""Relief on the horizon, and occlusion of the ground at grazing view by rocks below the rendering resolution."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from zlib import crc32
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from jaxtyping import Float64
+from numpy.random import Generator
 
-from marsyard.sim.render import Frame, Objects, Scene
+from marsyard.sim.render import Frame, Scene
 from marsyard.sim.render.objects import FIRST_MESH_NUMBER
-from marsyard.sim.terrain import RockField
+from marsyard.sim.render.skyline import Relief
+from marsyard.sim.terrain import RockField, Surface
 from marsyard.sim.terrain.sites import Hill
 
-#: Identifier of hills in `Objects.names`; identifiers of rocks are 0 or greater.
-HILL_NAME = -4
-#: Number of mesh lines of the hills in azimuth and in distance, and of azimuth lines per body.
-_AZIMUTHS, _DISTANCES, _LINES_PER_BODY = 1440, 64, 60
-#: Sizes of the ridges in lines of the mesh, and RMS height of the largest ridges relative to the hill's; assumed.
-_RIDGE_SIZES, _RIDGE_HEIGHT = (12.0, 6.0, 3.0), 0.25
-#: Minimum height of a face above the plain, metres, and albedo relative to the plain's; assumed.
-_MIN_FACE_HEIGHT_M, _HILL_ALBEDO = 1.0, 0.85
+#: Steps of azimuth around the horizon, and RMS irregularity of a hill's outline relative to its height (assumed).
+_AZIMUTHS, _IRREGULARITY = 8192, 0.25
+#: Swells of the plain: RMS height and distance, metres, and size, radians (assumed).
+_SWELL_M, _SWELL_DISTANCE_M, _SWELL_RAD = 4.0, 3000.0, 0.3
+#: Albedo of hills relative to the plain's; assumed.
+_HILL_ALBEDO = 0.85
 _MARS_RADIUS_M = 3.39e6
 #: Mean width of a rock's silhouette divided by its diameter and height: between an ellipse (pi/4) and a rectangle.
 _SILHOUETTE_FRACTION = 0.85
 
 
-def hill_objects(hills: Sequence[Hill], ground_m: float, albedo: float) -> Objects:
-    """Build the mesh of the hills around the origin of a site's terrain, without the part below the curved horizon.
+def horizon_relief(hills: Sequence[Hill], surface: Surface, extinction_m: float, albedo: float) -> Relief:
+    """Compute the relief on the horizon of a terrain: the hills of its site, in front of them the swells of the plain.
 
-    The hills are Gaussian domes with ridges of three sizes, on a mesh of lines of azimuth and distance; `ground_m` is
-    the mean height of the terrain, `albedo` that of the plain.
+    Hills are Gaussian domes with an irregular outline, lower by the curvature of the planet. Outlines and swells are
+    equal in all images of a terrain, and differ between terrains. `extinction_m` is that of the air at the ground,
+    `albedo` that of the plain.
     """
-    azimuth = np.linspace(-np.pi, np.pi, _AZIMUTHS, endpoint=False)
-    nearest, farthest = (
-        min(hill.distance_m - hill.depth_m for hill in hills),
-        max(hill.distance_m + hill.depth_m for hill in hills),
-    )
-    distance = np.geomspace(max(nearest, 1.0), farthest, _DISTANCES)[:, None]
-    height = np.zeros((_DISTANCES, _AZIMUTHS))
-    for hill in hills:
-        angle = azimuth - np.radians(hill.azimuth_deg)
-        along, across = distance * np.cos(angle) - hill.distance_m, distance * np.sin(angle)
-        # a Gaussian of standard deviation depth / 4 and width / 4
-        dome = np.exp(-2.0 * ((2.0 * along / hill.depth_m) ** 2 + (2.0 * across / hill.width_m) ** 2))
-        height += hill.height_m * np.where(np.cos(angle) > 0.0, dome, 0.0)
-    rng = np.random.default_rng(0)
-    for size in _RIDGE_SIZES:
-        noise = gaussian_filter(rng.standard_normal(height.shape), (size / 3.0, size), mode=("nearest", "wrap"))
-        height *= np.maximum(1.0 + _RIDGE_HEIGHT * size / _RIDGE_SIZES[0] * noise / noise.std(), 0.0)
-    x, y = distance * np.sin(azimuth), distance * np.cos(azimuth)
+    rng = np.random.default_rng(crc32(surface.levels[-1].tobytes()))
+    azimuth = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    layers = sorted(hills, key=lambda hill: -hill.distance_m)
+    heights = [_draw_outline(hill, azimuth, rng) for hill in layers]
+    heights.append(_SWELL_M * _draw_irregularity(_SWELL_RAD, rng))
+    distances = np.array([*(hill.distance_m for hill in layers), _SWELL_DISTANCE_M])
     # the plain curves away from its tangent plane by distance^2 / (2 radius)
-    height_above_plain = height - distance**2 / (2.0 * _MARS_RADIUS_M)
-    vertices = np.stack([x, y, ground_m + height_above_plain], axis=-1)
-    azimuth_tangents = np.roll(vertices, -1, axis=1) - np.roll(vertices, 1, axis=1)
-    normals = np.cross(azimuth_tangents, np.gradient(vertices, axis=0))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    indices = np.arange(height.size, dtype=np.int32).reshape(height.shape)
-    right = np.roll(indices, -1, axis=1)
-    quads = np.stack([indices[:-1], right[:-1], right[1:], indices[1:]], axis=-1)
-    # omit faces below `_MIN_FACE_HEIGHT_M`: they would intersect the terrain; bodies are sectors of azimuth
-    row, column = np.nonzero(np.all(height_above_plain.reshape(-1)[quads] > _MIN_FACE_HEIGHT_M, axis=-1))
-    order = np.argsort(column // _LINES_PER_BODY, kind="stable")
-    quad, body = quads[row, column][order], (column // _LINES_PER_BODY)[order]
-    faces = np.stack([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]], axis=1).reshape(-1, 3)
-    bodies = np.repeat(body, 2).astype(np.int32)
-    names = np.full(bodies.size, HILL_NAME, dtype=np.int32)
-    return Objects.of_mesh(vertices.reshape(-1, 3), normals.reshape(-1, 3), faces, names, _HILL_ALBEDO * albedo, bodies)
+    elevations = np.stack(heights) / distances[:, None] - distances[:, None] / (2.0 * _MARS_RADIUS_M)
+    # the steepest slope of a Gaussian of standard deviation depth / 4 is 0.61 height / (depth / 4)
+    depths = np.array([*(hill.depth_m for hill in layers), _SWELL_DISTANCE_M])
+    steepness = 0.61 * distances / (0.25 * depths)
+    return Relief(elevations.astype(np.float32), np.exp(-extinction_m * distances), steepness, _HILL_ALBEDO * albedo)
+
+
+def _draw_outline(
+    hill: Hill, azimuth: Float64[np.ndarray, "azimuths"], rng: Generator
+) -> Float64[np.ndarray, "azimuths"]:
+    """Draw the height of a hill's upper edge, metres: an irregular Gaussian of standard deviation width / 4."""
+    angle = (azimuth - np.radians(hill.azimuth_deg) + np.pi) % (2.0 * np.pi) - np.pi
+    dome = np.exp(-2.0 * (2.0 * angle * hill.distance_m / hill.width_m) ** 2)
+    irregularity = _draw_irregularity(0.25 * hill.width_m / hill.distance_m, rng)
+    return np.asarray(hill.height_m * dome * np.maximum(1.0 + _IRREGULARITY * irregularity, 0.0))
+
+
+def _draw_irregularity(largest_rad: float, rng: Generator) -> Float64[np.ndarray, "azimuths"]:
+    """Draw a fractal line around the horizon with the RMS 1 and a Hurst exponent of 1.3, white above `largest_rad`."""
+    waves = np.arange(_AZIMUTHS // 2 + 1)
+    amplitude = (waves**2 + (2.0 * np.pi / largest_rad) ** 2) ** (-0.5 * (1.3 + 0.5))
+    amplitude[0] = 0.0
+    line = np.fft.irfft(amplitude * (rng.standard_normal((len(waves), 2)) @ (1.0, 1.0j)))
+    return np.asarray(line / line.std())
 
 
 def add_unresolved_rocks(

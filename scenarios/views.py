@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.scenarios.cameras import Optics
-from marsyard.scenarios.horizon import hill_objects
+from marsyard.scenarios.horizon import horizon_relief
 from marsyard.sim.dynamics import State
 from marsyard.sim.frames import rigid
 from marsyard.sim.render import DustySky, Frame, Objects, Photometry, PixelRays, Scene, Sun, Texture, process_renderer
@@ -159,9 +159,10 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
     finest_m, half_width_m, lines = mesh_size(ground.surface.spacing_m, viewpoint.height_m, viewpoint.max_distance_m)
     objects = select_rocks(ground, viewpoint, half_width_m)
     is_near = viewpoint.height_m < _MAX_AMONG_ROCKS_M
-    if ground.site.hills and np.isinf(viewpoint.max_distance_m) and is_near:
-        mean_m = float(ground.surface.levels[-1][..., 0].mean())
-        objects = Objects.join([objects, hill_objects(ground.site.hills, mean_m, ground.terrain.albedo)])
+    horizon = None
+    if ground.site.hills and is_near:
+        extinction_m = ground.site.environment.mean_extinction_m(0.0)
+        horizon = horizon_relief(ground.site.hills, ground.surface, extinction_m, ground.terrain.albedo)
     return Scene(
         ground.surface,
         (viewpoint.east_m, viewpoint.north_m),
@@ -172,6 +173,7 @@ def site_scene(ground: SiteGround, viewpoint: Viewpoint, sun: Sun) -> Scene:
         ground_texture=Texture(ground.site.ground_texture.coarsest_m, ground.site.ground_texture.amplitudes),
         object_texture=Texture(ground.site.rock_texture.coarsest_m, ground.site.rock_texture.amplitudes),
         pebbles=ground.site.pebbles if is_near else None,
+        horizon=horizon,
         dust_albedo=ground.site.photometry.dust_albedo,
         dust_cover=ground.site.photometry.dust_cover,
         mesh_finest_m=finest_m,

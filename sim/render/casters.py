@@ -4,7 +4,7 @@ All rays to the sun are parallel. Projected along the sun's direction, a ray is 
 triangle's plane and the barycentric weights are linear in u and v. The triangles of each body are listed in the cells
 of a grid over the body's projection. The bodies are listed in the cells of a coarse grid over all bodies, and those of
 each coarse cell again in the cells of a fine grid over them: most bodies may be in few coarse cells, such as the rocks
-around a camera in a scene with hills at a distance of kilometres. A ray is tested only against the triangles of one
+around a camera in a scene with objects at a distance of kilometres. A ray is tested only against the triangles of one
 cell of each body with a projection that contains the ray.
 """
 

@@ -28,7 +28,7 @@ class Objects:
     - body_of_triangle: number of each triangle's body: row of `albedo`
     - first_triangle: first triangle of each body, and the number of triangles at the end
     - names: identifier of each body, a number that its creator defines: a rock has its number in the rock field; a
-      user's mesh has a number from 2^30; rover and hills have negative numbers
+      user's mesh has a number from 2^30; the rover has a negative number
     - shelter: corners of a convex body that hides the sky from the ground below it (`skylight.Shelter`), or None
     - unseen_mounds: mounds (see `mounds`) of bodies without triangles: they only hide the sky
     """

@@ -1,10 +1,12 @@
-"""Pebbles and granules on the ground: half spheroids at random positions of nested grids, with their shadows.
+"""Pebbles and granules on the ground: flattened stones at random positions of nested grids, with their shadows.
 
-Each octave of diameters has a square grid, turned against those of the others, whose cells are twice the largest
-diameter wide. A hash of the cell decides whether it contains a pebble, and its position, diameter, outline and albedo.
-Like texture, pebbles belong to the ground: they change normals, albedo and shadows, but not the range. A pixel has one
-ray and sees means over its footprint: outlines are blurred, normals of small pebbles flattened, and pebbles fade where
-they become smaller than a pixel.
+The number of pebbles larger than D is in proportion to a power of D. Each grid, turned against the others, contains the
+pebbles of one octave of the diameter; its cells are twice the largest diameter wide. A hash of the cell decides whether
+it contains a pebble, and its position, diameter, outline, height and albedo. Pebbles are many where the ground is
+darker than its mean (lag in hollows), and rare where it is brighter (dust, crests). Like texture, pebbles belong to the
+ground: they change normals, albedo and shadows, but not the range. A pixel has one ray and sees means over its
+footprint: outlines are blurred, normals of small pebbles flattened, and pebbles fade where they become smaller than a
+pixel.
 """
 
 from __future__ import annotations
@@ -19,23 +21,27 @@ from marsyard.sim.render.arrays import Values, clip, larger, smaller
 from marsyard.sim.render.device import Array3f, Float, Float64, Int32, UInt32
 from marsyard.sim.render.noise import hash_cell, mix_bits
 from marsyard.sim.terrain.sites import SitePebbles
+from marsyard.sim.terrain.surface import Surface
 
-#: Width of a cell divided by the largest diameter of its octave: a pebble and its shadow touch at most four cells.
+#: Width of a cell divided by the largest diameter of its octave: a pebble and its shadow, together not longer than a
+#: cell, lie in the four cells nearest to the middle between them.
 CELL_DIAMETERS = 2.0
-#: Smallest diameter of an octave, divided by its largest.
-_SMALLEST = 0.5
-#: Range of the ratio of the axes of the outline (assumed), and diameter in footprints at which an octave vanishes.
-_MIN_AXIS_RATIO, _MIN_FOOTPRINTS = 0.6, 0.5
+#: Maximum length of a shadow, in diameters.
+_MAX_SHADOW = 1.0
+#: Range of the ratio of the axes of the outline, half the relative range of the height, depth of the three corners of
+#: the outline, and slope of the random tilt of a pebble (all assumed).
+_MIN_AXIS_RATIO, _HEIGHT_SPREAD, _CORNERS, _TILT = 0.5, 0.5, 0.3, 0.35
+_MEAN_AXIS_RATIO = 0.5 * (1.0 + _MIN_AXIS_RATIO)
+#: Diameter in footprints at which an octave vanishes.
+_MIN_FOOTPRINTS = 0.5
 #: Light that the sides of a pebble take from the mean over its outline (fitted, see the test); its shadow takes that of
 #: half an ellipse beyond the outline.
 SIDE_LOSS = 0.25
-#: Sides of patches of equal density, in cells, and half the range of the relative density, where cells have room for
-#: more pebbles (assumed).
-_PATCH_CELLS, _PATCHINESS = (3, 11), 0.7
+#: Natural logarithm of the density of pebbles where the logarithm of the albedo is one standard deviation below its
+#: mean, relative to that at the mean, and maximum of the density relative to its mean (assumed).
+PATCHINESS, MAX_DENSITY = 1.2, 8.0
 #: Angle between the grids of successive octaves, radians: no two of ten octaves are nearly parallel.
 _TURN = math.pi * (3.0 - math.sqrt(5.0))
-#: Maximum length of a shadow, in diameters, so that it ends in a neighbouring cell.
-_MAX_SHADOW = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,38 +50,48 @@ class PebbleField:
 
     - largest: largest diameter of the coarsest octave, metres; halved with each octave
     - octaves: number of octaves
-    - probability, patchiness: mean probability that a cell contains a pebble, and half the range of its relative values
-    - coverage: fraction of the ground that one octave covers
+    - probability: mean probability that a cell of the coarsest octave contains a pebble
+    - exponent: of the cumulative number of pebbles, positive
+    - cell_coverage: fraction of a cell that its pebble covers in the mean
     - height_ratio, log_albedo, log_albedo_sd: of a pebble
+    - ground_mean, ground_sd: mean and standard deviation of the logarithm of the ground's albedo
     """
 
     largest: Values
     octaves: Values
     probability: Values
-    patchiness: Values
-    coverage: Values
+    exponent: Values
+    cell_coverage: Values
     height_ratio: Values
     log_albedo: Values
     log_albedo_sd: Values
+    ground_mean: Values
+    ground_sd: Values
 
     @classmethod
-    def of(cls, pebbles: SitePebbles) -> PebbleField:
+    def of(cls, pebbles: SitePebbles, ground: Surface) -> PebbleField:
         """Copy pebbles to the device."""
-        p = pebbles
+        p, q = pebbles, pebbles.exponent
         octaves = max(math.ceil(math.log2(p.largest_m / p.smallest_m) - 1e-9), 1)
-        # mean area of an outline relative to a cell; the diameter, and the ratio of axes, are distributed uniformly
-        mean_square = (1.0 - _SMALLEST**3) / (3.0 * (1.0 - _SMALLEST))
-        area = 0.25 * math.pi * mean_square * 0.5 * (1.0 + _MIN_AXIS_RATIO) / CELL_DIAMETERS**2
-        probability = min(p.coverage / octaves / area, 1.0)
-        patchiness = min(_PATCHINESS, 1.0 / max(probability, 1e-6) - 1.0)
-        densities = (probability, patchiness, p.coverage / octaves)
-        numbers = map(Float, (*densities, p.height_ratio, p.log_albedo, p.log_albedo_sd))
-        return cls(Float64(p.largest_m), UInt32(octaves), *numbers)
+        # mean square of the diameters of an octave relative to the largest, from their density q D**-(q+1) / (2**q - 1)
+        excess = q - 2.0
+        mean_square = (q * math.log(2.0) if excess == 0.0 else q * (2.0**excess - 1.0) / excess) / (2.0**q - 1.0)
+        cell_coverage = 0.25 * math.pi * mean_square * _MEAN_AXIS_RATIO / CELL_DIAMETERS**2
+        # the coverage of successive octaves, largest pebbles first, increases by 2**excess
+        probability = p.coverage / cell_coverage / sum(2.0 ** (excess * octave) for octave in range(octaves))
+        numbers = map(Float, (probability, q, cell_coverage, p.height_ratio, p.log_albedo, p.log_albedo_sd))
+        return cls(Float64(p.largest_m), UInt32(octaves), *numbers, *map(Float, ground.log_albedo_moments))
+
+    def density_at(self, albedo: Values) -> Values:
+        """Density of pebbles on ground of an albedo divided by the mean density: log-normal, with the mean 1."""
+        deviation = (dr.log(larger(albedo, 1e-6)) - self.ground_mean) / larger(self.ground_sd, 1e-6)
+        deviation = dr.select(self.ground_sd > 1e-6, deviation, -0.5 * PATCHINESS)
+        return smaller(dr.exp(-PATCHINESS * (deviation + 0.5 * PATCHINESS)), MAX_DENSITY)
 
 
 @dataclass(eq=False)
 class PebbleSurface:
-    """The pebbles that a pixel sees: normal relative to level ground, log albedo, shaded fraction, and lost light.
+    """The pebbles that a pixel sees: normal relative to level ground, log albedo, covered and shaded fractions, loss.
 
     `loss` is the mean fraction of direct sunlight that the visible pebbles and their shadows take from the ground.
     The normal, not of unit length, and the log albedo are means over the pixel: those of ground without pebbles are
@@ -84,8 +100,14 @@ class PebbleSurface:
 
     normal: Values
     log_albedo: Values
+    covered: Values
     shadow: Values
     loss: Values
+
+    @classmethod
+    def bare(cls) -> PebbleSurface:
+        """Ground without pebbles."""
+        return cls(Array3f(0.0, 0.0, 1.0), Float(0.0), Float(0.0), Float(0.0), Float(0.0))
 
 
 def _uniform(h: Values, shift: int) -> Values:
@@ -93,105 +115,122 @@ def _uniform(h: Values, shift: int) -> Values:
     return (Float((h >> shift) & 255) + 0.5) * (1.0 / 256.0)
 
 
-def _local_probability(pebbles: PebbleField, cell: list[Values], octave: Values) -> Values:
-    """Probability that a cell contains a pebble: it differs between patches of cells of two sizes."""
-    numbers = [
-        _uniform(hash_cell([component // side for component in cell], octave + UInt32(side << 8)), 0)
-        for side in _PATCH_CELLS
-    ]
-    return pebbles.probability * (1.0 + pebbles.patchiness * (numbers[0] + numbers[1] - 1.0))
+def _rotate(x: Values, y: Values, cosine: Values, sine: Values) -> tuple[Values, Values]:
+    """Components of a vector along axes that are turned counter-clockwise."""
+    return x * cosine + y * sine, y * cosine - x * sine
 
 
 def _evaluate_cell(
     pebbles: PebbleField,
+    probability: Values,
     octave: Values,
     diameter: Values,
     cell: list[Values],
     offset: list[Values],
     footprint: Values,
     sun: Values,
-) -> tuple[Values, PebbleSurface]:
-    """Evaluate the pebble of one cell: covered fraction of the pixel, and its surface.
+) -> PebbleSurface:
+    """Evaluate the pebble of one cell, without loss.
 
+    - probability: probability that the cell contains a pebble
+    - diameter: largest diameter of the octave, metres
     - cell: column and row of the cell
     - offset: position relative to the cell's corner, metres
     """
-    width, first = CELL_DIAMETERS * diameter, hash_cell(cell, octave)
-    second = mix_bits(first + UInt32(0x9E3779B1))
-    number = Float(((first >> 24) << 8) | (second >> 24)) * (1.0 / 65536.0)
-    exists = number < _local_probability(pebbles, cell, octave)
-    size = diameter * (_SMALLEST + (1.0 - _SMALLEST) * _uniform(first, 0))
-    centre = [0.5 * size + (width - size) * _uniform(second, shift) for shift in (0, 8)]
-    # offset from the centre in radii, stretched along a random axis of the outline
+    first = hash_cell(cell, octave)
+    second, third = mix_bits(first + UInt32(0x9E3779B1)), mix_bits(first + UInt32(0x7F4A7C15))
+    # the pebble's rank among those of its octave, by diameter: where the density changes, pebbles grow or shrink
+    rank = (Float(first >> 8) + 0.5) * 2.0**-24 / probability
+    size = diameter * dr.power(1.0 + rank * (dr.power(2.0, pebbles.exponent) - 1.0), -1.0 / pebbles.exponent)
+    # offset from the centre in radii, along the axes of the outline
+    axis_y, axis_x = dr.sincos(2.0 * math.pi * _uniform(second, 16))
+    stretch = 1.0 / (_MIN_AXIS_RATIO + (1.0 - _MIN_AXIS_RATIO) * _uniform(second, 24))
+    centre = [CELL_DIAMETERS * diameter * _uniform(second, shift) for shift in (0, 8)]
     x, y = (2.0 * (position - middle) / size for position, middle in zip(offset, centre, strict=True))
-    axis_y, axis_x = dr.sincos(math.pi * _uniform(first, 8))
-    stretch = 1.0 / (_MIN_AXIS_RATIO + (1.0 - _MIN_AXIS_RATIO) * _uniform(second, 16)) - 1.0
-    across = stretch * (x * axis_x + y * axis_y)
-    x, y = x + across * axis_x, y + across * axis_y
+    x, y = _rotate(x, y, axis_x, axis_y)
+    x *= stretch
     squared = x * x + y * y
+    # outline r**2 + c r**3 cos(3 angle) = 1, with three corners
+    corners = _CORNERS * _uniform(third, 24)
+    outline = squared + corners * x * (x * x - 3.0 * y * y) / (0.5 + 0.5 * squared)
     # the mean over a pixel is a ramp across the outline, divided by 1 + edge**2 / 12 to preserve the outline's area
     edge = larger(2.0 * footprint / size, 1e-3)
-    visible = dr.select(exists, 1.0 / (1.0 + edge * edge * (1.0 / 12.0)), 0.0)
-    covered = visible * clip((1.0 - dr.sqrt(squared)) / edge + 0.5, 0.0, 1.0)
-    # half spheroid: the normal is in proportion to (x / r, y / r, z / h**2)
-    height = 2.0 * pebbles.height_ratio
-    upwards = dr.sqrt(larger(1.0 - squared, 0.04))
+    visible = dr.select(rank < 1.0, 1.0 / (1.0 + edge * edge * (1.0 / 12.0)), 0.0)
+    covered = visible * clip((1.0 - dr.sqrt(larger(outline, 0.0))) / edge + 0.5, 0.0, 1.0)
+    # half spheroid, tilted: its normal is in proportion to (x / r, y / r, z / h**2)
+    height = 2.0 * pebbles.height_ratio * (1.0 - _HEIGHT_SPREAD + 2.0 * _HEIGHT_SPREAD * _uniform(third, 8))
+    upwards = dr.sqrt(larger(1.0 - outline, 0.04))
+    tilt_y, tilt_x = dr.sincos(2.0 * math.pi * _uniform(third, 16))
     # mean over the covered part of the footprint (fitted, see the test)
     slope = height / (1.0 + 0.25 * edge * edge)
-    normal = dr.normalize(Array3f(x * slope, y * slope, upwards))
-    log_albedo = pebbles.log_albedo + pebbles.log_albedo_sd * 3.464 * (_uniform(first, 16) - 0.5)
+    normal_x, normal_y = ((component + _TILT * tilt) * slope for component, tilt in ((x, tilt_x), (y, tilt_y)))
+    normal = dr.normalize(Array3f(*_rotate(normal_x, normal_y, axis_x, -axis_y), upwards))
+    log_albedo = pebbles.log_albedo + pebbles.log_albedo_sd * 3.464 * (_uniform(third, 0) - 0.5)
     # nearest distance of the ray to the sun from the axis of the spheroid, in units in which it is a sphere
-    sun_across = stretch * (sun.x * axis_x + sun.y * axis_y)
-    sun_x, sun_y = sun.x + sun_across * axis_x, sun.y + sun_across * axis_y
-    along = (x * sun_x + y * sun_y) / (sun_x * sun_x + sun_y * sun_y + (sun.z / height) ** 2)
+    sun_x, sun_y = _rotate(sun.x, sun.y, axis_x, axis_y)
+    horizontal = dr.sqrt(sun_x * sun_x + sun_y * sun_y)
+    sun_x *= stretch
+    # a low sun is raised, so that the shadow is not longer than `_MAX_SHADOW` diameters
+    sun_z = larger(sun.z / height, horizontal * (0.5 / _MAX_SHADOW))
+    along = (x * sun_x + y * sun_y) / (sun_x * sun_x + sun_y * sun_y + sun_z * sun_z)
     miss = dr.sqrt(larger(squared - along * (x * sun_x + y * sun_y), 0.0))
     shadow = dr.select(along < 0.0, visible * clip((1.0 - miss) / edge + 0.5, 0.0, 1.0), 0.0) * (1.0 - covered)
-    return covered, PebbleSurface(normal, log_albedo, shadow, Float(0.0))
+    return PebbleSurface(normal, log_albedo, covered, shadow, Float(0.0))
 
 
-def pebble_surface(pebbles: PebbleField, position: Values, footprint: Values, sun: Values) -> PebbleSurface:
-    """Compute the pebbles at positions on the ground for pixels with a footprint, metres, under a sun (unit vector)."""
+def pebble_surface(
+    pebbles: PebbleField, position: Values, footprint: Values, sun: Values, density: Values
+) -> PebbleSurface:
+    """Compute the pebbles at positions on the ground.
+
+    - footprint: of the pixels, metres
+    - sun: unit vector to the sun
+    - density: number of pebbles divided by its mean (`PebbleField.density_at`)
+    """
     limit = Float64(_MIN_FOOTPRINTS * footprint)
-    # a low sun is raised, so that no shadow is longer than `_MAX_SHADOW` diameters
     horizontal = larger(dr.sqrt(sun.x * sun.x + sun.y * sun.y), 1e-6)
-    sun_z = larger(sun.z, horizontal * pebbles.height_ratio / _MAX_SHADOW)
-    stretch = 2.0 * pebbles.height_ratio * horizontal / sun_z
-    loss = pebbles.coverage * (SIDE_LOSS + 0.5 * (dr.sqrt(1.0 + stretch * stretch) - 1.0))
+    # length of a shadow in diameters; the mean squared extent of an outline along the sun's azimuth is the product of
+    # its half axes
+    length = smaller(pebbles.height_ratio * horizontal / larger(sun.z, 1e-6), _MAX_SHADOW)
+    lost = SIDE_LOSS + 0.5 * (dr.sqrt(1.0 + 4.0 / _MEAN_AXIS_RATIO * length * length) - 1.0)
+    # middle between pebble and shadow, in diameters towards the sun
+    middle = [0.5 * length / horizontal * component for component in (sun.x, sun.y)]
 
-    def add_octave(octave: Values, diameter: Values, total: PebbleSurface) -> tuple[Values, Values, PebbleSurface]:
-        width = CELL_DIAMETERS * diameter
+    def add_octave(
+        octave: Values, diameter: Values, probability: Values, total: PebbleSurface
+    ) -> tuple[Values, Values, Values, PebbleSurface]:
+        width, size = CELL_DIAMETERS * diameter, Float(diameter)
         sine, cosine = dr.sincos(Float64(octave) * _TURN)
-        turned = [position.x * cosine + position.y * sine, position.y * cosine - position.x * sine]
         sin, cos = Float(sine), Float(cosine)
-        light = Array3f(sun.x * cos + sun.y * sin, sun.y * cos - sun.x * sin, sun_z)
-        step_x, step_y = (dr.select(component > 0.0, Int32(1), -1) for component in (light.x, light.y))
+        light = Array3f(*_rotate(sun.x, sun.y, cos, sin), sun.z)
         columns, offsets = [], []
-        for coordinate in turned:
-            floor = dr.floor(coordinate / width)
+        turned, shifts = _rotate(position.x, position.y, cosine, sine), _rotate(*middle, cos, sin)
+        for coordinate, shift in zip(turned, shifts, strict=True):
+            floor = dr.floor((coordinate + Float64(shift) * diameter) / width - 0.5)
             columns.append(Int32(floor))
             offsets.append(Float(coordinate - floor * width))
         # an octave vanishes where its largest pebbles are smaller than the limit
-        ratio = smaller(_MIN_FOOTPRINTS * footprint / Float(diameter), 1.0)
+        ratio = smaller(_MIN_FOOTPRINTS * footprint / size, 1.0)
         fade = (1.0 - ratio * ratio) * (1.0 - ratio * ratio)
-        shadow = Float(0.0)
+        local = smaller(probability * density, 1.0)
+        shadow, covered, normal, log_albedo = Float(0.0), total.covered, total.normal, total.log_albedo
         for j, i in product((0, 1), repeat=2):
-            cell = [columns[0] + i * step_x, columns[1] + j * step_y]
-            offset = [offsets[0] - Float(i * step_x) * Float(width), offsets[1] - Float(j * step_y) * Float(width)]
-            covered, surface = _evaluate_cell(pebbles, octave, Float(diameter), cell, offset, footprint, light)
+            cell = [columns[0] + i, columns[1] + j]
+            offset = [offsets[0] - i * CELL_DIAMETERS * size, offsets[1] - j * CELL_DIAMETERS * size]
+            surface = _evaluate_cell(pebbles, local, octave, size, cell, offset, footprint, light)
             shadow = larger(shadow, surface.shadow)
-            if (i, j) == (0, 0):
-                weight = fade * covered
-                x, y, z = surface.normal
-                normal = dr.lerp(total.normal, Array3f(x * cos - y * sin, x * sin + y * cos, z), weight)
-                log_albedo = dr.lerp(total.log_albedo, surface.log_albedo, weight)
-        shaded = dr.lerp(total.shadow * (1.0 - weight), 1.0, fade * shadow)
-        return octave + 1, 0.5 * diameter, PebbleSurface(normal, log_albedo, shaded, total.loss + fade * loss)
+            # large pebbles hide small ones
+            weight = fade * surface.covered * (1.0 - covered)
+            x, y, z = surface.normal
+            normal = dr.lerp(normal, Array3f(*_rotate(x, y, cos, -sin), z), weight)
+            log_albedo = dr.lerp(log_albedo, surface.log_albedo, weight)
+            covered = covered + weight
+        shaded = dr.lerp(total.shadow, 1.0, fade * shadow * (1.0 - total.covered))
+        loss = total.loss + fade * lost * pebbles.cell_coverage * local
+        total = PebbleSurface(normal, log_albedo, covered, shaded, loss)
+        return octave + 1, 0.5 * diameter, probability * dr.power(2.0, pebbles.exponent - 2.0), total
 
-    state = (
-        UInt32(0),
-        Float64(pebbles.largest),
-        PebbleSurface(Array3f(0.0, 0.0, 1.0), Float(0.0), Float(0.0), Float(0.0)),
-    )
+    state = (UInt32(0), Float64(pebbles.largest), Float(pebbles.probability), PebbleSurface.bare())
     return dr.while_loop(
-        state, lambda octave, diameter, total: (octave < pebbles.octaves) & (diameter > limit), add_octave
-    )[2]
+        state, lambda octave, diameter, probability, total: (octave < pebbles.octaves) & (diameter > limit), add_octave
+    )[3]

@@ -25,6 +25,7 @@ from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture
 from marsyard.sim.render.shading import Light, Materials
 from marsyard.sim.render.shadows import ObjectSurfaces, Occluders
 from marsyard.sim.render.skylight import MOUND_RANGE, Mounds, Obstructions, Shelter
+from marsyard.sim.render.skyline import Relief, Skyline
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.render.sunlight import Footprint, GroundShadow
 from marsyard.sim.render.texture import MicroRelief, RoughGround
@@ -48,6 +49,7 @@ class Scene:
     - relief: relief finer than the terrain's samples; its slopes change the shading, but not normals and range
     - ground_texture, object_texture: albedo variation finer than the terrain's samples
     - pebbles: pebbles on the ground; None without
+    - horizon: relief on the horizon; None without
     - dust_albedo, dust_cover: albedo of dust, and fraction of the level faces of rocks that it covers
     - caster_diameter_m: diameter of a round body at the camera that casts a shadow, such as a lander
     - ground_shadows: whether the ground casts shadows, with a penumbra; shadows of objects have hard edges
@@ -69,6 +71,7 @@ class Scene:
     ground_texture: Texture = NO_TEXTURE
     object_texture: Texture = NO_TEXTURE
     pebbles: SitePebbles | None = None
+    horizon: Relief | None = None
     dust_albedo: float = 0.3
     dust_cover: float = 0.0
     caster_diameter_m: float = 0.0
@@ -208,6 +211,11 @@ class Scene:
         return Obstructions(Mounds.of(mounds), None if shelter is None else Shelter.of(shelter))
 
     @cached_property
+    def skyline(self) -> Skyline | None:
+        """Relief on the horizon, on the device."""
+        return None if self.horizon is None else Skyline.of(self.horizon)
+
+    @cached_property
     def materials(self) -> Materials:
         """Relief, textures, normals and albedo."""
         objects, surfaces = self.objects, None
@@ -220,7 +228,7 @@ class Scene:
             )
         return Materials(
             RoughGround.of(self.relief),
-            PebbleField.of(self.pebbles) if self.pebbles is not None else None,
+            PebbleField.of(self.pebbles, self.surface) if self.pebbles is not None else None,
             self.ground_texture.octaves,
             self.object_texture.octaves,
             surfaces,
@@ -247,6 +255,7 @@ class Scene:
             Float64(self.caster_diameter_m) if self.caster_diameter_m > 0.0 else None,
             clouds,
             self.obstructions,
+            self.skyline,
         )
 
 

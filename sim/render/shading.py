@@ -12,6 +12,7 @@ from marsyard.sim.render.primary import Hits, Points, Pose, Rays, locate
 from marsyard.sim.render.reflectance import Angles, Law, Sky
 from marsyard.sim.render.shadows import ObjectSurfaces
 from marsyard.sim.render.skylight import Obstructions
+from marsyard.sim.render.skyline import Skyline
 from marsyard.sim.render.spline import Terrain, evaluate
 from marsyard.sim.render.sunlight import Clouds, disc_overlap
 from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albedo, relief_slopes, smith_shadowing
@@ -29,7 +30,8 @@ GROUND, SKY = -1, -2
 class Light:
     """Illumination at one time: unit vector to the sun, its angular radius, reflectance law, sky, and clouds.
 
-    `caster_diameter` is that of a round body at the camera, metres; None without one. `obstructions` hide the sky.
+    `caster_diameter` is that of a round body at the camera, metres; None without one. `obstructions` hide the sky
+    from the ground, the `skyline` hides it in images.
     """
 
     sun: Values
@@ -39,11 +41,13 @@ class Light:
     caster_diameter: Values | None
     clouds: Clouds | None
     obstructions: Obstructions | None
+    skyline: Skyline | None
 
     def sky_radiance(self, direction: Values, pixel_rad: Values) -> Values:
-        """Radiance factor of the sky in directions."""
+        """Radiance factor of the sky, and of the relief on the horizon, in directions."""
         cos_g = dr.dot(direction, self.sun)
-        return self.sky.radiance(self.sun.z, self.sun_radius, direction.z, cos_g, Float64(pixel_rad))
+        sky = Float(self.sky.radiance(self.sun.z, self.sun_radius, direction.z, cos_g, Float64(pixel_rad)))
+        return sky if self.skyline is None else self.skyline.cover(sky, direction, self.law, self.sun, pixel_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +159,8 @@ def shade(
     pebbles = None
     if materials.pebbles is not None:
         footprint = dr.select(is_ground, points.footprint, dr.inf)
-        pebbles = pebble_surface(materials.pebbles, points.position, footprint, Array3f(light.sun))
+        density = materials.pebbles.density_at(ground.albedo)
+        pebbles = pebble_surface(materials.pebbles, points.position, footprint, Array3f(light.sun), density)
         bump_x, bump_y = pebbles.normal.x / pebbles.normal.z, pebbles.normal.y / pebbles.normal.z
         bumped = Array3f(normal.x / normal.z + bump_x, normal.y / normal.z + bump_y, 1.0)
         normal = dr.select(is_ground, dr.normalize(bumped), normal)
@@ -185,5 +190,5 @@ def shade(
     if light.obstructions is not None:
         blocked = light.obstructions.hide_sky(points.position, is_ground, is_object)
     radiance = albedo * light.law.radiance(angles, normal, fraction, blocked)
-    radiance = where(~is_surface, lambda: Float(light.sky_radiance(points.direction, rays.pixel_angles)), radiance)
+    radiance = where(~is_surface, lambda: light.sky_radiance(points.direction, rays.pixel_angles), radiance)
     return ShadedImage(radiance, body, smooth_normal, sun_fraction)

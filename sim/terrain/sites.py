@@ -52,14 +52,15 @@ class SiteTexture(Parameters):
 class SitePebbles(Parameters):
     """Pebbles and granules that are too many and too small for triangles.
 
-    All octaves of the diameter cover the same fraction of the ground: the number of pebbles larger than D is in
-    proportion to D**-2, as for fragmented rock (Turcotte 1997). The law of Golombek & Rapp (1997), with an exponent of
-    -1 at these sizes, was fitted to rocks above 3 cm.
+    The number of pebbles larger than D is in proportion to D**-exponent, as for fragmented rock, with exponents of 1.9
+    to 2.6 (Turcotte 1997, table 3.2). The law of Golombek & Rapp (1997), with an exponent of 1 at these sizes, was
+    fitted to rocks above 3 cm. Ground darker than the mean of the terrain has more pebbles, brighter ground fewer.
     """
 
     coverage: Annotated[float, bounded_field(0.0, 0.4, "fraction of the ground that pebbles cover")]
-    largest_m: Annotated[Positive, Field(description="largest diameter, m")] = 0.02
+    largest_m: Annotated[Positive, Field(description="largest diameter, m")] = 0.048
     smallest_m: Annotated[Positive, Field(description="smallest diameter, m")] = 0.002
+    exponent: Annotated[float, bounded_field(1.0, 3.0, "exponent of the cumulative number of pebbles")] = 2.5
     height_ratio: Annotated[float, bounded_field(0.05, 1.0, "height divided by diameter; assumed")] = 0.4
     log_albedo: Annotated[float, bounded_field(-1.5, 1.5, "mean logarithm of albedo divided by the ground's")] = 0.0
     log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm; assumed")] = 0.2

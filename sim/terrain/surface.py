@@ -22,6 +22,7 @@ from marsyard.sim.terrain.kernels import block_ceilings, evaluate_field, reduce_
 
 HEIGHT, ALBEDO = 0, 1  #: Channels of the stored samples.
 Coordinate = Float[np.ndarray, "*batch"] | float  #: One coordinate or many, metres.
+_MOMENTS_SIDE = 1024  #: Maximum side of the level from which moments of the albedo are computed.
 SMALLEST_LEVEL = 16  #: Samples along each side of the coarsest level.
 ALIGNMENT_BYTES = 64  #: Alignment of memory that is shared with the renderer's device: that of vectors of AVX-512.
 ROUGHNESS, TEXTURE, ROCKS = 0, 1, 2  #: Channels of the factors of the ground.
@@ -121,6 +122,13 @@ class Surface:
     def ceilings(self) -> tuple[Float32[np.ndarray, "_ _"], ...]:
         """Upper bounds of each level's height, metres, over blocks of `CEILING_BLOCK` samples along each side."""
         return tuple(block_ceilings(level) for level in self.levels)
+
+    @cached_property
+    def log_albedo_moments(self) -> tuple[float, float]:
+        """Mean and standard deviation of the logarithm of albedo, of a level with at most 1024 samples along a side."""
+        level = next(level for level in self.levels if len(level) <= _MOMENTS_SIDE)
+        values = np.log(np.maximum(level[..., ALBEDO], 1e-6))
+        return float(values.mean(dtype=np.float64)), float(values.std(dtype=np.float64))
 
     def height(self, x: Coordinate, y: Coordinate, level: int = 0) -> Float[np.ndarray, "*batch"]:
         """Evaluate the height above the datum, metres, at world positions."""

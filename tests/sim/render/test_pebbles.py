@@ -5,6 +5,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
+from scipy.ndimage import center_of_mass, label
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv
@@ -12,40 +13,91 @@ from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.device import Array3f, Array3f64, Float
-from marsyard.sim.render.pebbles import PebbleField, pebble_surface
+from marsyard.sim.render.pebbles import CELL_DIAMETERS, PebbleField, pebble_surface
 from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain.sites import SitePebbles
+from marsyard.sim.terrain.surface import Surface
 from tests.sim.scenes import DOWN, LAMBERT, flat_ground
 
-ONE_SIZE = SitePebbles(coverage=0.1, largest_m=0.04, smallest_m=0.02, log_albedo=-0.5, log_albedo_sd=0.0)
+ONE_SIZE = SitePebbles(coverage=0.06, largest_m=0.04, smallest_m=0.02, log_albedo=-0.5, log_albedo_sd=0.0)
 MESH: dict[str, Any] = {"mesh_finest_m": 0.2, "mesh_half_width_m": 60.0}
 SUN = Sun(direction(0.5 * np.pi, np.radians(35.0)))
+LEVEL = flat_ground(64, 1.0)
 
 
-def _sample(pebbles: SitePebbles, footprint_m: float) -> tuple[np.ndarray, ...]:
+def _sample(
+    pebbles: SitePebbles, footprint_m: float, *, density: float = 1.0, side: int = 700, spacing_m: float = 0.0071
+) -> tuple[np.ndarray, ...]:
     """Return normals, log albedo and shadow on a square grid of positions; rows are north."""
-    side = 700
-    grid = 0.0071 * np.arange(side)
+    grid = spacing_m * np.arange(side)
     x, y = np.meshgrid(grid, grid)
     position = Array3f64(*(np.ravel(values) for values in (x, y, np.zeros_like(x))))
-    footprint = dr.full(Float, footprint_m, side * side)
-    surface = pebble_surface(PebbleField.of(pebbles), position, footprint, Array3f(*SUN.direction.tolist()))
+    footprint, sun = dr.full(Float, footprint_m, side * side), Array3f(*SUN.direction.tolist())
+    surface = pebble_surface(PebbleField.of(pebbles, LEVEL), position, footprint, sun, Float(density))
     normal, albedo, shadow = (to_host(values) for values in (surface.normal, surface.log_albedo, surface.shadow))
     return normal.reshape(side, side, 3), albedo.reshape(side, side), shadow.reshape(side, side)
 
 
+def label_pebbles(pebbles: SitePebbles) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the mask of pebbles, its connected regions, and their numbers."""
+    mask = _sample(pebbles, 1e-4)[1] < -0.25
+    regions, count = label(mask)
+    return mask, regions, np.arange(1, count + 1)
+
+
 def test_pebbles_cover_the_specified_fraction_of_the_ground() -> None:
     _, log_albedo, _ = _sample(ONE_SIZE, 1e-4)
-    # 25 m2 with cells of 8 cm: 3900 cells, about 1000 pebbles, so the coverage varies by 3 %
-    assert np.mean(log_albedo < -0.25) == pytest.approx(0.1, rel=0.1)
+    # 25 m2 with cells of 8 cm: 3900 cells, about 3500 pebbles; the outlines' corners add up to 7 % to their areas
+    assert np.mean(log_albedo < -0.25) == pytest.approx(0.06, rel=0.1)
+
+
+def test_sizes_follow_the_power_law_across_the_octaves() -> None:
+    pebbles = SitePebbles(coverage=0.03, largest_m=0.064, smallest_m=0.008, log_albedo=-0.5, log_albedo_sd=0.0)
+    spacing_m = 0.002
+    _, log_albedo, _ = _sample(pebbles, 1e-4, side=3000, spacing_m=spacing_m)
+    regions, count = label(log_albedo < -0.25)
+    # the mean outline has the area of 0.75 circles of its diameter, for axes with ratios of 0.5 to 1
+    area = np.bincount(regions.ravel())[1:] * spacing_m**2
+    diameter = np.sqrt(area / (0.25 * np.pi * 0.75))
+    larger = [np.sum(diameter > size) for size in (0.012, 0.017, 0.024, 0.034)]
+    # three ranges, two of which contain the border of two octaves; about 100 pebbles are larger than 34 mm
+    ratios = np.divide(larger[:-1], larger[1:])
+    assert count > 2000
+    assert ratios == pytest.approx(np.sqrt(2.0) ** 2.5, rel=0.25)
+
+
+def test_pebbles_are_many_on_dark_ground_and_rare_on_bright_ground() -> None:
+    rng = np.random.default_rng(5)
+    samples = np.stack([np.zeros((64, 64)), 0.2 * np.exp(0.1 * rng.standard_normal((64, 64)))], axis=-1)
+    field = PebbleField.of(SitePebbles(coverage=0.05), Surface.from_samples(samples.astype(np.float32), 1.0))
+    deviations = rng.standard_normal(200_000)
+    density = to_host(field.density_at(Float(0.2 * np.exp(0.1 * deviations))))
+    # about 1 % of the pebbles of a log-normal density are above its maximum
+    assert density.mean() == pytest.approx(1.0, abs=0.05)
+    assert density[deviations < -1.0].mean() > 8.0 * density[deviations > 1.0].mean()
+    # the coverage follows the density as long as cells are free
+    sparse = SitePebbles(coverage=0.01, log_albedo=-0.5, log_albedo_sd=0.0)
+    bare, lag = (np.mean(_sample(sparse, 1e-4, density=factor)[1] < -0.25) for factor in (0.5, 3.0))
+    assert lag / bare == pytest.approx(6.0, rel=0.25)
+
+
+def test_pebbles_do_not_stand_in_rows_and_columns() -> None:
+    """In each octave, the positions are uniform in the cells and independent of those in neighbouring cells."""
+    centres = center_of_mass(*label_pebbles(ONE_SIZE))
+    x = np.array(centres)[:, 1] * 0.0071 / (CELL_DIAMETERS * ONE_SIZE.largest_m) % 1.0
+    counts = np.histogram(x, bins=8, range=(0.0, 1.0))[0]
+    # a chi-squared variable with 7 degrees of freedom is below 24 with a probability of 0.999
+    assert np.sum((counts - counts.mean()) ** 2) / counts.mean() < 24.0
 
 
 def test_shadows_point_away_from_the_sun() -> None:
     _, log_albedo, shadow = _sample(ONE_SIZE, 1e-4)
     pebble, shade = log_albedo < -0.25, shadow > 0.5
     # the sun is in the east; the mean shadow of a half spheroid is half the ellipse beyond its outline:
-    # 0.5 (sqrt(1 + (2 ratio / tan)^2) - 1) of the outline's area, with the ratio 0.4 and tan(35 deg) = 0.70
-    assert shade.sum() / pebble.sum() == pytest.approx(0.5 * (np.hypot(1.0, 0.8 / 0.70) - 1.0), rel=0.25)
+    # 0.5 (sqrt(1 + (2 ratio / tan)^2) - 1) of the outline's area, with the height ratio 0.4, tan(35 deg) = 0.70, and an
+    # extent along the sun's azimuth of sqrt(0.75), for axes with ratios of 0.5 to 1
+    expected = 0.5 * (np.hypot(1.0, 0.8 / 0.70 / np.sqrt(0.75)) - 1.0)
+    assert shade.sum() / pebble.sum() == pytest.approx(expected, rel=0.15)
     west_of_pebbles, east_of_pebbles = np.roll(pebble, -2, axis=1), np.roll(pebble, 2, axis=1)
     assert np.mean(shade[west_of_pebbles & ~pebble]) > 5.0 * np.mean(shade[east_of_pebbles & ~pebble])
 
