@@ -45,15 +45,14 @@ _STEERING_HEIGHT, _BRACKET_GAP_M = 1.6, 0.03
 _SIDES, _SEGMENTS = 12, 8
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
-_ARM_JOINTS_M = ((0.03, 0.2, -0.24), (0.05, -0.26, -0.3), (0.1, 0.12, -0.33))
-_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.022, 0.04, 0.12
+_ARM_JOINTS_M = ((0.02, 0.25, -0.3), (0.04, -0.3, -0.34), (0.05, 0.22, -0.37))
+_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.022, 0.035, 0.12
 #: Cables at the front, relative to the same point: start, end, and how far they hang forward and down, m; their radius.
 _CABLES_M = (
-    ((0.0, 0.5, -0.24), (0.0, -0.48, -0.22), (0.055, -0.1)),
-    ((0.0, 0.46, -0.28), (0.0, -0.52, -0.27), (0.04, -0.08)),
-    ((0.01, 0.1, -0.3), (0.01, -0.5, -0.3), (0.07, -0.02)),
+    ((0.0, 0.4, -0.28), (0.0, -0.38, -0.26), (0.05, -0.08)),
+    ((0.0, 0.36, -0.31), (0.0, -0.42, -0.3), (0.03, -0.05)),
 )
-_CABLE_RADIUS_M = 0.011
+_CABLE_RADIUS_M = 0.009
 
 #: Position and normal of each corner of each triangle.
 Solid = Float64[np.ndarray, "triangles 3 2 3"]
@@ -79,9 +78,9 @@ def rover_objects(
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     wheel_size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
     # the axis of a wheel is y
-    wheel = (_unit_wheel() * np.array([wheel_size, [1.0, 1.0, 1.0]]))[..., [1, 2, 0]]
+    wheel = (_unit_wheel() * np.stack([wheel_size, np.ones(3)]))[..., [1, 2, 0]]
     parts = {"deck": [_build_deck(rover, outline)], "body": [_build_body(rover, stance)]}
-    parts |= {"wheel": [wheel + np.array([centre, np.zeros(3)]) for centre in centres]}
+    parts |= {"wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres]}
     parts |= {"mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)]}
     bodies = [
         _create_body(_transform(solid, stance.world_from_rover), ALBEDOS[material])
@@ -96,9 +95,7 @@ def rover_objects(
     deck_size = np.array([rover.body_length_m, rover.body_width_m])
     bottom = np.column_stack([corners * _BODY_FRACTION * deck_size, np.full(4, rover.clearance_m)])
     top = np.column_stack([corners * scale * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
-    return Objects.join(bodies).with_shelter(
-        np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top])))
-    )
+    return Objects.join(bodies).with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
 
 
 def _create_body(solid: Solid, albedo: float) -> Objects:
@@ -120,7 +117,9 @@ def _build_deck(rover: RoverParameters, outline: Float64[np.ndarray, "corners 2"
     """Build the deck, which is star-shaped, with its equipment."""
     size = np.array([0.5 * rover.body_length_m, 0.5 * rover.body_width_m, 1.0])
     above = np.array([0.0, 0.0, rover.deck_m])
-    equipment = [(start * size + above, end * size + above, radius) for start, end, radius in map(_as_points, _EQUIPMENT)]
+    equipment = [
+        (start * size + above, end * size + above, radius) for start, end, radius in map(_as_points, _EQUIPMENT)
+    ]
     half = 0.5 * _DECK_M
     profile = [(rover.deck_m + z, factor) for z, factor in ((-half, 0.0), (-half, 1.0), (half, 1.0), (half, 0.0))]
     return np.concatenate([_shade_flat(_stack_rings(profile, outline)), _make_cylinders(equipment)])
@@ -162,7 +161,13 @@ def _build_leg(rover: RoverParameters, pivot: Point, centre: Point, *, steers: b
     motor = hub + np.array([0.0, 0.0, _STEERING_HEIGHT * rover.wheel_radius_m])
     down = np.array([0.0, 0.0, 0.5 * rover.wheel_radius_m])
     cable = _hang_cable(pivot, motor, np.array([0.0, 0.0, -0.03]))
-    return [(pivot, motor, radius), (motor, hub, 0.7 * radius), (hub, centre, radius), (motor, motor - down, _LEG_M), *cable]
+    return [
+        (pivot, motor, radius),
+        (motor, hub, 0.7 * radius),
+        (hub, centre, radius),
+        (motor, motor - down, _LEG_M),
+        *cable,
+    ]
 
 
 def _hang_cable(start: Point, end: Point, sag: Point) -> list[Cylinder]:
