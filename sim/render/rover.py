@@ -1,4 +1,4 @@
-"""A rover as an object on the ground, with the parts that hazard images and its shadow show, built from simple shapes."""
+"""A rover as an object on the ground, with the parts that hazard images and its shadow show."""
 
 from functools import cache
 
@@ -15,8 +15,8 @@ from marsyard.sim.render.objects import Objects
 ALBEDOS = {"deck": 0.14, "body": 0.3, "wheel": 0.26, "mast": 0.35}
 #: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
-#: Width of the legs, radius of the mast, thickness of the deck, m, assumed; length and width of the body as fractions of
-#: those of the deck.
+#: Width of the legs, radius of the mast, thickness of the deck, m, assumed; length and width of the body as fractions
+#: of those of the deck.
 _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 #: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
@@ -39,10 +39,10 @@ _EQUIPMENT = (
 #: Number of cleats of a wheel, their height, and radii of rim and hub, as fractions of the wheel's radius; number of
 #: spokes. Read from images of MER's wheels, accurate to about 10 %.
 _CLEATS, _CLEAT_HEIGHT, _RIM, _HUB, _SPOKES = 20, 0.05, 0.84, 0.3, 6
-#: Height of the steering motors above the wheels' centres, as a fraction of the radius; gap between bracket and wheel, m.
+#: Height of the steering motors above the wheels' centres, in radii; gap between bracket and wheel, m; assumed.
 _STEERING_HEIGHT, _BRACKET_GAP_M = 1.6, 0.03
 #: Number of sides of the prism that represents a cylinder, and of segments of a cable.
-_SIDES, _SEGMENTS = 12, 8
+_SIDES, _SEGMENTS = 8, 6
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
 _ARM_JOINTS_M = ((0.02, 0.25, -0.3), (0.04, -0.3, -0.34), (0.05, 0.22, -0.37))
@@ -76,9 +76,10 @@ def rover_objects(
     """
     outline = _deck_outline(rover)
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
-    wheel_size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
+    size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
     # the axis of a wheel is y
-    wheel = (_unit_wheel() * np.stack([wheel_size, np.ones(3)]))[..., [1, 2, 0]]
+    wheel = (_unit_wheel() * np.stack([size, 1.0 / size]))[..., [1, 2, 0]]
+    wheel[:, :, 1] /= np.linalg.norm(wheel[:, :, 1], axis=2, keepdims=True)
     parts = {"deck": [_build_deck(rover, outline)], "body": [_build_body(rover, stance)]}
     parts |= {"wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres]}
     parts |= {"mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)]}
@@ -184,12 +185,12 @@ def _build_mast(
     x, y, z = mast.base_m
     depth, height, extra_width = _HEAD_M
     middle = np.array([-_BEHIND_M - 0.5 * depth, 0.0, 0.0])
-    ends = [middle + (0.0, side * 0.5 * baseline_m, 0.0) for side in (-1.0, 1.0)]
+    ends = [middle + np.array([0.0, side * 0.5 * baseline_m, 0.0]) for side in (-1.0, 1.0)]
     head = [_box((0.6 * depth, baseline_m, 0.6 * height), middle)]
     head += [_box((depth, extra_width, height), end) for end in ends]
     lens = np.array([0.5 * depth, 0.0, 0.0])
     # camera centres lie on the y axis of the head's frame, in front of the lenses
-    lenses = [(end + lens, end + lens + (0.5 * _BEHIND_M, 0.0, 0.0), 0.25 * height) for end in ends]
+    lenses = [(end + lens, end + lens + np.array([0.5 * _BEHIND_M, 0.0, 0.0]), 0.25 * height) for end in ends]
     post = [(np.array([x, y, rover.deck_m]), np.array([x, y, z + mast.elbow_m[2]]), _MAST_RADIUS_M)]
     # the elevation axis, from the mast's elbow to the head's middle
     top, end = rover_from_head.apply(np.array([-mast.head_m, middle]))
@@ -232,7 +233,7 @@ def _box(size_m: tuple[float, float, float], middle_m: Point | tuple[float, floa
 def _stack_rings(
     profile: list[tuple[float, float]], outline: Float64[np.ndarray, "corners 2"]
 ) -> Float64[np.ndarray, "triangles 3 3"]:
-    """Return the triangles between copies of a closed outline around the z axis, at heights with factors of its size."""
+    """Return the triangles between copies of a closed outline around the z axis: heights, and factors of its size."""
     rings = np.stack([np.column_stack([factor * outline, np.full(len(outline), z)]) for z, factor in profile])
     a, b = rings, np.roll(rings, -1, axis=1)
     quads = np.stack([a[:-1], b[:-1], b[1:], a[:-1], b[1:], a[1:]], axis=2).reshape(-1, 3, 3)

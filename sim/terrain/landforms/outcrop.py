@@ -8,13 +8,13 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, resample
-from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs
+from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, locate_points
 
 #: Sizes of the slabs of the two generations of joints, relative to the parameter, and their relative heights (assumed).
 _SIZES, _HEIGHTS = (1.0, 0.37), (1.0, 0.4)
 #: Range of a slab's height around the mean, and depth of joints, in heights of the slabs; rise of the bedrock from its
 #: boundary into a patch, in heights per standard deviation of the field (assumed).
-_HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.7, 1.3, 3.0
+_HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: Amplitude of undulations of the sand in heights of the slabs, and their length in sizes of the slabs; displacement of
 #: the joints in sizes; height above the sand over which dust covers a slab, in heights (assumed).
 _SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _DUSTY_EDGE = 0.5, 2.5, 0.22, 0.35
@@ -61,10 +61,9 @@ class Outcrop(Parameters):
             self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
             for size, height in zip(_SIZES, _HEIGHTS, strict=True)
         ]
-        max_slab = 2.0 * sum(generation.rise for generation in generations)
         fields = np.stack([bedrock, sand_tone, bend_x, bend_y], axis=-1).astype(np.float32)
         edge = max(_DUSTY_EDGE * self.height_m, 1e-6)
-        add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, max_slab, edge)
+        add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, edge)
         ground.add(layer)
 
     def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
@@ -81,4 +80,7 @@ class Outcrop(Parameters):
             axis=-1,
         )
         joint, depth = max(size * self.joint_m, spacing_m), _JOINT_DEPTH * height * self.height_m
-        return Slabs(rng.uniform(0.02, 0.98, (cells, cells, 2)), slabs, period_m / cells, joint, depth, rise)
+        positions = locate_points(rng.uniform(0.02, 0.98, (cells, cells, 2)))
+        return Slabs(
+            positions, np.pad(slabs, ((1, 1), (1, 1), (0, 0)), mode="wrap"), period_m / cells, joint, depth, rise
+        )
