@@ -1,4 +1,4 @@
-"""A rover as an object on the ground: body, wheels, legs, mast and arm, built from boxes and cylinders."""
+"""A rover as an object on the ground, with the parts that hazard images and its shadow show."""
 
 from functools import cache
 
@@ -10,24 +10,54 @@ from marsyard.sim.dynamics.rover import RoverParameters, Stance, compute_bogie_p
 from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.objects import Objects
 
-#: Albedo of all rover parts, assumed: dusty bright metal and glass.
-ALBEDO = 0.25
+#: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast: dusty, matt,
+#: assumed.
+ALBEDOS = {"deck": 0.14, "body": 0.3, "wheel": 0.26, "mast": 0.35}
 #: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
-#: Dimensions that affect shadows only, assumed: width of the legs, radius of the mast and thickness of the deck, m;
-#: length and width of the body as fractions of those of the deck.
+#: Width of the legs, radius of the mast, thickness of the deck, m, assumed; length and width of the body as fractions
+#: of those of the deck.
 _LEG_M, _MAST_RADIUS_M, _DECK_M, _BODY_FRACTION = 0.05, 0.05, 0.04, (0.65, 0.4)
 #: The head: depth, height, width minus the cameras' baseline; distance of its front behind the cameras' centres, m.
 _HEAD_M, _BEHIND_M = (0.12, 0.12, 0.12), 0.04
-#: Number of sides of the prism that represents a cylinder.
-_SIDES = 24
+#: Left half of the deck's outline from front to rear, x and y as fractions of half its length and width: the solar
+#: panels of MER, with gaps between them (read from drawings of the press kit, accurate to about 5 %).
+_OUTLINE = (
+    *((0.78, 0.0), (0.78, 0.3), (0.71, 0.3), (0.71, 0.34), (0.75, 0.36), (0.62, 0.62), (0.5, 0.62), (0.53, 0.69)),
+    *((0.3, 1.0), (-0.3, 1.0), (-0.43, 0.8), (-0.37, 0.74), (-0.47, 0.74), (-0.8, 0.55), (-1.0, 0.4)),
+)
+#: Equipment on the deck: start and end (x, y as fractions of half the deck's length and width, height above the deck in
+#: m) and radius, m. Base of the mast's deployment drive, low-gain antenna, post and dish (0.28 m, press kit) of the
+#: high-gain antenna, UHF antenna, calibration target, and brackets at the front edge; positions assumed.
+_EQUIPMENT = (
+    *(((0.52, -0.08, 0.0), (0.52, 0.06, 0.14), 0.07), ((-0.4, -0.3, 0.0), (-0.4, -0.3, 0.55), 0.025)),
+    *(((0.05, -0.38, 0.0), (0.05, -0.38, 0.28), 0.03), ((0.06, -0.4, 0.3), (0.09, -0.39, 0.32), 0.14)),
+    *(((-0.55, 0.3, 0.0), (-0.55, 0.3, 0.25), 0.015), ((-0.3, 0.5, 0.0), (-0.3, 0.5, 0.06), 0.04)),
+    *(((0.72, 0.2, 0.0), (0.72, 0.2, 0.06), 0.03), ((0.74, -0.24, 0.0), (0.74, -0.24, 0.04), 0.045)),
+    *(((0.5, 0.58, 0.0), (0.5, 0.58, 0.05), 0.03), ((0.36, -0.85, 0.0), (0.36, -0.85, 0.035), 0.05)),
+)
+#: Number of cleats of a wheel, their height, and radii of rim and hub, as fractions of the wheel's radius; number of
+#: spokes. Read from images of MER's wheels, accurate to about 10 %.
+_CLEATS, _CLEAT_HEIGHT, _RIM, _HUB, _SPOKES = 20, 0.05, 0.84, 0.3, 6
+#: Height of the steering motors above the wheels' centres, in radii; gap between bracket and wheel, m; assumed.
+_STEERING_HEIGHT, _BRACKET_GAP_M = 1.6, 0.03
+#: Number of sides of the prism that represents a cylinder, and of segments of a cable.
+_SIDES, _SEGMENTS = 8, 6
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
-_ARM_JOINTS_M = ((0.06, 0.30, -0.02), (0.20, -0.30, 0.0), (0.22, 0.06, -0.01))
-_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.025, 0.06, 0.18
+_ARM_JOINTS_M = ((0.02, 0.25, -0.3), (0.04, -0.3, -0.34), (0.05, 0.22, -0.37))
+_ARM_RADIUS_M, _TURRET_RADIUS_M, _TURRET_M = 0.022, 0.035, 0.12
+#: Cables at the front, relative to the same point: start, end, and how far they hang forward and down, m; their radius.
+_CABLES_M = (
+    ((0.0, 0.4, -0.28), (0.0, -0.38, -0.26), (0.05, -0.08)),
+    ((0.0, 0.36, -0.31), (0.0, -0.42, -0.3), (0.03, -0.05)),
+)
+_CABLE_RADIUS_M = 0.009
 
-Triangles = Float64[np.ndarray, "triangles 3 3"]
+#: Position and normal of each corner of each triangle.
+Solid = Float64[np.ndarray, "triangles 3 2 3"]
 Point = Float64[np.ndarray, "3"]
+Cylinder = tuple[Point, Point, float]
 
 
 def rover_objects(
@@ -38,52 +68,134 @@ def rover_objects(
     elevation_rad: float,
     baseline_m: float = 0.3,
 ) -> Objects:
-    """Build the rover as one body, with the pose and joint angles of `stance` and the mast at these true angles.
+    """Build the rover with the pose and joint angles of `stance` and the mast at these true angles.
 
-    To add it to the rocks of a scene: ``Objects.join([scene.objects, rover_objects(...)])``. `baseline_m` is the
-    baseline of the widest stereo pair; the head is slightly wider.
+    Its bodies are deck, body with arm and legs, each wheel, and mast. To add it to the rocks of a scene:
+    ``Objects.join([scene.objects, rover_objects(...)])``. `baseline_m` is the baseline of the widest stereo pair; the
+    head is slightly wider.
     """
-    length, width = _BODY_FRACTION[0] * rover.body_length_m, _BODY_FRACTION[1] * rover.body_width_m
-    x, y, z = mast.base_m
-    parts = [
-        # body and deck
-        _box((length, width, rover.deck_m - rover.clearance_m), (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m))),
-        _box((rover.body_length_m, rover.body_width_m, _DECK_M), (0.0, 0.0, rover.deck_m)),
+    outline = _deck_outline(rover)
+    centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
+    size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
+    # the axis of a wheel is y
+    wheel = (_unit_wheel() * np.stack([size, 1.0 / size]))[..., [1, 2, 0]]
+    wheel[:, :, 1] /= np.linalg.norm(wheel[:, :, 1], axis=2, keepdims=True)
+    parts = {"deck": [_build_deck(rover, outline)], "body": [_build_body(rover, stance)]}
+    parts |= {"wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres]}
+    parts |= {"mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)]}
+    bodies = [
+        _create_body(_transform(solid, stance.world_from_rover), ALBEDOS[material])
+        for material, solids in parts.items()
+        for solid in solids
     ]
-    # start, end and radius, first of the mast up to the elbow
-    cylinders = [(np.array([x, y, rover.deck_m]), np.array([x, y, z + mast.elbow_m[2]]), _MAST_RADIUS_M)]
-    shoulder, elbow, wrist = np.array([0.5 * length, 0.0, rover.deck_m]) + np.array(_ARM_JOINTS_M)
+    # the sky is hidden by a frustum from the bottom of the body to a rectangle with the deck's area
+    x, y = outline.T
+    area = 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
+    scale = np.sqrt(area / (rover.body_length_m * rover.body_width_m))
+    corners = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    deck_size = np.array([rover.body_length_m, rover.body_width_m])
+    bottom = np.column_stack([corners * _BODY_FRACTION * deck_size, np.full(4, rover.clearance_m)])
+    top = np.column_stack([corners * scale * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
+    return Objects.join(bodies).with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
+
+
+def _create_body(solid: Solid, albedo: float) -> Objects:
+    """Create one body."""
+    faces = np.arange(3 * len(solid), dtype=np.int32).reshape(-1, 3)
+    names = np.full(len(solid), ROVER_NAME, dtype=np.int32)
+    points, normals = (solid[:, :, k].reshape(-1, 3) for k in (0, 1))
+    return Objects.of_mesh(points, normals, faces, names, albedo)
+
+
+def _deck_outline(rover: RoverParameters) -> Float64[np.ndarray, "corners 2"]:
+    """Corners of the deck, counter-clockwise from above."""
+    left = np.array(_OUTLINE)
+    outline = np.concatenate([left, left[:0:-1] * (1.0, -1.0)])
+    return np.asarray(outline * (0.5 * rover.body_length_m, 0.5 * rover.body_width_m))
+
+
+def _build_deck(rover: RoverParameters, outline: Float64[np.ndarray, "corners 2"]) -> Solid:
+    """Build the deck, which is star-shaped, with its equipment."""
+    size = np.array([0.5 * rover.body_length_m, 0.5 * rover.body_width_m, 1.0])
+    above = np.array([0.0, 0.0, rover.deck_m])
+    equipment = [
+        (start * size + above, end * size + above, radius) for start, end, radius in map(_as_points, _EQUIPMENT)
+    ]
+    half = 0.5 * _DECK_M
+    profile = [(rover.deck_m + z, factor) for z, factor in ((-half, 0.0), (-half, 1.0), (half, 1.0), (half, 0.0))]
+    return np.concatenate([_shade_flat(_stack_rings(profile, outline)), _make_cylinders(equipment)])
+
+
+def _as_points(cylinder: tuple[tuple[float, ...], tuple[float, ...], float]) -> Cylinder:
+    return np.array(cylinder[0]), np.array(cylinder[1]), cylinder[2]
+
+
+def _build_body(rover: RoverParameters, stance: Stance) -> Solid:
+    """Build the body with the stowed arm, cables, and the legs with steering motors."""
+    length, width = _BODY_FRACTION[0] * rover.body_length_m, _BODY_FRACTION[1] * rover.body_width_m
+    middle = (0.0, 0.0, 0.5 * (rover.deck_m + rover.clearance_m))
+    front = np.array([0.5 * length, 0.0, rover.deck_m])
+    shoulder, elbow, wrist = front + np.array(_ARM_JOINTS_M)
     turret = np.array([0.0, 0.5 * _TURRET_M, 0.0])
-    cylinders += [(shoulder, elbow, _ARM_RADIUS_M), (elbow, wrist, _ARM_RADIUS_M)]
-    cylinders.append((wrist - turret, wrist + turret, _TURRET_RADIUS_M))
+    cylinders = [(shoulder, elbow, _ARM_RADIUS_M), (elbow, wrist, _ARM_RADIUS_M)]
+    # the turret carries instruments on two crossed axes
+    cylinders += [(wrist - axis, wrist + axis, _TURRET_RADIUS_M) for axis in (turret, turret[[1, 0, 2]])]
+    for start, end, sag in _CABLES_M:
+        cylinders += _hang_cable(front + start, front + end, np.array([sag[0], 0.0, sag[1]]))
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     for side, bogie in enumerate(compute_bogie_pivots(rover, stance.differential_rad)):
-        front, middle, rear = centres[3 * side : 3 * side + 3]
         rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
-        legs = ((rocker, front), (rocker, bogie), (bogie, middle), (bogie, rear))
-        cylinders += [(start, end, 0.5 * _LEG_M) for start, end in legs]
-    half_axle = np.array([0.0, 0.5 * rover.wheel_width_m, 0.0])
-    cylinders += [(centre - half_axle, centre + half_axle, rover.wheel_radius_m) for centre in centres]
-    # camera bar behind the cameras' centres, which lie on the y axis of the head's frame
+        cylinders.append((rocker, bogie, 0.5 * _LEG_M))
+        for wheel, pivot in enumerate((rocker, bogie, bogie)):
+            cylinders += _build_leg(rover, pivot, centres[3 * side + wheel], steers=wheel != 1)
+    box = _box((length, width, rover.deck_m - rover.clearance_m), middle)
+    return np.concatenate([box, _make_cylinders(cylinders)])
+
+
+def _build_leg(rover: RoverParameters, pivot: Point, centre: Point, *, steers: bool) -> list[Cylinder]:
+    """Build a leg from a pivot to a wheel's hub: to its inner side, with the motor of a steered wheel above it."""
+    inwards = np.array([0.0, -np.sign(centre[1]), 0.0])
+    hub = centre + (0.5 * rover.wheel_width_m + _BRACKET_GAP_M) * inwards
+    radius = 0.5 * _LEG_M
+    if not steers:
+        return [(pivot, hub, radius), (hub, centre, radius)]
+    motor = hub + np.array([0.0, 0.0, _STEERING_HEIGHT * rover.wheel_radius_m])
+    down = np.array([0.0, 0.0, 0.5 * rover.wheel_radius_m])
+    cable = _hang_cable(pivot, motor, np.array([0.0, 0.0, -0.03]))
+    return [
+        (pivot, motor, radius),
+        (motor, hub, 0.7 * radius),
+        (hub, centre, radius),
+        (motor, motor - down, _LEG_M),
+        *cable,
+    ]
+
+
+def _hang_cable(start: Point, end: Point, sag: Point) -> list[Cylinder]:
+    """Approximate a cable by a parabola whose middle is displaced by `sag`."""
+    t = np.linspace(0.0, 1.0, _SEGMENTS + 1)[:, None]
+    points = start + t * (end - start) + 4.0 * t * (1.0 - t) * sag
+    return [(points[k], points[k + 1], _CABLE_RADIUS_M) for k in range(_SEGMENTS)]
+
+
+def _build_mast(
+    rover: RoverParameters, mast: MastGeometry, rover_from_head: RigidTransform, baseline_m: float
+) -> Solid:
+    """Build the mast up to the elbow, and the head: a bar behind the cameras' centres, with a camera at each end."""
+    x, y, z = mast.base_m
     depth, height, extra_width = _HEAD_M
-    rover_from_head = mast.rover_from_head(azimuth_rad, elevation_rad)
-    middle_of_head = (-_BEHIND_M - 0.5 * depth, 0.0, 0.0)
-    parts.append(_transform(_box((depth, baseline_m + extra_width, height), middle_of_head), rover_from_head))
+    middle = np.array([-_BEHIND_M - 0.5 * depth, 0.0, 0.0])
+    ends = [middle + np.array([0.0, side * 0.5 * baseline_m, 0.0]) for side in (-1.0, 1.0)]
+    head = [_box((0.6 * depth, baseline_m, 0.6 * height), middle)]
+    head += [_box((depth, extra_width, height), end) for end in ends]
+    lens = np.array([0.5 * depth, 0.0, 0.0])
+    # camera centres lie on the y axis of the head's frame, in front of the lenses
+    lenses = [(end + lens, end + lens + np.array([0.5 * _BEHIND_M, 0.0, 0.0]), 0.25 * height) for end in ends]
+    post = [(np.array([x, y, rover.deck_m]), np.array([x, y, z + mast.elbow_m[2]]), _MAST_RADIUS_M)]
     # the elevation axis, from the mast's elbow to the head's middle
-    top, end = rover_from_head.apply(np.array([-mast.head_m, middle_of_head]))
-    cylinders.append((top, end, _MAST_RADIUS_M))
-    triangles = _transform(np.concatenate([*parts, _make_cylinders(cylinders)]), stance.world_from_rover)
-    face_normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals = face_normals / np.linalg.norm(face_normals, axis=1, keepdims=True)
-    faces = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
-    names = np.full(len(triangles), ROVER_NAME, dtype=np.int32)
-    objects = Objects.of_mesh(triangles.reshape(-1, 3), np.repeat(normals, 3, axis=0), faces, names, ALBEDO)
-    # the sky is hidden by a frustum from the bottom of the body to the deck; wheels and legs are below the deck
-    corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    bottom = np.column_stack([0.5 * corners * (length, width), np.full(4, rover.clearance_m)])
-    deck_size = (rover.body_length_m, rover.body_width_m)
-    top = np.column_stack([0.5 * corners * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
-    return objects.with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
+    top, end = rover_from_head.apply(np.array([-mast.head_m, middle]))
+    solids = _transform(np.concatenate([*head, _make_cylinders(lenses)]), rover_from_head)
+    return np.concatenate([solids, _make_cylinders([*post, (top, end, _MAST_RADIUS_M)])])
 
 
 def rover_sphere(
@@ -112,38 +224,75 @@ def _length(*components: float | Float64[np.ndarray, "3"]) -> float:
     return float(np.linalg.norm(np.hstack(components)))
 
 
-def _box(size_m: tuple[float, float, float], middle_m: tuple[float, float, float]) -> Triangles:
+def _box(size_m: tuple[float, float, float], middle_m: Point | tuple[float, float, float]) -> Solid:
     """Create a box with edges along the axes."""
-    return np.asarray(_unit_box() * np.array(size_m) + np.array(middle_m))
+    half = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    return _shade_flat(_stack_rings([(-0.5, 0.0), (-0.5, 1.0), (0.5, 1.0), (0.5, 0.0)], half) * size_m + middle_m)
+
+
+def _stack_rings(
+    profile: list[tuple[float, float]], outline: Float64[np.ndarray, "corners 2"]
+) -> Float64[np.ndarray, "triangles 3 3"]:
+    """Return the triangles between copies of a closed outline around the z axis: heights, and factors of its size."""
+    rings = np.stack([np.column_stack([factor * outline, np.full(len(outline), z)]) for z, factor in profile])
+    a, b = rings, np.roll(rings, -1, axis=1)
+    quads = np.stack([a[:-1], b[:-1], b[1:], a[:-1], b[1:], a[1:]], axis=2).reshape(-1, 3, 3)
+    # a factor of 0 gives triangles without area
+    return np.asarray(quads[np.linalg.norm(_face_normals(quads), axis=1) > 0.0])
+
+
+def _face_normals(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Float64[np.ndarray, "triangles 3"]:
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+
+
+def _shade_flat(triangles: Float64[np.ndarray, "triangles 3 3"]) -> Solid:
+    """Return triangles with the normals of their planes."""
+    normals = _face_normals(triangles)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.stack([triangles, np.broadcast_to(normals[:, None], triangles.shape)], axis=2)
 
 
 @cache
-def _unit_box() -> Triangles:
-    import trimesh  # imported at the first use, here and below, because the import is slow
-
-    return np.asarray(trimesh.creation.box().triangles, dtype=np.float64)
+def _unit_cylinder() -> Solid:
+    """Return a cylinder of radius 1 around the z axis from z = 0 to z = 1; its side is smooth."""
+    angles = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    outline = np.column_stack([np.cos(angles), np.sin(angles)])
+    solid = _shade_flat(_stack_rings([(0.0, 0.0), (0.0, 1.0), (1.0, 1.0), (1.0, 0.0)], outline))
+    is_side = np.abs(solid[:, 0, 1, 2]) < 0.5
+    solid[is_side, :, 1] = solid[is_side, :, 0] * (1.0, 1.0, 0.0)
+    return solid
 
 
 @cache
-def _unit_cylinder() -> Triangles:
-    """Return a cylinder of radius 1 around the z axis from z = 0 to z = 1."""
-    import trimesh
+def _unit_wheel() -> Solid:
+    """Return a wheel of radius 1 and width 1 around the z axis: crowned tread with cleats, rim, hub and spokes."""
+    # a cleat is a narrow ridge: two corners at its top, one between cleats
+    radii = np.tile([1.0, 1.0, 1.0 - _CLEAT_HEIGHT], _CLEATS)
+    angles = 2.0 * np.pi / _CLEATS * (np.arange(_CLEATS)[:, None] + np.array([-0.1, 0.1, 0.5])).ravel()
+    outline = radii[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    tread = [(-0.5, 0.9), (-0.36, 1.0), (0.36, 1.0), (0.5, 0.9), (0.42, _RIM), (-0.42, _RIM), (-0.5, 0.9)]
+    axis = np.array([0.0, 0.0, 0.45])
+    radial = [np.array([np.cos(a), np.sin(a), 0.0]) for a in 2.0 * np.pi * np.arange(_SPOKES) / _SPOKES]
+    spokes = [(_HUB * d, (_RIM + 0.03) * d + 0.3 * axis, 0.07) for d in radial]
+    return np.concatenate([_shade_flat(_stack_rings(tread, outline)), _make_cylinders([(-axis, axis, _HUB), *spokes])])
 
-    cylinder = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=_SIDES)
-    return np.asarray(cylinder.triangles + np.array([0.0, 0.0, 0.5]), dtype=np.float64)
 
-
-def _make_cylinders(cylinders: list[tuple[Point, Point, float]]) -> Triangles:
+def _make_cylinders(cylinders: list[Cylinder]) -> Solid:
     """Create cylinders between the centres of their ends, with these radii."""
     starts, ends = (np.array([cylinder[end] for cylinder in cylinders]) for end in (0, 1))
     radii = np.array([radius for _, _, radius in cylinders])[:, None]
     axes = ends - starts
     x = np.cross(np.eye(3)[np.argmin(np.abs(axes), axis=1)], axes)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    y = np.cross(axes / np.linalg.norm(axes, axis=1, keepdims=True), x)
-    scaled_axes = np.stack([radii * x, radii * y, axes], axis=1)
-    return np.asarray(starts[:, None, None] + _unit_cylinder() @ scaled_axes[:, None]).reshape(-1, 3, 3)
+    z = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    rotation = np.stack([x, np.cross(z, x), z], axis=1)
+    stretched = np.stack([radii * rotation[:, 0], radii * rotation[:, 1], axes], axis=1)
+    unit = _unit_cylinder()
+    points = starts[:, None, None] + unit[:, :, 0] @ stretched[:, None]
+    return np.stack([points, unit[:, :, 1] @ rotation[:, None]], axis=3).reshape(-1, 3, 2, 3)
 
 
-def _transform(triangles: Triangles, new_from_old: RigidTransform) -> Triangles:
-    return np.asarray(new_from_old.apply(triangles.reshape(-1, 3))).reshape(-1, 3, 3)
+def _transform(solid: Solid, new_from_old: RigidTransform) -> Solid:
+    points, normals = solid[:, :, 0].reshape(-1, 3), solid[:, :, 1].reshape(-1, 3)
+    moved = [new_from_old.apply(points), new_from_old.rotation.apply(normals)]
+    return np.stack(moved, axis=1).reshape(-1, 3, 2, 3)

@@ -22,6 +22,7 @@ from marsyard.sim.render.kernels.sweep import height_range
 from marsyard.sim.render.objects import Objects
 from marsyard.sim.render.pebbles import PebbleField
 from marsyard.sim.render.photometry import CloudLayer, Photometry, Sun, Texture
+from marsyard.sim.render.rock_surface import describe_grain
 from marsyard.sim.render.shading import Light, Materials
 from marsyard.sim.render.shadows import ObjectSurfaces, Occluders
 from marsyard.sim.render.skylight import MOUND_RANGE, Mounds, Obstructions, Shelter
@@ -225,6 +226,7 @@ class Scene:
                 to_device(Int32, objects.body_of_triangle),
                 to_device(Float, objects.albedo),
                 to_device(Float, self._dust_albedo()),
+                to_device(Float, self._grain()),
             )
         return Materials(
             RoughGround.of(self.relief),
@@ -238,6 +240,12 @@ class Scene:
         """Mean albedo of the level faces of each body: dust covers a part of those of rocks."""
         covered = self.dust_cover * self.objects.is_rock
         return np.asarray((1.0 - covered) * self.objects.albedo + covered * self.dust_albedo)
+
+    def _grain(self) -> FloatArray[np.ndarray, "bodies 4"]:
+        """Grain of each rock; none without texture."""
+        sizes = 0.5 * (self.objects.bounds[:, 3:5] - self.objects.bounds[:, :2]).sum(axis=1)
+        has_grain = self.objects.is_rock & bool(self.object_texture.amplitudes)
+        return describe_grain(self.objects.names, sizes * has_grain)
 
     def light(self, time_s: float) -> Light:
         """Return the illumination at a time."""

@@ -1,15 +1,15 @@
 """The radiance of every pixel: sample the surface that its ray meets, then texture, illumination and reflectance."""
 
-import math
 from dataclasses import dataclass
 
 import drjit as dr
 
-from marsyard.sim.render.arrays import Values, clip, compiled, larger, smaller, where
-from marsyard.sim.render.device import Array3f, Bool, Float, Float64, Int32, UInt32
+from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
+from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.pebbles import PebbleField, pebble_surface
 from marsyard.sim.render.primary import Hits, Points, Pose, Rays, locate
 from marsyard.sim.render.reflectance import Angles, Law, Sky
+from marsyard.sim.render.rock_surface import WEAR, RockSurface, dust_cover, rock_surface, texture_frame
 from marsyard.sim.render.shadows import ObjectSurfaces
 from marsyard.sim.render.skylight import Obstructions
 from marsyard.sim.render.skyline import Skyline
@@ -19,9 +19,6 @@ from marsyard.sim.render.texture import Octaves, RoughGround, log_relative_albed
 
 #: Maximum footprint, in samples, for which the finest level is used; the B-spline contains no finer detail.
 MAX_SHARP_FOOTPRINT = 1.2
-#: Angles between a rock's face and the horizontal, radians, up to which dust stays on it (about the angle of repose),
-#: and from which it is bare: a thin, cohesive film stays on steep faces (assumed).
-MAX_DUSTY_TILT, MIN_BARE_TILT = math.radians(30.0), math.radians(100.0)
 #: Body number of pixels that see the ground, and of pixels that see the sky.
 GROUND, SKY = -1, -2
 
@@ -111,15 +108,6 @@ def _sample_ground(terrain: Terrain, points: Points, level: Values) -> _Surface:
     )[0]
 
 
-def dust_cover(normal_z: Values) -> Values:
-    """Fraction of the dust on level faces that stays on a face: all below `MAX_DUSTY_TILT`, none above `MIN_BARE_TILT`.
-
-    Between them it is linear in the vertical component of the unit normal.
-    """
-    bare, dusty = math.cos(MIN_BARE_TILT), math.cos(MAX_DUSTY_TILT)
-    return clip((normal_z - bare) / (dusty - bare), 0.0, 1.0)
-
-
 @compiled
 def shade(
     terrain: Terrain, pose: Pose, rays: Rays, hits: Hits, light: Light, sun_fraction: Values, materials: Materials
@@ -129,6 +117,7 @@ def shade(
     is_object, is_ground = points.is_object, points.is_ground
     ground = _sample_ground(terrain, points, hits.level)
     normal, albedo = ground.normal(), ground.albedo
+    strength, texture_position = Float(1.0), Array3f64(points.position)
     body, texture_footprint = dr.select(is_ground, Int32(GROUND), SKY), dr.select(is_ground, points.footprint, dr.inf)
     if materials.objects is not None:
         object_normal = materials.objects.normal_at(hits, is_object)
@@ -137,12 +126,27 @@ def shade(
         body = dr.select(is_object, object_body, body)
         object_albedo = dr.gather(Float, materials.objects.albedo, UInt32(object_body), is_object)
         dust_albedo = dr.gather(Float, materials.objects.dust_albedo, UInt32(object_body), is_object)
-        albedo = dr.select(is_object, dr.lerp(object_albedo, dust_albedo, dust_cover(object_normal.z)), albedo)
         facing = -dr.dot(Array3f(points.direction), object_normal)
         object_footprint = Float(hits.distance) * rays.pixel_angles / dr.sqrt(larger(facing, 0.05))
+        grain = dr.gather(Array4f, materials.objects.grain, UInt32(object_body), is_object)
+        is_grainy = is_object & (grain.w > 0.0)
+        rock = where(
+            is_grainy,
+            lambda: rock_surface(grain, points.position, object_normal, object_footprint),
+            RockSurface(Array3f(0.0), Float(0.0), dust_cover(object_normal.z)),
+        )
+        object_albedo = dr.lerp(object_albedo, dust_albedo, rock.dust) * dr.exp(rock.log_albedo)
+        albedo = dr.select(is_object, object_albedo, albedo)
+        rock_position, rock_footprint = texture_frame(grain, points.position, object_footprint)
+        texture_position = dr.select(is_grainy, rock_position, texture_position)
         texture_footprint = dr.select(is_object, object_footprint, texture_footprint)
+        texture_footprint = dr.select(is_grainy, rock_footprint, texture_footprint)
+        strength = dr.select(is_object & ~is_grainy, WEAR, 1.0)
     is_surface = is_ground | is_object
-    smooth_normal, strength = dr.select(is_surface, normal, 0.0), Float(1.0)
+    smooth_normal = dr.select(is_surface, normal, 0.0)
+    if materials.objects is not None:
+        grainy_normal = normal - (rock.slope - dr.dot(rock.slope, normal) * normal)
+        normal = dr.select(is_grainy, dr.normalize(grainy_normal), normal)
     slopes = None
     if materials.relief is not None:
         # tilted normals change the mean radiance, but the reflectance law already includes the mean effect of all
@@ -150,7 +154,7 @@ def shade(
         slopes = relief_slopes(materials.relief, points.position, dr.select(is_ground, points.footprint, dr.inf))
         x, y = points.position.x, points.position.y
         roughness = dr.select(is_ground, materials.relief.roughness.interpolate(x, y), 0.0)
-        strength = dr.select(is_ground, materials.relief.texture.interpolate(x, y), 1.0)
+        strength = dr.select(is_ground, materials.relief.texture.interpolate(x, y), strength)
         tilted = _Surface(ground.slope_x + roughness * slopes.x, ground.slope_y + roughness * slopes.y, albedo)
         normal = dr.select(is_ground, tilted.normal(), normal)
         slopes.resolved, slopes.unresolved = (
@@ -167,7 +171,7 @@ def shade(
         albedo *= dr.exp(pebbles.log_albedo)
     angles = Angles.of(normal, points.direction, light.sun)
     textures = materials.ground_texture, materials.object_texture
-    albedo *= dr.exp(log_relative_albedo(*textures, is_object, points.position, texture_footprint, strength))
+    albedo *= dr.exp(log_relative_albedo(*textures, is_object, texture_position, texture_footprint, strength))
     # a copy: products in place would change the fraction that is returned
     fraction = Float(sun_fraction)
     if light.caster_diameter is not None:

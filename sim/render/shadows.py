@@ -25,13 +25,15 @@ class Occluders:
 class ObjectSurfaces:
     """Normals at the corners of all triangles, body of each triangle, and albedo of each body.
 
-    `dust_albedo` is that of a body's level faces.
+    `dust_albedo` is that of a body's level faces, `grain` that of `rock_surface.describe_grain`, of size 0 for
+    bodies without grain.
     """
 
     normals: Values
     body_of_triangle: Values
     albedo: Values
     dust_albedo: Values
+    grain: Values
 
     def normal_at(self, hits: Hits, active: Values) -> Values:
         """Interpolate the unit normals at the corners of the triangles that are hit."""

@@ -44,7 +44,7 @@ class Octaves:
         return cls(Float64(coarsest_m), to_device(Float, padded), UInt32(len(padded) - 1))
 
 
-def _fade(footprint: Values, cell: Values, fading: float) -> Values:
+def fade_octave(footprint: Values, cell: Values, fading: float) -> Values:
     """Compute the fraction of an octave's amplitude that remains in the mean over a pixel's footprint."""
     ratio = footprint / Float(cell)
     fade = larger(1.0 - fading * ratio * ratio, 0.0)
@@ -70,7 +70,7 @@ def log_relative_albedo(
             dr.gather(Float, objects.amplitudes, dr.minimum(octave, objects.count)),
             dr.gather(Float, ground.amplitudes, dr.minimum(octave, ground.count)),
         )
-        gain = strength * amplitude * _fade(footprint, cell, FADING)
+        gain = strength * amplitude * fade_octave(footprint, cell, FADING)
         noise = noise_in_space(list(position), cell, octave)
         return octave + 1, 0.5 * cell, total + gain * noise - 0.5 * NOISE_VARIANCE * gain * gain
 
@@ -145,7 +145,7 @@ def relief_slopes(ground: RoughGround, position: Values, footprint: Values) -> S
 
     def add_octave(octave: Values, cell: Values, total: Slopes) -> tuple[Values, Values, Slopes]:
         gain = dr.gather(Float, octaves.amplitudes, dr.minimum(octave, octaves.count)) / Float(cell)
-        fade, variance = _fade(footprint, cell, SLOPE_FADING), gain * gain * SLOPE_VARIANCE
+        fade, variance = fade_octave(footprint, cell, SLOPE_FADING), gain * gain * SLOPE_VARIANCE
         _, slope_x, slope_y = noise_in_plane(list(position)[:2], cell, octave)
         total = Slopes(
             total.x + gain * fade * slope_x,

@@ -8,17 +8,25 @@ from pydantic import Field
 
 from marsyard.sim.parameters import Fraction, NonNegative, Parameters, Positive, bounded_field
 from marsyard.sim.terrain.landforms.ground import TerrainGround, draw_smooth_fields, resample
-from marsyard.sim.terrain.landforms.kernels.bedrock import add_slabs
+from marsyard.sim.terrain.landforms.kernels.bedrock import Slabs, add_slabs, locate_points
 
 #: Sizes of the slabs of the two generations of joints, relative to the parameter, and their relative heights (assumed).
-_SIZES, _HEIGHTS = (1.0, 0.4), (1.0, 0.35)
+_SIZES, _HEIGHTS = (1.0, 0.37), (1.0, 0.4)
+#: Range of a slab's height around the mean, and depth of joints, in heights of the slabs; rise of the bedrock from its
+#: boundary into a patch, in heights per standard deviation of the field (assumed).
+_HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
+#: Amplitude of undulations of the sand in heights of the slabs, and their length in sizes of the slabs; displacement of
+#: the joints in sizes; height above the sand over which dust covers a slab, in heights (assumed).
+_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _DUSTY_EDGE = 0.5, 2.5, 0.22, 0.35
 
 
 class Outcrop(Parameters):
-    """Patches of bedrock, divided by joints into polygonal slabs.
+    """Patches of bedrock, divided by joints into polygonal slabs with rounded edges, partly below sand.
 
-    A slab is a cell of a Voronoi diagram whose point lies in a patch: the level set of a smooth random field. It has
-    its own height, tilt and albedo. Slabs of a second, finer generation lie on the patches too.
+    The bedrock is above the sand inside the level set of a smooth random field, and dips below it at the boundary.
+    Slabs are cells of a Voronoi diagram with curved borders. Each has its own height, tilt and albedo, and is divided
+    by a second, finer generation of joints. Joints differ in width and depth. Sand, with undulations, fills them where
+    it is higher than their floor.
     """
 
     fraction: Annotated[Fraction, Field(description="fraction of the ground in patches of bedrock")] = 0.3
@@ -29,30 +37,50 @@ class Outcrop(Parameters):
     joint_m: Annotated[Positive, Field(description="half width of the sand-filled joints between slabs, m")] = 0.06
     log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "mean logarithm of albedo divided by the sand's")] = 0.2
     log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm")] = 0.1
+    sand_log_albedo_sd: Annotated[
+        float, bounded_field(0.0, 1.0, "the same of the sand between slabs, which varies from patch to patch")
+    ] = 0.15
 
     def apply(self, ground: TerrainGround, rng: Generator) -> None:
         """Add the slabs of both generations."""
-        field = draw_smooth_fields(ground.period_m, self.patch_m, self.patch_m, 0.0, rng)[..., 0]
         layer = ground.coarser(0.5 * self.joint_m)
-        patches = resample(np.ascontiguousarray(field), layer.side)
-        threshold = np.quantile(patches, 1.0 - self.fraction)
-        for size, height in zip(_SIZES, _HEIGHTS, strict=True):
-            cells = max(round(ground.period_m / (size * self.slab_m)), 3)
-            points = rng.uniform(0.05, 0.95, (cells, cells, 2))
-            corner = np.arange(cells)
-            columns, rows = (
-                ((points[..., axis] + offset) * layer.side / cells).astype(int) % layer.side
-                for axis, offset in ((0, corner[None, :]), (1, corner[:, None]))
-            )
-            exists = patches[rows, columns] > threshold
-            slabs = np.stack(
-                [
-                    height * self.height_m * rng.uniform(0.3, 1.7, exists.shape) * exists,
-                    *(np.tan(np.radians(self.tilt_deg)) * rng.standard_normal((2, *exists.shape)) * exists),
-                    (self.log_albedo * height + self.log_albedo_sd * rng.standard_normal(exists.shape)) * exists,
-                ],
-                axis=-1,
-            )
-            joint = max(size * self.joint_m, layer.spacing_m)
-            add_slabs(layer.height, layer.log_albedo, layer.spacing_m, points, slabs, ground.period_m / cells, joint)
+        patches = draw_smooth_fields(ground.period_m, self.patch_m, self.patch_m, 0.0, rng)
+        sand_m = _SAND_LENGTH * self.slab_m
+        sand = draw_smooth_fields(ground.period_m, sand_m, sand_m, 0.0, rng)[..., 0]
+        bends = _DISPLACEMENT * self.slab_m * draw_smooth_fields(ground.period_m, *(0.6 * self.slab_m,) * 2, 0.0, rng)
+        rows = min(len(bends), layer.side)
+        patch, tone, sand, bend_x, bend_y = (
+            resample(np.ascontiguousarray(field), rows)
+            for field in (*np.moveaxis(patches, -1, 0), sand, *np.moveaxis(bends, -1, 0))
+        )
+        # the components of a smooth field have the variance 1/2
+        depth = np.sqrt(2.0) * _RISE * (patch - np.quantile(patch, 1.0 - self.fraction))
+        bedrock = self.height_m * (np.minimum(depth, 1.0) - np.sqrt(2.0) * _SAND_HEIGHT * sand)
+        sand_tone = np.sqrt(2.0) * self.sand_log_albedo_sd * tone
+        generations = [
+            self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
+            for size, height in zip(_SIZES, _HEIGHTS, strict=True)
+        ]
+        fields = np.stack([bedrock, sand_tone, bend_x, bend_y], axis=-1).astype(np.float32)
+        edge = max(_DUSTY_EDGE * self.height_m, 1e-6)
+        add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, edge)
         ground.add(layer)
+
+    def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
+        """Draw the slabs of a generation with this size and height relative to the parameters."""
+        cells = max(round(period_m / (size * self.slab_m)), 3)
+        rise = _HEIGHT_RANGE * height * self.height_m
+        slabs = np.stack(
+            [
+                rise * rng.uniform(-1.0, 1.0, (cells, cells)),
+                *(height * np.tan(np.radians(self.tilt_deg)) * rng.standard_normal((2, cells, cells))),
+                (self.log_albedo + self.log_albedo_sd * rng.standard_normal((cells, cells))) * height / sum(_HEIGHTS),
+                rng.random((cells, cells)),
+            ],
+            axis=-1,
+        )
+        joint, depth = max(size * self.joint_m, spacing_m), _JOINT_DEPTH * height * self.height_m
+        positions = locate_points(rng.uniform(0.02, 0.98, (cells, cells, 2)))
+        return Slabs(
+            positions, np.pad(slabs, ((1, 1), (1, 1), (0, 0)), mode="wrap"), period_m / cells, joint, depth, rise
+        )

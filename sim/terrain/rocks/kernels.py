@@ -108,29 +108,37 @@ def place_discs(
 def stamp_tails(
     samples: NDArray[np.float32], spacing: float, tails: Array, downwind_x: float, downwind_y: float, log_albedo: float
 ) -> None:
-    """Raise ridges in the lee of rocks; `samples` are heights and albedos on a periodic square, changed in place.
+    """Raise ridges in the lee of rocks, and dig moats on the other side.
 
-    `tails` has rows (x, y, half width, distance of the tip, height). `log_albedo` is the natural logarithm of the
-    albedo of a ridge divided by that of the ground. The ridge rises from the centre of the rock to its edge. Its width
-    and height are largest there, and decrease linearly to its tip. Its cross section at the offset t is
+    `samples` are heights and albedos on a periodic square, changed in place. `tails` has rows (x, y, half width,
+    distance of the tip, height, depth of the moat). `log_albedo` is the natural logarithm of the albedo of a ridge
+    divided by that of the ground. The ridge rises from the centre of the rock to its edge. Its width and height are
+    largest there, and decrease linearly to its tip. Its cross section at the offset t is
     ``(1 - (t / half width)**2)**2``. The maximum slope is 1.54 times the height divided by the half width: the maximum
-    of ``4 t (1 - t**2)`` at ``t = 1 / sqrt(3)``.
+    of ``4 t (1 - t**2)`` at ``t = 1 / sqrt(3)``. A moat has the same cross section, from 0.5 to 1.8 half widths from
+    the centre, and is in proportion to the cosine of the azimuth from the wind.
     """
     # the side is a power of two: `& mask` returns the index in the periodic square
     mask = samples.shape[0] - 1
     for n in range(tails.shape[0]):
-        x, y, half_width, tip, height = tails[n]
+        x, y, half_width, tip, height, moat = tails[n]
+        margin = 1.8 * half_width
         x_end, y_end = x + tip * downwind_x, y + tip * downwind_y
         for i in range(
-            math.floor((min(y, y_end) - half_width) / spacing), math.ceil((max(y, y_end) + half_width) / spacing) + 1
+            math.floor((min(y, y_end) - margin) / spacing), math.ceil((max(y, y_end) + margin) / spacing) + 1
         ):
             for j in range(
-                math.floor((min(x, x_end) - half_width) / spacing),
-                math.ceil((max(x, x_end) + half_width) / spacing) + 1,
+                math.floor((min(x, x_end) - margin) / spacing), math.ceil((max(x, x_end) + margin) / spacing) + 1
             ):
                 dx, dy = j * spacing - x, i * spacing - y
                 along, across = dx * downwind_x + dy * downwind_y, dy * downwind_x - dx * downwind_y
-                if along <= 0.0 or along >= tip:
+                if along < 0.0:
+                    distance = math.hypot(along, across)
+                    t = (distance / half_width - 1.15) / 0.65
+                    if abs(t) < 1.0:
+                        samples[i & mask, j & mask, 0] += moat * (1.0 - t * t) ** 2 * along / distance
+                    continue
+                if along >= tip:
                     continue
                 if along < half_width:
                     rise = along / half_width

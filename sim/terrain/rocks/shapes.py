@@ -28,7 +28,9 @@ class RockForm:
     """Distributions of the shapes of one form.
 
     - cuts, cut_distances: ranges of the number of planes that cut an ellipsoid, and of their distances from its centre
-    - sharpness: exponents of the first and the last shape in the norm that combines the cuts and rounds their edges
+    - sharpness: exponents of the first and the last shape in the norm that combines the cuts and rounds their edges.
+      The radius of an edge is about the rock's radius divided by the exponent: abrasion rounds all edges, by 1 to 20 %
+      of the radius (assumed)
     - bumps: RMS height of bumps divided by the radius, in each wavenumber band
     - short_axis_ratios: range of shortest / longest axis; middle / longest axis is 0.65 to 0.95
     - buried_fractions: range of the fraction of the height that is below the ground: 20 to 60 % (assumed). Overhangs
@@ -41,7 +43,7 @@ class RockForm:
 
     cuts: tuple[int, int] = (8, 16)
     cut_distances: tuple[float, float] = (0.45, 0.85)
-    sharpness: tuple[float, float] = (200.0, 10.0)
+    sharpness: tuple[float, float] = (50.0, 5.0)
     bumps: tuple[float, float, float, float] = (0.03, 0.015, 0.008, 0.004)
     short_axis_ratios: tuple[float, float] = (0.6, 0.85)
     buried_fractions: tuple[float, float] = (0.2, 0.6)
@@ -56,18 +58,18 @@ class RockForm:
 FORMS = {
     "block": RockForm(),
     "clinker": RockForm(bumps=(0.1, 0.045, 0.022, 0.0), buried_fractions=(0.3, 0.5), folded=True),
-    "vesicular": RockForm(cuts=(10, 18), sharpness=(80.0, 12.0), bumps=(0.03, 0.02, 0.012, 0.006), pits=90),
+    "vesicular": RockForm(cuts=(10, 18), sharpness=(40.0, 6.0), bumps=(0.03, 0.02, 0.012, 0.006), pits=90),
     "slab": RockForm(
         cuts=(8, 12),
         cut_distances=(0.55, 0.95),
-        sharpness=(250.0, 40.0),
+        sharpness=(80.0, 14.0),
         short_axis_ratios=(0.9, 1.0),
         buried_fractions=(0.3, 0.7),
         flatness=0.35,
         bedding=True,
     ),
     "ventifact": RockForm(
-        cuts=(5, 9), cut_distances=(0.4, 0.75), sharpness=(400.0, 120.0), bumps=(0.012, 0.008, 0.004, 0.002)
+        cuts=(5, 9), cut_distances=(0.4, 0.75), sharpness=(100.0, 25.0), bumps=(0.012, 0.008, 0.004, 0.002)
     ),
 }
 SHAPES = SHAPES_OF_FORM * len(FORMS)

@@ -9,7 +9,7 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, settle
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.measurements import MastGeometry
-from marsyard.sim.render import PixelRays, Renderer, Scene, Sun, may_cast_shadow
+from marsyard.sim.render import Objects, PixelRays, Renderer, Scene, Sun, Texture, may_cast_shadow
 from marsyard.sim.render.rover import ROVER_NAME, rover_objects, rover_sphere
 from marsyard.sim.sensor.mast import MER_MAST, RESEARCH_MAST, stereo_mast
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
@@ -23,15 +23,16 @@ def test_rover_stands_on_the_ground_with_specified_size(rover: RoverParameters, 
     stance = settle(rover, Plane(height_m=2.0), 10.0, 20.0, EAST)
     objects = rover_objects(rover, stance, mast, 0.0, 0.0)
     low, high = objects.triangles.min(axis=(0, 1)), objects.triangles.max(axis=(0, 1))
-    # Wheels are prisms with 24 sides: the middle of a side is 1 % of the radius closer to the axis than a corner.
-    assert low[2] == pytest.approx(2.0, abs=0.01 * rover.wheel_radius_m)
+    # The lowest point of a wheel is a cleat, or between two cleats 18 deg apart: at most 1.3 % of the radius higher.
+    assert low[2] == pytest.approx(2.0, abs=0.013 * rover.wheel_radius_m)
     # The head extends 0.06 m above its centre.
     assert high[2] == pytest.approx(2.0 + (mast.base_m + mast.elbow_m + mast.head_m)[2] + 0.06, abs=1e-9)
     assert (low[1], high[1]) == pytest.approx(
         (20.0 - 0.5 * rover.body_width_m, 20.0 + 0.5 * rover.body_width_m), abs=0.2
     )
-    assert len(objects) == 1
-    assert objects.names[0] == ROVER_NAME
+    # deck, body with legs and arm, six wheels, and mast
+    assert len(objects) == 9
+    assert set(objects.names.tolist()) == {ROVER_NAME}
 
 
 def test_normals_point_outwards() -> None:
@@ -41,7 +42,67 @@ def test_normals_point_outwards() -> None:
     face_normals = np.cross(*(objects.triangles[:, corner] - objects.triangles[:, 0] for corner in (1, 2)))
     assert np.einsum("ti,ti->", objects.triangles[:, 0], face_normals) > 0.0
     lengths = np.linalg.norm(face_normals, axis=1, keepdims=True)
-    assert objects.normals[:, 0] == pytest.approx(face_normals / lengths)
+    # The sides of cylinders are smooth: at most 28 deg between the normals of a corner and of a face, on spokes.
+    cosines = np.einsum("tci,ti->tc", objects.normals, face_normals / lengths)
+    assert cosines.min() > np.cos(np.radians(28.0))
+
+
+def test_wheels_have_cleats_and_are_open_between_their_spokes() -> None:
+    stance = settle(MER, Plane(), 0.0, 0.0, EAST)
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    centre = stance.world_from_rover.apply(MER.wheel_centres_m[0])
+    # the rover faces east: the axis of a wheel is the y axis. Rays are not parallel to any face
+    angles = np.radians(np.arange(0.1, 360.0, 0.5))
+    radial = np.stack([np.cos(angles), np.full(angles.size, 1e-3), np.sin(angles)], axis=1)
+    radii = 0.3 - cast_triangles(objects, centre + np.array([0.0, 0.03, 0.0]) + 0.3 * radial, -radial, nearest=1e-3)
+    is_tread = (radii < 1.001 * MER.wheel_radius_m) & (radii > 0.9 * MER.wheel_radius_m)
+    # 20 cleats stand 5 % of the radius above the tread; legs hide a part of it
+    assert radii[is_tread].max() == pytest.approx(MER.wheel_radius_m, rel=0.01)
+    assert np.percentile(radii[is_tread], 2) == pytest.approx(0.95 * MER.wheel_radius_m, rel=0.02)
+    # along the axis, rays pass between the spokes
+    outside = centre + np.array([0.0, 0.2, 0.0]) + 0.6 * MER.wheel_radius_m * radial
+    through = cast_triangles(objects, outside, np.tile([1e-3, -1.0, 2e-3], (len(radial), 1)), nearest=1e-3)
+    assert 0.3 < np.mean(through > 0.3) < 0.9
+
+
+def test_deck_has_gaps_between_its_panels_and_carries_antennas() -> None:
+    stance = settle(MER, Plane(), 0.0, 0.0, EAST)
+    objects = rover_objects(MER, stance, MER_MAST, 0.0, 0.0)
+    # along the front edges of the left panels, seen from above, the deck is interrupted
+    y = np.linspace(0.0, 0.75, 301)
+    above = np.column_stack([np.full(y.size, 0.58), y, np.full(y.size, 2.0)])
+    heights = 2.0 - cast_triangles(objects, above, np.tile([1e-3, 2e-3, -1.0], (y.size, 1)), nearest=1e-3)
+    is_deck = heights > MER.deck_m
+    assert np.count_nonzero(np.diff(is_deck.astype(int))) >= 3
+    # the low-gain antenna stands 0.55 m above the deck, behind the mast
+    corners = objects.triangles.reshape(-1, 3)
+    behind = corners[corners[:, 0] < 0.2]
+    assert behind[:, 2].max() == pytest.approx(MER.deck_m + 0.55, abs=1e-6)
+
+
+def test_rover_is_matt_with_slight_wear_where_rocks_have_texture(renderer: Renderer) -> None:
+    plate = np.array([[7.0, 7.0, 0.5], [9.0, 7.0, 0.5], [9.0, 9.0, 0.5], [7.0, 9.0, 0.5]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    camera = Cahv.from_field_of_view(0.5, (100, 100), **DOWN)
+    pose = rigid(Rotation.identity(), np.array([8.0, 8.0, 3.0]))
+    contrast = {}
+    for name in (5, ROVER_NAME):
+        names = np.full(2, name, dtype=np.int32)
+        objects = Objects.of_mesh(plate, np.tile([0.0, 0.0, 1.0], (4, 1)), faces, names, 0.2)
+        scene = Scene(
+            flat_ground(64, 1.0),
+            (8.0, 8.0),
+            Sun(direction(0.0, np.radians(40.0))),
+            LAMBERT,
+            objects,
+            object_texture=Texture(0.2, (0.12,) * 7),
+            mesh_finest_m=0.2,
+            mesh_half_width_m=60.0,
+        )
+        radiance = renderer.render(scene, PixelRays.from_camera(camera), pose).radiance
+        contrast[name] = radiance.std() / radiance.mean()
+    assert contrast[ROVER_NAME] < 0.2 * contrast[5]
+    assert 0.0 < contrast[ROVER_NAME] < 0.02
 
 
 def test_wheels_follow_the_suspension() -> None:

@@ -1,16 +1,18 @@
 """Compiled shapes of bedrock: cracks, polygonal slabs and exposed strata."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from marsyard.sim.terrain.kernels import Array
 from marsyard.sim.terrain.landforms.kernels.shapes import Grid
 
 
 @njit(cache=True)
-def _locate_points(points: Array) -> Array:
+def locate_points(points: Array) -> Array:
     """Positions of the points of a periodic grid in units of its squares, with a margin of one square.
 
     `points` contains the position of each point within its square, from 0 to 1, shape (count, count, 2).
@@ -24,27 +26,28 @@ def _locate_points(points: Array) -> Array:
     return positions
 
 
-@njit(cache=True)
-def _find_cell(positions: Array, x: float, y: float) -> tuple[int, int, float, float, float]:
-    """Find the Voronoi cell at x, y: row and column of its point in `positions`, offset of the point, and border.
+@njit(cache=True, error_model="numpy")
+def _find_cells(positions: Array, x: float, y: float) -> tuple[int, int, int, int, float, float, float]:
+    """Find the Voronoi cells next to x, y: rows and columns of the two nearest points in `positions`, and the border.
 
-    `positions` are those of `_locate_points`. Lengths are in units of its squares. The border is the distance to it.
+    Returns also the offset of the nearest point, before the distance to the border. `positions` are those of
+    `locate_points`. Lengths are in units of its squares.
     """
     row, column = int(y), int(x)
-    nearest2, nearest_x, nearest_y, nearest_row, nearest_column = 1e9, 0.0, 0.0, 0, 0
-    second2, second_x, second_y = 1e9, 0.0, 0.0
-    for n in range(row, row + 3):
-        for m in range(column, column + 3):
-            dx, dy = positions[n, m, 0] - x, positions[n, m, 1] - y
-            distance2 = dx * dx + dy * dy
-            if distance2 < nearest2:
-                second2, second_x, second_y = nearest2, nearest_x, nearest_y
-                nearest2, nearest_x, nearest_y, nearest_row, nearest_column = distance2, dx, dy, n, m
-            elif distance2 < second2:
-                second2, second_x, second_y = distance2, dx, dy
+    nearest2, second2, nearest, second = 1e9, 1e9, 0, 0
+    for k in range(9):
+        dx, dy = positions[row + k // 3, column + k % 3, 0] - x, positions[row + k // 3, column + k % 3, 1] - y
+        distance2 = dx * dx + dy * dy
+        is_nearest, is_second = distance2 < nearest2, distance2 < second2
+        second, second2 = (nearest, nearest2) if is_nearest else ((k, distance2) if is_second else (second, second2))
+        nearest, nearest2 = (k, distance2) if is_nearest else (nearest, nearest2)
+    nearest_row, nearest_column = row + nearest // 3, column + nearest % 3
+    second_row, second_column = row + second // 3, column + second % 3
+    nearest_x, nearest_y = positions[nearest_row, nearest_column, 0] - x, positions[nearest_row, nearest_column, 1] - y
+    second_x, second_y = positions[second_row, second_column, 0] - x, positions[second_row, second_column, 1] - y
     separation = math.sqrt((second_x - nearest_x) ** 2 + (second_y - nearest_y) ** 2)
     border = 0.5 * (second2 - nearest2) / max(separation, 1e-6)
-    return nearest_row, nearest_column, nearest_x, nearest_y, border
+    return nearest_row, nearest_column, second_row, second_column, nearest_x, nearest_y, border
 
 
 @njit(cache=True)
@@ -65,51 +68,105 @@ def add_cracks(
     - width, depth: half width over which a crack fades, and depth at its middle, metres
     - contrast: change of the logarithm of albedo at the middle of a crack
     """
-    positions = _locate_points(points)
+    positions = locate_points(points)
     for i in range(height.shape[0]):
         for j in range(height.shape[0]):
-            border = _find_cell(positions, j * spacing / cell, i * spacing / cell)[4] * cell
+            border = _find_cells(positions, j * spacing / cell, i * spacing / cell)[6] * cell
             if border < width:
                 strength = 1.0 - border / width
                 height[i, j] -= depth * strength
                 log_albedo[i, j] += contrast * strength
 
 
-@njit(cache=True)
-def add_slabs(
-    height: Grid, log_albedo: Grid, spacing: float, points: Array, slabs: Array, cell: float, joint: float
-) -> None:
-    """Add tilted slabs: Voronoi cells with one point in each square of a periodic grid, rounded towards the joints.
+class Slabs(NamedTuple):
+    """Slabs of one generation of joints: Voronoi cells with one point in each square of a periodic grid.
 
-    - points: position of each point within its square, from 0 to 1, shape (count, count, 2)
-    - slabs: height at the point (0: no slab), slopes along x and y, and logarithm of albedo of each cell, shape
-      (count, count, 4)
+    - positions: of the points, those of `locate_points`
+    - slabs: height at the point, slopes along x and y, logarithm of albedo, and a random number from 0 to 1 of each
+      cell, with a margin like the positions, shape (count + 2, count + 2, 5). The numbers of two cells give the width
+      of the joint between them
     - cell: side of a square, metres
-    - joint: distance from the border over which a slab rises from the ground, metres
+    - joint, depth: mean half width of a joint, and its depth below the slabs, metres
+    - rise: bound of the rise of a tilted slab from its point, metres
     """
-    count = points.shape[0]
-    positions = _locate_points(points)
-    # a position belongs to the cell of a point in its square, or in a square next to it
-    has_slabs = np.zeros((count, count), dtype=np.bool_)
-    for row in range(count):
-        for column in range(count):
-            for di in range(-1, 2):
-                for dj in range(-1, 2):
-                    has_slabs[row, column] |= slabs[(row + di) % count, (column + dj) % count, 0] > 0.0
-    for i in range(height.shape[0]):
-        y = i * spacing / cell
-        for j in range(height.shape[0]):
-            x = j * spacing / cell
-            if not has_slabs[int(y), int(x)]:
+
+    positions: Array
+    slabs: Array
+    cell: float
+    joint: float
+    depth: float
+    rise: float
+
+
+@njit(cache=True, error_model="numpy")
+def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float]:
+    """Compute height and logarithm of albedo of the slab at x, y (metres), and subtract the joint around it.
+
+    The edge is rounded: over the width of the joint, the height rises as a parabola. Joints have 0 to 2 times the mean
+    width; narrow ones are also shallow, so that slabs of several cells are common.
+    """
+    positions, slabs, cell, joint, depth, rise = generation
+    count = positions.shape[0] - 2
+    # bends of joints lead less than a period out of the grid
+    x, y = x / cell, y / cell
+    x += count if x < 0.0 else (-count if x >= count else 0.0)
+    y += count if y < 0.0 else (-count if y >= count else 0.0)
+    row, column, second_row, second_column, offset_x, offset_y, border = _find_cells(positions, x, y)
+    # uniform from 0 to 1, and equal on both sides of the joint
+    opening = slabs[row, column, 4] + slabs[second_row, second_column, 4]
+    opening -= 1.0 if opening >= 1.0 else 0.0
+    t = border * cell / max(2.0 * opening * joint, 1e-6)
+    cut = (1.0 - t) ** 2 if t < 1.0 else 0.0
+    tilt = -cell * (slabs[row, column, 1] * offset_x + slabs[row, column, 2] * offset_y)
+    top = slabs[row, column, 0] + min(max(tilt, -rise), rise) - min(1.5 * opening, 1.0) * depth * cut
+    return top, slabs[row, column, 3]
+
+
+@njit(cache=True, error_model="numpy")
+def add_slabs(
+    height: Grid, log_albedo: Grid, spacing: float, fields: NDArray[np.float32], coarse: Slabs, fine: Slabs, edge: float
+) -> None:
+    """Add the slabs of two generations of joints where they rise above the sand.
+
+    - fields: on a coarser grid of the same extent, shape (rows, rows, 4): mean height of the bedrock above the sand,
+      metres; logarithm of albedo of sand between slabs; displacements of the joints along x and y, metres
+    - edge: height above the sand over which the albedo changes from that of sand to that of a slab, metres
+    """
+    rows = fields.shape[0]
+    step = height.shape[0] // rows
+    max_fine = 2.0 * fine.rise
+    max_slab = 2.0 * coarse.rise + max_fine
+    for row in range(rows):
+        for column in range(rows):
+            next_row, next_column = (row + 1) % rows, (column + 1) % rows
+            a, b = fields[row, column], fields[row, next_column]
+            c, d = fields[next_row, column], fields[next_row, next_column]
+            if max(a[0], b[0], c[0], d[0]) + max_slab <= 0.0:
                 continue
-            row, column, offset_x, offset_y, border = _find_cell(positions, x, y)
-            slab_height, slope_x, slope_y, contrast = slabs[(row - 1) % count, (column - 1) % count]
-            if slab_height > 0.0:
-                t = min(border * cell / joint, 1.0)
-                rise = t * t * (3.0 - 2.0 * t)
-                top = slab_height - cell * (slope_x * offset_x + slope_y * offset_y)
-                height[i, j] += rise * max(top, 0.0)
-                log_albedo[i, j] += rise * contrast
+            for i in range(step):
+                v = i / step
+                for j in range(step):
+                    u = j / step
+                    wa, wb, wc, wd = (1.0 - u) * (1.0 - v), u * (1.0 - v), (1.0 - u) * v, u * v
+                    bedrock = wa * a[0] + wb * b[0] + wc * c[0] + wd * d[0]
+                    if bedrock + max_slab <= 0.0:
+                        continue
+                    sand = wa * a[1] + wb * b[1] + wc * c[1] + wd * d[1]
+                    x = (column * step + j) * spacing + wa * a[2] + wb * b[2] + wc * c[2] + wd * d[2]
+                    y = (row * step + i) * spacing + wa * a[3] + wb * b[3] + wc * c[3] + wd * d[3]
+                    top, contrast = _cut_slab(coarse, x, y)
+                    top += bedrock
+                    exposed = 0.0
+                    if top + max_fine > 0.0:
+                        fine_top, fine_contrast = _cut_slab(fine, x, y)
+                        top += fine_top
+                        if top > 0.0:
+                            rise = min(top / edge, 1.0)
+                            exposed = rise * rise * (3.0 - 2.0 * rise)
+                            height[row * step + i, column * step + j] += top
+                            contrast += fine_contrast
+                    sand *= (1.0 - exposed) * min((bedrock + max_slab) / max_slab, 1.0)
+                    log_albedo[row * step + i, column * step + j] += exposed * contrast + sand
 
 
 @njit(cache=True)
