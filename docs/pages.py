@@ -170,7 +170,8 @@ def _walk_options(options: Any, values: Any, prefix: str) -> Iterator[tuple[str,
             yield from _walk_options(types_of[field.name], default, f"{prefix}{field.name}.")
         else:
             description = descriptions.get(field.name, "").replace("|", "\\|")
-            yield prefix + field.name, FieldInfo(annotation=types_of[field.name], default=default, description=description)
+            described = FieldInfo(annotation=types_of[field.name], default=default, description=description)
+            yield prefix + field.name, described
 
 
 def _is_union(annotation: Any) -> bool:

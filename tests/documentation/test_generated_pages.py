@@ -18,7 +18,9 @@ def read_keys(name: str) -> set[str]:
 
 def test_options_of_algorithms_are_listed_with_their_descriptions() -> None:
     rows = {line.split("`")[1]: line for line in pages.format_parameters("landing").splitlines() if "| `hda." in line}
-    assert rows["hda.track_seed"].startswith("| `hda.track_seed` | `unchanged` or `poses` | `unchanged` | Start of the ")
+    assert rows["hda.track_seed"].startswith(
+        "| `hda.track_seed` | `unchanged` or `poses` | `unchanged` | Start of the "
+    )
     # two options with one description
     for name, default in (("max_tilt_change_rad", "0.349066"), ("max_roll_change_rad", "0.174533")):
         assert rows[f"hda.{name}"].startswith(f"| `hda.{name}` | number | `{default}` | Limits of the image pairs: ")

@@ -32,7 +32,9 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     loose = {**VELOCITY, "id": "LOOSE", "bound": 20.0, "probability": 0.8}
     requirements = (VELOCITY, loose)
     run = write_run(
-        folder / "run", frame.assign(**other, **{"other_plus.velocity_error_m_s": [2.0] * 39 + [float("nan")]}), requirements
+        folder / "run",
+        frame.assign(**other, **{"other_plus.velocity_error_m_s": [2.0] * 39 + [float("nan")]}),
+        requirements,
     )
     write_report(run)
     results.store_run("dimes-a", run, folder / "stored")
