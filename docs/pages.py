@@ -1,11 +1,15 @@
 """Generated pages of the documentation: commands, parameters of scenarios, catalogue, folders of `marsyard ingest`."""
 
+import inspect
+import re
 import subprocess
 import sys
 import tomllib
 import types
 import typing
 from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
@@ -18,7 +22,7 @@ from marsyard.scenarios.columns import row_columns
 from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
 from marsyard.scenarios.systems import catalogue, scenario, scenario_names
-from marsyard.sim.parameters import list_models
+from marsyard.sim.parameters import list_alternatives, list_models
 
 #: Folder of the generated pages.
 FOLDER = Path(__file__).parent / "reference" / "generated"
@@ -140,7 +144,10 @@ def _walk_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str
     """Yield keys and fields of a model and of its nested models, in order."""
     for name, field in model.model_fields.items():
         nested_models = list_models(field.annotation)
-        if not nested_models:
+        options = [item for item in list_alternatives(field.annotation) if is_dataclass(item)]
+        if options:
+            yield from _walk_options(options[0], field.default, f"{prefix}{name}.")
+        elif not nested_models:
             yield prefix + name, field
         # alternative models can have the same key: yield the first
         keys: set[str] = set()
@@ -148,6 +155,21 @@ def _walk_fields(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str
             fields = {key: entry for key, entry in _walk_fields(nested_model, f"{prefix}{name}.") if key not in keys}
             keys.update(fields)
             yield from fields.items()
+
+
+def _walk_options(options: Any, values: Any, prefix: str) -> Iterator[tuple[str, FieldInfo]]:
+    """Yield keys and fields of an algorithm's options; the docstring describes them as ``- name, name: text``."""
+    entries = re.findall(r"^- ([a-z_, \d]+): (.*(?:\n  .*)*)", inspect.getdoc(options) or "", re.MULTILINE)
+    descriptions = {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
+    types_of = typing.get_type_hints(options, include_extras=True)
+    for field in fields(options):
+        default = getattr(values, field.name, field.default)
+        if is_dataclass(types_of[field.name]):
+            yield from _walk_options(types_of[field.name], default, f"{prefix}{field.name}.")
+        else:
+            description = descriptions.get(field.name, "").replace("|", "\\|")
+            described = FieldInfo(annotation=types_of[field.name], default=default, description=description)
+            yield prefix + field.name, described
 
 
 def _is_union(annotation: Any) -> bool:
@@ -181,7 +203,9 @@ def _type_name(annotation: Any) -> str:
         return f"list of {', '.join(elements)}"
     if get_origin(annotation) is dict:
         return "table"
-    names = {float: "number", int: "integer", str: "text", bool: "true or false"}
+    if inspect.isclass(annotation) and issubclass(annotation, Enum):
+        return " or ".join(f"`{member.value}`" for member in annotation)
+    names = {float: "number", int: "integer", str: "text", bool: "true or false", Path: "path"}
     return names.get(annotation, f"`{getattr(annotation, '__name__', annotation)}`")
 
 
@@ -189,5 +213,6 @@ def _format_default(field: FieldInfo) -> str:
     """Format the default of a field; empty if the field is required or the text is long."""
     if field.default is PydanticUndefined:
         return "" if field.default_factory is None else "computed"
-    text = "none" if field.default is None else str(field.default)
+    value = field.default.value if isinstance(field.default, Enum) else field.default
+    text = "none" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
     return f"`{text}`" if text and len(text) <= 60 else ""

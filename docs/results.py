@@ -108,7 +108,8 @@ def format_comparison(reports: Reports) -> str:
             errors = [NOTHING if entry[key] is None else number(entry[key]) for key in ("median", "p95")]
             counts = [f"{entry[key]:,}" for key in ("cases", "answered", "succeeded")]
             tree = f"{report.evidence.title}, {describe_tree(report)}"
-            rows.append([f"`{name}`", f"`{entry['name']}`", *counts, *errors, tree])
+            # the section contains labels, which are prefixes of columns: `dimes_plus` for the algorithm `dimes-plus`
+            rows.append([f"`{name}`", f"`{entry['name'].replace('_', '-')}`", *counts, *errors, tree])
     if not rows:
         return ""
     metric = label(next(iter(reports.values())).metric or "")

@@ -36,7 +36,7 @@ class LvsOptions:
     - relief_tolerance_m: The same when patches are rectified to the map's elevation (assumed)
     - coarse_candidates: Number of candidate offsets that are verified with the map's elevation (assumed)
     - alternative_score: A patch supports a candidate if its correlation there is at least this fraction of its maximum
-      over the search area (assumed)
+      over the search area. A fix is ambiguous if the patches have a second maximum above this fraction (assumed)
     - min_consistent_patches: Minimum number of consistent patches. The same ground is matched once per image, so that
       seven of 15 patches cover at least three areas: one coincidence gives three, two give six.
     - max_second_support: Largest ratio of the support of the second candidate to that of the first; the support is the
@@ -56,8 +56,8 @@ class LvsOptions:
     - min_interest: Minimum Harris interest of a landmark divided by the map's mean, per map pixel (assumed)
     - template_px: Side of a template, odd, pixels of the working scale, which are about one map pixel (assumed)
     - search_sigmas_fine: Search half width in standard deviations of the predicted pixel (assumed)
-    - min_half_width_px, max_half_width_px: Limits of the search half width, working pixels. Above the maximum an
-      acquisition step at a reduced scale comes first (assumed)
+    - min_half_width_px, max_half_width_px: Limits of the search half width, working pixels. Above the minimum an
+      acquisition step comes first, above the maximum at a reduced scale (assumed)
     - min_working_px: Smallest side of a working image in the acquisition step (assumed)
     - min_score: Minimum normalised correlation of a landmark (assumed)
     - max_residual_px: Largest residual from the common correction of position and attitude, working pixels (assumed:

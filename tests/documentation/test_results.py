@@ -28,11 +28,13 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     frame["terrain"] = range(40)
     frame["velocity_error_m_s"] = [1.0] * 28 + [9.0] * 11 + [float("nan")]
     frame["answered"] = [True] * 39 + [False]
-    other = frame.rename(columns=lambda name: f"other.{name}")[["other.outcome", "other.answered"]]
+    other = frame.rename(columns=lambda name: f"other_plus.{name}")[["other_plus.outcome", "other_plus.answered"]]
     loose = {**VELOCITY, "id": "LOOSE", "bound": 20.0, "probability": 0.8}
     requirements = (VELOCITY, loose)
     run = write_run(
-        folder / "run", frame.assign(**other, **{"other.velocity_error_m_s": [2.0] * 39 + [float("nan")]}), requirements
+        folder / "run",
+        frame.assign(**other, **{"other_plus.velocity_error_m_s": [2.0] * 39 + [float("nan")]}),
+        requirements,
     )
     write_report(run)
     results.store_run("dimes-a", run, folder / "stored")
@@ -56,7 +58,7 @@ def test_page_has_the_verdicts_of_stored_runs_and_names_missing_ones(stored: Pat
     (reach,) = [line for line in lines if line.startswith("- `dimes-a`")]
     assert reach.startswith("- `dimes-a`, LOOSE: PASS holds (90 % confidence, one change at a time) for ")
     assert "Robust verdicts ([how far a PASS reaches](ROBUST)):" in lines
-    (row,) = [line for line in lines if "`other`" in line]
+    (row,) = [line for line in lines if "`other-plus`" in line]
     assert [cell.strip() for cell in row.strip("|").split("|")][2:7] == ["40", "39", "39", "2.000", "2.000"]
     assert "an old table" not in text
     assert results.fill_page(text, reports) == text

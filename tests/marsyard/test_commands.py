@@ -1,11 +1,16 @@
-"""Tests that all commands have a help text, and that commands which only print have a JSON option."""
+"""Tests of the list of commands: help texts, JSON options, and the exit statuses and commands of the documentation."""
 
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.app import app
+from marsyard.cli.errors import Exit
+
+PAGE = (Path(__file__).parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
 
 #: Commands that only print, and commands that write files. Each command is in one of the two sets.
 PRINTING = {
@@ -42,3 +47,16 @@ def test_printing_commands_have_a_json_option() -> None:
 
 def test_every_command_has_a_help_text() -> None:
     assert [name for name, command in list_commands().items() if not command.help] == []
+
+
+def test_help_and_page_state_every_exit_status() -> None:
+    assert app.info.epilog is not None
+    statuses = {str(int(status)) for status in Exit}
+    assert set(re.findall(r"\b\d+\b", app.info.epilog)) == statuses
+    assert set(re.findall(r"^\| (\d+) \|", PAGE, re.MULTILINE)) == statuses
+
+
+def test_page_has_an_example_of_every_command() -> None:
+    named = set(re.findall(r"`marsyard (terrain \w+|\w+)", PAGE))
+    # `terrain list` has no table row of its own: `terrain stats` stands for both
+    assert set(list_commands()) - named == {"terrain list"}
