@@ -7,9 +7,11 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, value_at
-from marsyard.campaigns.definition.campaign_file import POPULATIONS, Key, Requirement, key_text, validation_problems
-from marsyard.campaigns.definition.identity import list_algorithms
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign_file import POPULATIONS, Requirement
+from marsyard.campaigns.definition.components import list_algorithms
+from marsyard.campaigns.definition.parameter_paths import find_value, leaves, value_at
+from marsyard.campaigns.definition.toml_models import Key, key_text, validation_problems
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
-from marsyard.campaigns.errors import CampaignError, WorkerExitError
+from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import accept_process_state
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import WorkerExitError
 from marsyard.scenarios import conformance as suite
 
 #: Limits of output and memory of a conformance check, bytes.

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from marsyard.campaigns.store.products import load_products
+from marsyard.campaigns.store.packed_products import load_products
 from marsyard.scenarios.interface import CaseResult, recording_timelines
 from marsyard.scenarios.timeline import Timeline, timeline_products
 from marsyard.sim.streams import Streams
