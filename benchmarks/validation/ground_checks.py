@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, measure_within
-from benchmarks.validation.image_statistics import BLOCK, GroundStatistics, compute_ground_statistics
+from benchmarks.validation.image_statistics import BLOCK_PX, GroundStatistics, compute_ground_statistics
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.validation_rows import Conditions
 from marsyard.sim.terrain import sites
@@ -90,7 +90,7 @@ def measure_shadow(image: RenderedImage) -> tuple[float, float]:
     is_near = (layers["object"] == -1) & (layers["range_m"] < MAX_HAZARD_RANGE_M)
     shadow = layers["shadow"]
     blocks, inside = (
-        values.reshape(values.shape[0] // BLOCK, BLOCK, -1, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK**2)
+        values.reshape(values.shape[0] // BLOCK_PX, BLOCK_PX, -1, BLOCK_PX).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
         for values in (counts, is_near & shadow)
     )
     dark = blocks[inside.all(axis=1)]

@@ -10,11 +10,11 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.components import list_algorithms
 from marsyard.campaigns.definition.identity import custom_sources, distribution_version, hash_sources
 from marsyard.campaigns.definition.parameter_paths import find_value
+from marsyard.scenarios.custom_algorithms import custom_path, describe_custom
 from marsyard.scenarios.imports import source_files
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.isolation.description import plain_options
 from marsyard.scenarios.offline_algorithms import is_offline
-from marsyard.scenarios.tasks import custom_path, describe_custom
 
 
 def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:

@@ -15,10 +15,11 @@ from marsyard.campaigns.definition.toml_models import Key, key_text, validation_
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
-from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag, row_columns
+from marsyard.scenarios.algorithm_labels import labels
+from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag
+from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.interface import HasParts
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.tasks import labels
 
 #: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
 _CHECKED_CASES = 32

@@ -22,10 +22,10 @@ from marsyard.campaigns.definition.components import list_algorithms, list_parts
 from marsyard.campaigns.definition.parameter_paths import leaves
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
+from marsyard.scenarios.custom_algorithms import algorithm_sources
 from marsyard.scenarios.imports import relative_to
 from marsyard.scenarios.offline_algorithms import answers_file
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
-from marsyard.scenarios.tasks import algorithm_sources
 from marsyard.scenarios.user_files import input_files
 
 #: Folders of the packages whose code determines rows; reports and commands do not affect rows.

@@ -23,8 +23,8 @@ from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store.packed_products import PackedProducts, pack_products
 from marsyard.campaigns.store.product_selection import ProductSelection
 from marsyard.campaigns.store.rows import Row
-from marsyard.scenarios.interface import recording_timelines
 from marsyard.scenarios.systems import scenario
+from marsyard.scenarios.timeline_recording import recording_timelines
 from marsyard.sim.cache import CacheWarning
 
 #: Maximum number of notes for each kind of change of the process state.

@@ -38,7 +38,8 @@ from marsyard.campaigns.store.products import ProductStore
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
 from marsyard.campaigns.store.showcase import find_showcase, find_worst_cases
 from marsyard.campaigns.store.table import TABLE_FILE, is_current, numeric_metrics, write_table
-from marsyard.scenarios.columns import Columns, row_columns
+from marsyard.scenarios.columns import Columns
+from marsyard.scenarios.declared_columns import row_columns
 
 
 @dataclass(frozen=True)
