@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.scenarios.descent.conditions import instrument_errors
 from marsyard.scenarios.descent.flight import create_flight, states_at_images
 from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.measurement import DescentInstruments, measure
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.descent.scenario import draw_detector
-from marsyard.scenarios.descent.score import instrument_errors
+from marsyard.scenarios.descent.simulation import draw_detector
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar
 

@@ -1,9 +1,9 @@
-"""Outcomes of unfinished cases, and errors that a user can fix (one message without a traceback, exit status 2)."""
+"""Errors that a user can fix: one message without a traceback, exit status 2."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -62,36 +62,3 @@ def unknown_name_message(kind: str, word: str, allowed: Iterable[str], listed_on
     allowed_words = sorted(allowed)
     words_text = ", ".join(allowed_words if listed_only is None else sorted(listed_only)) or "none"
     return f"unknown {kind} '{word}'{suggest_similar(word, allowed_words)}; allowed: {words_text}"
-
-
-#: The case raised an exception, or its worker process died.
-CRASHED = "CRASHED"
-#: The case exceeded its time limit.
-TIMED_OUT = "TIMED_OUT"
-#: The case needed more memory than available, or than its limit.
-OUT_OF_MEMORY = "OUT_OF_MEMORY"
-#: The case exceeded its limit of standard output and error.
-TOO_MUCH_OUTPUT = "TOO_MUCH_OUTPUT"
-#: The algorithm's answer violated its interface.
-BAD_ANSWER = "BAD_ANSWER"
-_OUTCOMES = (CRASHED, TIMED_OUT, OUT_OF_MEMORY, TOO_MUCH_OUTPUT, BAD_ANSWER)
-#: Outcomes by their command-line names (`--retry timed-out`).
-RETRYABLE: Mapping[str, str] = {outcome.lower().replace("_", "-"): outcome for outcome in _OUTCOMES}
-#: Cases with these outcomes fail the requirements on all cases, and result in exit status 1.
-ENGINE_FAILURES = frozenset(RETRYABLE.values())
-
-
-class WorkerExitError(Exception):
-    """The worker process ended before its task finished.
-
-    - outcome: one of this module's outcomes; reason: text that is equal for equal causes
-    - trace: Python stack of the process and its last output, as far as available
-    """
-
-    def __init__(self, outcome: str, reason: str, trace: str) -> None:
-        super().__init__(reason)
-        self.outcome = outcome
-        self.trace = trace
-
-    def __reduce__(self) -> tuple[type[WorkerExitError], tuple[str, str, str]]:
-        return type(self), (self.outcome, str(self), self.trace)

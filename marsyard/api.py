@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marsyard.campaigns.definition import loading
+from marsyard.campaigns.definition.algorithm_replacement import replace_algorithms
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.scenarios import systems
@@ -131,7 +132,7 @@ def run(
     if compare and algorithm is None:
         raise CampaignError("compare needs an algorithm under test: the argument 'algorithm'")
     if isinstance(campaign, Campaign):
-        selected = loading.replace_algorithms(campaign, specs)
+        selected = replace_algorithms(campaign, specs)
     else:
         selected = load_campaign(campaign, changes, cases=cases, seed=seed, algorithms=specs)
     run_campaign(selected, folder, jobs=jobs)

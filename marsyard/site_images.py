@@ -22,7 +22,7 @@ from jaxtyping import Bool, UInt16
 from marsyard.scenarios import views
 from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.radiance import add_haze
-from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
+from marsyard.scenarios.terrain_model_sites import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
 from marsyard.sim.dynamics.rover import RoverParameters, Stance

@@ -15,7 +15,8 @@ from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section
 from marsyard.reports.statistics.samples import circular_error, error_ellipse
 from marsyard.reports.wording import NOTHING, format_fraction, interval, label, note_text, number, percent
-from marsyard.scenarios.columns import enabling_columns, split_unit
+from marsyard.scenarios.columns import split_unit
+from marsyard.scenarios.declared_columns import enabling_columns
 
 
 def answers_section(subject: Subject) -> Section | None:

@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from marsyard.campaigns.definition.campaign import leaves
+from marsyard.campaigns.definition.parameter_paths import leaves
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports import rates
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.column_values import numbers
@@ -101,7 +102,7 @@ def summarize_algorithm(frame: pd.DataFrame, name: str, metric: str | None, boun
         name=name,
         cases=len(frame),
         answered=int(frame["answered"].eq(True).sum()),
-        failed=int(frame["outcome"].isin(rates.ENGINE_FAILURES).sum()),
+        failed=int(frame["outcome"].isin(ENGINE_FAILURES).sum()),
         succeeded=succeeded,
         median=float(np.median(finite)) if finite.size else math.nan,
         p95=float(np.quantile(finite, 0.95)) if finite.size else math.nan,

@@ -25,7 +25,8 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.special import ndtr, ndtri
 
-from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.sampling.dispersions import Choice
 from marsyard.reports.statistics.weighted import MIN_EFFECTIVE, Changes

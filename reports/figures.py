@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.ticker import MaxNLocator
 
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports import figure_style
 from marsyard.reports.column_selection import axis_columns, category_column
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figure_style import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
 from marsyard.reports.plots import axis_edge, note_beyond
-from marsyard.reports.rates import ENGINE_FAILURES
 from marsyard.reports.statistics.samples import error_ellipse
 from marsyard.reports.tables import answered_outcomes, outcome_counts
 from marsyard.reports.wording import format_fraction, label, magnitude_label, plain_value

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.claims import requirement_key
-from marsyard.campaigns.definition.evidence import Confirmation, Evidence
+from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.confirmations import (
+from marsyard.campaigns.store.confirmation_record import (
     ConfirmationRecord,
     find_own_entry,
     is_variant,

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from pydantic import BaseModel
 
 from marsyard.algorithms.faults import Fault
-from marsyard.campaigns.definition.campaign_file import description_at
+from marsyard.campaigns.definition.toml_models import description_at
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.reports import figures
 from marsyard.reports.column_selection import axis_columns

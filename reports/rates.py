@@ -8,15 +8,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns import errors
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports.column_values import numbers
 from marsyard.reports.statistics.clusters import ClusteredCases
 from marsyard.reports.statistics.proportions import Interval, proportion_interval
 from marsyard.reports.statistics.samples import is_interpolated
 from marsyard.reports.wording import NOTHING, number, percent
-
-#: Outcomes of cases that the engine could not finish.
-ENGINE_FAILURES = errors.ENGINE_FAILURES
 
 
 def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns.errors import ENGINE_FAILURES
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports import rates
 from marsyard.reports.column_values import numbers
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus

@@ -11,10 +11,11 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.campaigns.definition.evidence import Confirmation
+from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
-from marsyard.reports.rates import ENGINE_FAILURES, is_flag, population_mask, terrain_groups
+from marsyard.reports.rates import is_flag, population_mask, terrain_groups
 from marsyard.reports.section import Grid
 from marsyard.reports.statistics.samples import ErrorSummary, summarize
 from marsyard.reports.verdicts import Status, Verdict

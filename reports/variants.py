@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float64, Int
 
-from marsyard.campaigns.definition.campaign import value_at
+from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVariant
 from marsyard.reports import rates

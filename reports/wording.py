@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from marsyard.scenarios.columns import find_column, split_unit
-from marsyard.scenarios.columns import label as column_label
+from marsyard.scenarios.columns import split_unit
+from marsyard.scenarios.declared_columns import find_column
+from marsyard.scenarios.declared_columns import label as column_label
 
 #: Text of a missing value.
 NOTHING = "–"

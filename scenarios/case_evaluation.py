@@ -10,10 +10,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from marsyard.scenarios.algorithm_labels import labels
 from marsyard.scenarios.algorithm_run import AlgorithmRun
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.scores import ScoredCase, compute_scores
-from marsyard.scenarios.tasks import AlgorithmSelection, labels
 from marsyard.scenarios.timeline import Timeline, timeline_products
 
 Answer = TypeVar("Answer")

@@ -19,6 +19,7 @@ from marsyard.sim.sensor import DetectorParameters
 #: Path length for which the fault `haze` states an optical depth, m: about the height of the first image.
 HAZE_PATH_M = 2000.0
 Haze = Annotated[NonNegative, Field(le=10.0, description=f"optical depth of dusty air over {HAZE_PATH_M:g} m")]
+#: Detector counts of the images of a case, in their order.
 Images = Sequence[UInt16[np.ndarray, "rows columns"]]
 
 

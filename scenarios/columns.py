@@ -7,14 +7,11 @@ The engine adds its own columns (`ENGINE`) and the sampled values of the case, e
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from fnmatch import fnmatchcase
-from functools import cache, cached_property
-
-from marsyard.scenarios.imports import import_object
-from marsyard.scenarios.systems import find_system, systems
+from functools import cached_property
 
 #: Units by the ends of column names.
 _UNITS = {
@@ -138,8 +135,7 @@ def text(name: str, meaning: str, kind: Kind = Kind.CONDITION) -> Column:
     return Column(name, kind, meaning, type=str)
 
 
-#: Columns of the engine in every row.
-#: The first columns of a row, and the last ones.
+#: Columns of the engine: the first ones of a row, and the last ones.
 LEADING = (
     Column("case", Kind.PROVENANCE, "number of the case"),
     text("outcome", "outcome of the answer, or reason of the failure", Kind.OUTCOME),
@@ -188,7 +184,7 @@ class Columns:
 
     @property
     def configured(self) -> tuple[str, ...]:
-        """Names and patterns of the configured flags."""
+        """Names and patterns of the configured columns."""
         return tuple(item.name for item in self.columns if item.kind is Kind.CONFIGURED)
 
     def is_condition(self, name: str) -> bool:
@@ -199,61 +195,3 @@ class Columns:
     @cached_property
     def _by_name(self) -> dict[str, Column]:
         return {item.name: item for item in self.columns}
-
-
-@cache
-def row_columns(scenario: str) -> Columns | None:
-    """Return the columns of a scenario; None if its system declares none. Raises ValueError for an invalid one."""
-    system = find_system(scenario)
-    path = None if system is None else system.columns.get(scenario)
-    if path is None:
-        return None
-    try:
-        columns = import_object(path)
-    except ImportError as error:
-        raise ValueError(f"the columns of '{scenario}' cannot be imported: {error}") from error
-    if not isinstance(columns, Columns):
-        raise ValueError(f"{path} is a {type(columns).__name__}; allowed: a marsyard.scenarios.columns.Columns")
-    return columns
-
-
-@cache
-def _all_columns() -> Columns:
-    """Return the columns of all scenarios; the first declaration of a name applies."""
-    columns = {item.name: item for item in ENGINE}
-    for scenario in (name for system in systems() for name in system.columns):
-        try:
-            declared = row_columns(scenario)
-        except ValueError:  # campaigns of the scenario report the error
-            continue
-        for item in declared or ():
-            columns.setdefault(item.name, item)
-    return Columns(tuple(columns.values()))
-
-
-@cache
-def find_column(name: str) -> Column | None:
-    """Return the declaration of a column of any scenario; None if there is none."""
-    return _all_columns().find(name)
-
-
-def enabling_columns(names: Iterable[str]) -> list[Column]:
-    """Return the declarations of the flags without which an algorithm cannot answer, among columns given by name."""
-    return [column for name in names if (column := find_column(name)) is not None and column.enables_answer]
-
-
-@cache
-def label(column: str) -> str:
-    """Return a column in words, without its unit: ``velocity error``.
-
-    The label of a compared algorithm precedes its columns. A sampled value, whose name is the path of its parameter,
-    is named by the last two parts of the path.
-    """
-    found = find_column(column)
-    if found is not None:
-        return found.label_of(column)
-    prefix, _, name = column.rpartition(".")
-    compared = find_column(name) if prefix and "." not in prefix else None
-    if compared is not None:
-        return f"{to_words(prefix)} {compared.label_of(name)}"
-    return to_words(".".join(split_unit(column)[0].split(".")[-2:]))

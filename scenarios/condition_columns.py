@@ -1,7 +1,9 @@
-"""Columns of conditions common to several scenarios: sun, contrast, attitude, and provenance of the images."""
+"""Values of the condition columns that several scenarios have: sun, contrast and attitude.
 
-import hashlib
-from collections.abc import Iterable
+`marsyard.scenarios.common_columns` declares the columns.
+"""
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -9,13 +11,18 @@ from jaxtyping import Float, Float64, UInt16
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.dynamics import State
-from marsyard.sim.kernel_cache import processor_features
-from marsyard.sim.render import process_renderer
-from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters
 
 #: Side of the image of which the local contrast is computed, pixels, as in DIMES; and side of its blocks.
-SIDE, BLOCK = 256, 16
+SIDE_PX, BLOCK_PX = 256, 16
+
+
+class LocalContrast(NamedTuple):
+    """Percentiles over the blocks of an image of the local contrast: standard deviation / mean of a block."""
+
+    p10: float
+    median: float
+    p90: float
 
 
 def sun_columns(direction: Float64[np.ndarray, "3"]) -> dict[str, Scalar]:
@@ -31,22 +38,23 @@ def contrast_columns(image: UInt16[np.ndarray, "rows columns"], detector: Detect
 
     `local_contrast` defines the contrast; the quotient is NaN if the 10 % quantile is 0.
     """
-    p10, median, p90 = local_contrast(np.maximum(image - detector.offset_dn, 0.0))
-    return {"image_contrast": median, "image_patchiness": p90 / p10 if p10 > 0.0 else np.nan}
+    contrast = local_contrast(np.maximum(image - detector.offset_dn, 0.0))
+    patchiness = contrast.p90 / contrast.p10 if contrast.p10 > 0.0 else np.nan
+    return {"image_contrast": contrast.median, "image_patchiness": patchiness}
 
 
-def local_contrast(image: Float[np.ndarray, "rows columns"]) -> tuple[float, float, float]:
-    """Compute the 10th, 50th and 90th percentiles over all blocks of (standard deviation / mean of a block).
+def local_contrast(image: Float[np.ndarray, "rows columns"]) -> LocalContrast:
+    """Compute the local contrast of an image, which is resized to `SIDE_PX` x `SIDE_PX` pixels first.
 
-    The image is resized to `SIDE` x `SIDE` pixels first. The result is NaN if all blocks are black.
+    The result is NaN if all blocks are black.
     """
-    small = cv2.resize(np.asarray(image, dtype=np.float64), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-    blocks = small.reshape(SIDE // BLOCK, BLOCK, SIDE // BLOCK, BLOCK)
+    small = cv2.resize(np.asarray(image, dtype=np.float64), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
+    blocks = small.reshape(SIDE_PX // BLOCK_PX, BLOCK_PX, SIDE_PX // BLOCK_PX, BLOCK_PX)
     deviation, mean = blocks.std(axis=(1, 3)), blocks.mean(axis=(1, 3))
     if not np.any(mean > 0.0):
-        return (np.nan, np.nan, np.nan)
+        return LocalContrast(np.nan, np.nan, np.nan)
     p10, p50, p90 = np.percentile(deviation[mean > 0.0] / mean[mean > 0.0], [10.0, 50.0, 90.0])
-    return float(p10), float(p50), float(p90)
+    return LocalContrast(float(p10), float(p50), float(p90))
 
 
 def off_nadir_deg(state: State) -> float:
@@ -58,18 +66,3 @@ def off_nadir_deg(state: State) -> float:
 def attitude_rate_deg_s(state: State) -> float:
     """Return the magnitude of the body rate."""
     return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
-
-
-def hash_images(images: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
-    """Compute the SHA-256 of the counts of images."""
-    return hashlib.sha256(b"".join(counts.tobytes() for counts in images)).hexdigest()
-
-
-def image_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
-    """Return the provenance columns of images rendered by a backend."""
-    return {
-        "image_hash": image_hash,
-        "gl_backend": backend,
-        "gl_version": process_renderer(backend).description(),
-        "processor_features": processor_features(),
-    }

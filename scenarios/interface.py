@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -18,24 +16,6 @@ if TYPE_CHECKING:
 
 #: Value of a column of the results.
 Scalar = float | int | str | bool
-
-
-_is_recording_timelines: ContextVar[bool] = ContextVar("_is_recording_timelines", default=False)
-
-
-@contextmanager
-def recording_timelines(is_recording: bool = True) -> Iterator[None]:
-    """Add timelines to the products of cases that run while the context is active, or do not."""
-    token = _is_recording_timelines.set(is_recording)
-    try:
-        yield
-    finally:
-        _is_recording_timelines.reset(token)
-
-
-def is_recording_timelines() -> bool:
-    """Return whether the products of the running case contain its timeline (`marsyard.scenarios.timeline`)."""
-    return _is_recording_timelines.get()
 
 
 @dataclass(frozen=True)
@@ -115,7 +95,7 @@ class HasAlgorithms(Protocol):
     """A scenario whose algorithms are selected in the campaign file.
 
     The keys are `algorithm` (under test) and `compared` (further algorithms on the same cases), the fields of
-    `AlgorithmSelection` (`marsyard.scenarios.algorithm_run`). A scenario without these keys does not implement
+    `AlgorithmSelection` (`marsyard.scenarios.algorithm_selection`). A scenario without these keys does not implement
     this protocol.
     """
 

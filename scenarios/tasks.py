@@ -1,4 +1,4 @@
-"""Tasks of the systems: creation of their algorithms by name, and the parameters that select those of a case.
+"""Tasks of the systems: each with its algorithms, which are created by name.
 
 An algorithm is specified by
 
@@ -12,31 +12,18 @@ An algorithm is specified by
 
 from __future__ import annotations
 
-import difflib
-import itertools
-import re
-from collections.abc import Callable, Collection, Container, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Container, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Generic, TypeVar, cast
-
-from pydantic import Field, field_validator, model_validator
+from typing import Any, Generic, TypeVar, cast
 
 from marsyard.algorithms import exchange
 from marsyard.algorithms.worker_device import worker_device
-from marsyard.scenarios.imports import import_object, source_files
+from marsyard.scenarios.answer_tables import AnswerFormat, read_answers
+from marsyard.scenarios.custom_algorithms import custom_path, describe_custom, import_algorithm
 from marsyard.scenarios.isolation.host import construct, reset
-from marsyard.scenarios.isolation.remote import AlgorithmDescription, RemoteAlgorithm, describe_in_process
-from marsyard.scenarios.offline_algorithms import AnswerFormat, answers_file, create_offline, is_offline, read_answers
+from marsyard.scenarios.isolation.remote import RemoteAlgorithm
+from marsyard.scenarios.offline_algorithms import answers_file, create_offline, is_offline
 from marsyard.scenarios.streamed import STREAM_METHODS, StreamedEstimator
-from marsyard.scenarios.systems import systems
-from marsyard.sim.parameters import Parameters
-
-#: Entry point group of other packages' algorithms.
-GROUP = "marsyard.algorithms"
 
 Algorithm = TypeVar("Algorithm")
 Options = TypeVar("Options")
@@ -140,7 +127,7 @@ class Task(Generic[Algorithm, Options]):
         path = custom_path(spec, self.shipped)
         if limits.isolated:
             return RemoteAlgorithm(path, limits, {item.__qualname__: item for item in self.answers})
-        algorithm = construct(_import(path), worker_device(limits.devices))
+        algorithm = construct(import_algorithm(path), worker_device(limits.devices))
         reset(algorithm)
         return algorithm
 
@@ -165,146 +152,3 @@ class Task(Generic[Algorithm, Options]):
         if self.offline is None:
             raise ValueError(f"'{spec}': a {self.noun} cannot run offline: each answer determines the next image")
         return self.offline
-
-
-def custom_path(spec: str, shipped: Collection[str] = ()) -> str:
-    """Return the import path of a custom algorithm: of an entry point, or the given one.
-
-    Raises ValueError, with the allowed names in the message, if there is no algorithm of this name.
-    """
-    if ":" in spec:
-        return spec
-    if spec in list_installed():
-        return list_installed()[spec].value
-    allowed = [*shipped, *list_installed()]
-    matches = difflib.get_close_matches(spec, allowed, n=1)
-    hint = f" (did you mean '{matches[0]}'?)" if matches else ""
-    custom = "a custom one as 'module:Class' or 'exec:./program'"
-    raise ValueError(f"unknown algorithm '{spec}'{hint}; allowed: {', '.join(allowed)}, or {custom}")
-
-
-def describe_custom(spec: str, shipped: Collection[str] = ()) -> AlgorithmDescription:
-    """Describe a custom algorithm, imported in a process of its own. Raises ValueError if it cannot be imported."""
-    path = custom_path(spec, shipped)
-    try:
-        return describe_in_process(path)
-    except ImportError as error:
-        raise ValueError(_import_problem(spec, path, error)) from error
-
-
-def _import(path: str) -> Any:
-    """Import a custom algorithm in this process. Raises ValueError with the reason."""
-    try:
-        return import_object(path)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"cannot import algorithm '{path}': {error}") from error
-
-
-def _import_problem(spec: str, path: str, error: Exception) -> str:
-    if spec == path:
-        return f"cannot import algorithm '{spec}': {error}"
-    return f"algorithm '{spec}' cannot be loaded from {path}: {error}"
-
-
-@cache
-def shipped_names() -> frozenset[str]:
-    """Return the names of the systems' built-in algorithms."""
-    names: set[str] = set()
-    for path in dict.fromkeys(path for system in systems() for path in system.tasks):
-        with suppress(ImportError):  # the campaigns of the system report the error
-            names.update(import_object(path).shipped)
-    return frozenset(names)
-
-
-@cache
-def list_installed() -> Mapping[str, EntryPoint]:
-    """Return the algorithms of installed packages, sorted by name."""
-    return {point.name: point for point in sorted(entry_points(group=GROUP), key=lambda point: point.name)}
-
-
-def algorithm_sources(spec: str) -> list[tuple[str, Path]]:
-    """Return names and paths of the source files of a user's Python algorithm; empty for all other algorithms."""
-    path = list_installed()[spec].value if spec in list_installed() else spec
-    is_external = is_offline(spec) or spec.startswith(tuple(exchange.PREFIXES))
-    is_shipped = ":" not in spec and spec in shipped_names()
-    return list(source_files(path)) if ":" in path and not is_external and not is_shipped else []
-
-
-def check_algorithms(task: Task[Any, Any], specs: Sequence[str]) -> None:
-    """Raise ValueError if an algorithm does not exist or is listed twice."""
-    for index, spec in enumerate(specs):
-        task.check(spec)
-        if spec in specs[:index]:
-            raise ValueError(f"the algorithm '{spec}' is listed twice")
-
-
-def labels(specs: Sequence[str]) -> tuple[str, ...]:
-    """Return unique short names of algorithms, the prefixes of their columns.
-
-    >>> labels(["dimes", "phase-correlation", "mypkg.velocity:Estimator", "exec:./mine --fast", "exec:./mine"])
-    ('dimes', 'phase_correlation', 'Estimator', 'mine', 'mine_2')
-    """
-    unique_labels: list[str] = []
-    for spec in specs:
-        program = re.match(r"(?:(?:exec|serve)(?:-stream)?|answers|export):\s*(\S+)", spec)
-        basename = Path(program[1]).stem if program else spec.rpartition(":")[2]
-        label = re.sub(r"\W", "_", basename, flags=re.ASCII)
-        # names of columns must begin with a letter
-        label = label if label[:1].isalpha() else f"a_{label}"
-        candidates = itertools.chain([label], (f"{label}_{number}" for number in itertools.count(2)))
-        unique_labels.append(next(name for name in candidates if name not in unique_labels))
-    return tuple(unique_labels)
-
-
-class AlgorithmSelection(Parameters):
-    """Parameters of scenarios with selectable algorithms; subclasses define the field `algorithm`."""
-
-    task: ClassVar[Task[Any, Any]]
-
-    algorithm: str
-    compared: Annotated[
-        tuple[str, ...], Field(description="further algorithms, run on the same cases and compared with the first")
-    ] = ()
-    executable: Annotated[exchange.ExecutableLimits, Field(description="limits and isolation of custom algorithms")] = (
-        exchange.ExecutableLimits()
-    )
-
-    @property
-    def algorithms(self) -> tuple[str, ...]:
-        """All algorithms; the first is the one under test."""
-        return (self.algorithm, *self.compared)
-
-    @property
-    def options(self) -> Any:
-        """Options of the published algorithm, for all algorithms of Marsyard."""
-        return next((value for _, value in self if isinstance(value, self.task.options)), self.task.options())
-
-    def make(self, algorithm: str, case: int) -> Any:
-        """Create an algorithm for a case. Raises ValueError, and the exceptions of a user's constructor."""
-        return self.task.make(algorithm, self.options, self.executable, case)
-
-    @field_validator("algorithm")
-    @classmethod
-    def _check_algorithm(cls, name: str) -> str:
-        cls.task.check(name)
-        return name
-
-    @field_validator("compared")
-    @classmethod
-    def _check_compared(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        check_algorithms(cls.task, names)
-        return names
-
-    @model_validator(mode="after")
-    def _check_distinct(self) -> AlgorithmSelection:
-        if self.algorithm in self.compared:
-            raise ValueError(f"the algorithm '{self.algorithm}' is listed twice")
-        return self
-
-    @model_validator(mode="after")
-    def _check_options(self) -> AlgorithmSelection:
-        """Create the algorithms of Marsyard once, which checks their options."""
-        for name in self.algorithms:
-            if name in self.task.shipped:
-                self.task.shipped[name](self.options)
-        return self

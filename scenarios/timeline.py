@@ -1,8 +1,8 @@
 """Timeline of a case: ground, trajectories, cameras with images, points and measured values, over space and time.
 
 A scenario adds a timeline to the products of a case by `timeline_products`, and only while timelines are recorded
-(`marsyard.scenarios.interface.recording_timelines`): for replayed cases and for the case that the report shows.
-`marsyard replay` exports it (`marsyard.reports.timeline`). Positions are in the world frame (east, north, up), times
+(`marsyard.scenarios.timeline_recording`): for replayed cases and for the case that the report shows. `marsyard replay`
+exports it (`marsyard.reports.timeline`). Positions are in the world frame (east, north, up), times
 are seconds on the clock of the simulation.
 """
 
@@ -16,20 +16,13 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.interface import is_recording_timelines
-from marsyard.sim.camera import Cahv, Cahvor, Cahvore, CameraModel
+from marsyard.scenarios.timeline_recording import is_recording_timelines
+from marsyard.sim.camera import Cahvor, Cahvore, CameraModel
 from marsyard.sim.dynamics import Motion
-from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import ImuIncrements
-from marsyard.sim.render import PixelRays, Scene, process_renderer
-from marsyard.sim.render.backend import Backend
 
 #: Key of the timeline among the products of a case.
 PRODUCT = "timeline"
-#: Side of the image of `surface_from_above`, pixels, and the height of its camera divided by the half width.
-_SIDE_PX, _HEIGHT_RATIO = 384, 6.0
-#: Quantiles of the brightness that become black and white.
-_DARK, _BRIGHT = 0.005, 0.995
 
 
 def timeline_products(create: Callable[[], Timeline], *, is_tested: bool = True) -> dict[str, Any]:
@@ -226,36 +219,3 @@ class Timeline:
         except (LookupError, TypeError, AttributeError):
             return None
         return cls(**tables, images=images, inertial=inertial)
-
-
-def surface_from_above(
-    create_scene: Callable[[float, float, float, float], Scene],
-    centre_m: tuple[float, float],
-    half_width_m: float,
-    backend: Backend,
-    time_s: float = 0.0,
-) -> SurfacePatch:
-    """Render the world from above; return the visible points, rocks included, with their brightness.
-
-    - create_scene: creates the scene for a camera by its east and north, height above the ground, and pixel angle (rad)
-    - centre_m: east and north of the centre
-    """
-    height_m = _HEIGHT_RATIO * half_width_m
-    scene = create_scene(*centre_m, height_m, 2.0 / (_HEIGHT_RATIO * _SIDE_PX))
-    ground_m = float(scene.surface.height(*centre_m))
-    camera = Cahv.from_field_of_view(
-        2.0 * np.arctan(1.0 / _HEIGHT_RATIO),
-        (_SIDE_PX, _SIDE_PX),
-        axis=np.array([0.0, 0.0, -1.0]),
-        right=np.array([1.0, 0.0, 0.0]),
-    )
-    pose = rigid(Rotation.identity(), np.array([*centre_m, ground_m + height_m]))
-    frame = process_renderer(backend).render(scene, PixelRays.from_camera(camera), pose, time_s)
-    return SurfacePatch(frame.points_world().astype(np.float32), grey_values(frame.radiance))
-
-
-def grey_values(brightness: Float32[np.ndarray, "rows columns"]) -> UInt8[np.ndarray, "rows columns"]:
-    """Scale brightness to 8 bits; the darkest and the brightest 0.5 % become black and white."""
-    low, high = np.quantile(brightness, (_DARK, _BRIGHT))
-    scaled = (brightness - low) * (255.0 / max(float(high - low), 1e-9))
-    return np.asarray(np.clip(scaled, 0.0, 255.0), dtype=np.uint8)

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 
 from benchmarks.validation.flight_checks import FIRST_SEED, measure_within
 from benchmarks.validation.image_statistics import (
-    BLOCK,
+    BLOCK_PX,
     GroundStatistics,
     compute_ground_statistics,
     compute_image_statistics,
@@ -97,7 +97,7 @@ def measure_shadow(image: RenderedImage) -> tuple[float, float]:
     is_near = (layers["object"] == -1) & (layers["range_m"] < MAX_HAZARD_RANGE_M)
     shadow = layers["shadow"]
     blocks, inside = (
-        values.reshape(values.shape[0] // BLOCK, BLOCK, -1, BLOCK).swapaxes(1, 2).reshape(-1, BLOCK**2)
+        values.reshape(values.shape[0] // BLOCK_PX, BLOCK_PX, -1, BLOCK_PX).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
         for values in (counts, is_near & shadow)
     )
     dark = blocks[inside.all(axis=1)]

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from scipy.ndimage import gaussian_filter, median_filter
 
-from marsyard.scenarios.condition_columns import BLOCK, SIDE, local_contrast
+from marsyard.scenarios.condition_columns import BLOCK_PX, SIDE_PX, local_contrast
 
-#: Side of the resized images for features and pairs, pixels; side of the templates in images of `SIDE`, pixels.
+#: Side of the resized images for features and pairs, pixels; side of the templates in images of `SIDE_PX`, pixels.
 FEATURE_SIDE, TEMPLATE = 512, 31
 #: Minimum numbers of matches, and of matches that agree with the homography of a pair.
 _MIN_MATCHES, _MIN_INLIERS = 8, 12
@@ -29,7 +29,7 @@ MIN_FREQUENCY, MAX_FREQUENCY = 4, 63
 
 
 class ImageStatistics(NamedTuple):
-    """Statistics of an image's central square, area-averaged to `SIDE` x `SIDE` pixels.
+    """Statistics of an image's central square, area-averaged to `SIDE_PX` x `SIDE_PX` pixels.
 
     - rms: standard deviation divided by the mean
     - slope: exponent of the radially averaged power spectrum from `MIN_FREQUENCY` to `MAX_FREQUENCY`, Hann window
@@ -66,7 +66,7 @@ class PairStatistics(NamedTuple):
       of one of the 700 best of the second
     - tracking_error_px: median displacement of corners that the Lucas-Kanade method tracks in the second image, warped
       to the first
-    - decorrelation: 1 minus the median correlation of the templates after warping, in `SIDE` x `SIDE` pixels
+    - decorrelation: 1 minus the median correlation of the templates after warping, in `SIDE_PX` x `SIDE_PX` pixels
     """
 
     inlier_ratio: float
@@ -96,7 +96,7 @@ class MapStatistics(NamedTuple):
 class GroundStatistics(NamedTuple):
     """Statistics of a crop of ground in an image from a mast or a low-flying helicopter, at full resolution.
 
-    - local_p10, local_p50, local_p90: percentiles over blocks of `BLOCK` pixels of (standard deviation / mean)
+    - local_p10, local_p50, local_p90: percentiles over blocks of `BLOCK_PX` pixels of (standard deviation / mean)
     - kurtosis: excess kurtosis of the finest band, the image minus its blur by 1 pixel, divided by the image's blur by
       32 pixels: large where a few strong features stand out of quiet ground
     - corners: thousands of corners (Shi and Tomasi) per megapixel
@@ -112,9 +112,9 @@ class GroundStatistics(NamedTuple):
 
 
 def compute_ground_statistics(crop: Float[np.ndarray, "rows columns"]) -> GroundStatistics:
-    """Compute the statistics of a crop of ground; its sides are multiples of `BLOCK`."""
+    """Compute the statistics of a crop of ground; its sides are multiples of `BLOCK_PX`."""
     rows, columns = crop.shape
-    blocks = np.asarray(crop, dtype=np.float64).reshape(rows // BLOCK, BLOCK, columns // BLOCK, BLOCK)
+    blocks = np.asarray(crop, dtype=np.float64).reshape(rows // BLOCK_PX, BLOCK_PX, columns // BLOCK_PX, BLOCK_PX)
     contrast = np.percentile(blocks.std(axis=(1, 3)) / blocks.mean(axis=(1, 3)), [10.0, 50.0, 90.0])
     flat = _flatten(np.asarray(crop, dtype=np.float64), 32.0)
     finest = _standardise((flat - gaussian_filter(flat, 1.0, mode="reflect"))[16:-16, 16:-16])
@@ -134,9 +134,9 @@ def compute_ground_statistics(crop: Float[np.ndarray, "rows columns"]) -> Ground
 
 def compute_image_statistics(image: Float[np.ndarray, "rows columns"]) -> ImageStatistics:
     """Compute the statistics of an image in any unit proportional to radiance."""
-    small = _reduce(image, SIDE)
+    small = _reduce(image, SIDE_PX)
     p10, p50, p90 = local_contrast(small)
-    offset = np.arange(SIDE) - 0.5 * (SIDE - 1)
+    offset = np.arange(SIDE_PX) - 0.5 * (SIDE_PX - 1)
     radius = np.hypot(offset[:, None], offset) / np.hypot(offset[0], offset[0])
     corner = float(small[radius > 0.9].mean() / small[radius < 0.25].mean())
     rms = float(small.std() / small.mean())
@@ -354,12 +354,13 @@ def _decorrelation(
     inverse, full = np.linalg.inv(homography), np.full_like(second, 255)
     warped = [cv2.warpPerspective(image, inverse, (FEATURE_SIDE, FEATURE_SIDE)) for image in (second, full)]
     a, b, valid = (
-        cv2.resize(image, (SIDE, SIDE), interpolation=cv2.INTER_AREA).astype(np.float64) for image in (first, *warped)
+        cv2.resize(image, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA).astype(np.float64)
+        for image in (first, *warped)
     )
     half = TEMPLATE // 2
     correlations = []
-    for row in range(half + 1, SIDE - half - 1, 8):
-        for column in range(half + 1, SIDE - half - 1, 8):
+    for row in range(half + 1, SIDE_PX - half - 1, 8):
+        for column in range(half + 1, SIDE_PX - half - 1, 8):
             window = np.s_[row - half : row + half + 1, column - half : column + half + 1]
             if valid[window].min() > 254.0:
                 correlations.append(np.corrcoef(a[window].ravel(), b[window].ravel())[0, 1])

@@ -14,9 +14,9 @@ from benchmarks.validation.flight_checks import FIRST_SEED, copy_image
 from benchmarks.validation.image_statistics import MapStatistics, compute_map_statistics
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.validation_rows import Conditions
-from marsyard.scenarios.localisation.instruments import true_camera
+from marsyard.scenarios.localisation.camera import true_camera
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.scenario import LocalisedDescent
+from marsyard.scenarios.localisation.simulation import LocalisedDescent
 from marsyard.scenarios.localisation.sites import localisation_site
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.streams import Streams

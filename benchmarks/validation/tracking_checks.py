@@ -17,9 +17,11 @@ from marsyard.algorithms.vtt.stereo import disparity_px_m
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.validation_rows import Conditions
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.rover.closed_loop import RoverRun, run_case
+from marsyard.scenarios.rover.closed_loop import run_case
+from marsyard.scenarios.rover.conditions import fixed_conditions, run_conditions
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.score import fixed_conditions, run_conditions, score_run
+from marsyard.scenarios.rover.run_state import RoverRun
+from marsyard.scenarios.rover.score import score_run
 from marsyard.sim.sensor.odometry import EXACT
 from marsyard.sim.streams import Streams
 

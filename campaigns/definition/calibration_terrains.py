@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 
-from marsyard.campaigns.definition.campaign import Campaign, replace_values
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.parameter_paths import replace_values
 from marsyard.scenarios.interface import IdentifiesTerrains
 from marsyard.sim.terrain.bank import IMPORTED_TERRAIN
 

@@ -1,6 +1,6 @@
 """A campaign and the parameters of each of its cases: the campaign's parameters with the case's sampled values.
 
-A path is the dotted path of a parameter in nested tables and lists, such as `wind.east_m_s`. A study evaluates cases at
+A path is the dotted path of a parameter (`marsyard.campaigns.definition.parameter_paths`). A study evaluates cases at
 points that it chooses (`marsyard.campaigns.sampling.study_points`).
 """
 
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.parameter_paths import replace_values, value_at
 from marsyard.campaigns.sampling.correlation import MIN_DRAW, correlate_groups
 from marsyard.campaigns.sampling.design import build_stratified_design, compute_grid_quantiles, locate_case
 from marsyard.campaigns.sampling.dispersion_base import Dispersion
@@ -26,7 +27,7 @@ from marsyard.scenarios.error_sources import error_sources
 from marsyard.scenarios.interface import Scenario
 from marsyard.sim.streams import Streams, stream_name
 
-#: Name of the record of confirmations in the current folder.
+#: Name of the record of confirmations in the current folder; git searches the history for it.
 CONFIRMATIONS_FILE = "confirmations.jsonl"
 
 
@@ -198,52 +199,3 @@ class Campaign:
             if source.name in removed:
                 tree = replace_values(tree, source.exact_values(tree))
         return self.scenario.parameters_type.model_validate(tree)
-
-
-def replace_values(tree: Any, values: Mapping[str, Any]) -> Any:
-    """Copy nested tables and lists with new values at dotted paths."""
-    for path, value in values.items():
-        tree = replace_value(tree, path.split("."), value)
-    return tree
-
-
-def replace_value(tree: Any, path: Sequence[str], value: Any) -> Any:
-    """Copy nested tables and lists with a new value at one path."""
-    if not path:
-        return value
-    key, *subpath = path
-    if isinstance(tree, list):
-        index = int(key)
-        return [*tree[:index], replace_value(tree[index], subpath, value), *tree[index + 1 :]]
-    return {**tree, key: replace_value(tree[key], subpath, value)}
-
-
-def value_at(tree: Any, path: str) -> Any:
-    """Return the value at a dotted path in nested tables and lists. Raises ValueError if there is no such path."""
-    node = tree
-    for part in path.split("."):
-        try:
-            node = node[int(part)] if isinstance(node, list) else node[part]
-        except (KeyError, IndexError, TypeError, ValueError):
-            raise ValueError(f"there is no parameter '{path}'") from None
-    return node
-
-
-def find_value(tree: Any, path: str) -> Any:
-    """Return the value at a dotted path in nested tables and lists; `()` if there is no such path."""
-    try:
-        return value_at(tree, path)
-    except ValueError:
-        return ()
-
-
-def leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield every value in nested tables and lists with its dotted path."""
-    if isinstance(tree, Mapping):
-        for name, inner in tree.items():
-            yield from leaves(inner, f"{path}.{name}" if path else str(name))
-    elif isinstance(tree, list) and tree:
-        for index, inner in enumerate(tree):
-            yield from leaves(inner, f"{path}.{index}")
-    else:
-        yield path, tree

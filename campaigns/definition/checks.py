@@ -7,16 +7,19 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, value_at
-from marsyard.campaigns.definition.campaign_file import POPULATIONS, Key, Requirement, key_text, validation_problems
-from marsyard.campaigns.definition.identity import list_algorithms
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign_file import POPULATIONS, Requirement
+from marsyard.campaigns.definition.components import list_algorithms
+from marsyard.campaigns.definition.parameter_paths import find_value, leaves, value_at
+from marsyard.campaigns.definition.toml_models import Key, key_text, validation_problems
 from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
-from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag, row_columns
+from marsyard.scenarios.algorithm_labels import labels
+from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag
+from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.interface import HasParts
 from marsyard.scenarios.parts.named import SCORE
-from marsyard.scenarios.tasks import labels
 
 #: Number of cases whose sampled values are validated before the campaign starts; ranges are always checked.
 _CHECKED_CASES = 32

@@ -19,15 +19,12 @@ from pathlib import Path
 from typing import Any, Self
 
 from marsyard.algorithms.exchange import parse_command
-from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves, replace_values
+from marsyard.campaigns.definition.algorithm_descriptions import describe_algorithms
+from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
-from marsyard.campaigns.definition.identity import (
-    custom_sources,
-    describe_algorithms,
-    hash_code,
-    hash_inputs,
-    list_parts,
-)
+from marsyard.campaigns.definition.components import list_parts
+from marsyard.campaigns.definition.identity import custom_sources, hash_code, hash_inputs
+from marsyard.campaigns.definition.parameter_paths import find_value, leaves, replace_values
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import HasAlgorithms
 from marsyard.scenarios.systems import scenario_source

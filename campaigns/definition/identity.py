@@ -1,8 +1,4 @@
-"""Identity of a campaign: hashes and versions of all inputs, except the case number, that determine its rows.
-
-The module also describes the algorithms of a campaign for its record: class, version, options, hash of the sources.
-Custom parts are code of users that replaces the motion, an instrument or a score (docs/custom-parts.md).
-"""
+"""Identity of a campaign: hashes and versions of all inputs, except the case number, that determine its rows."""
 
 from __future__ import annotations
 
@@ -20,17 +16,16 @@ from typing import Any, Self
 
 from pydantic import ValidationError
 
-from marsyard.algorithms.exchange import PREFIXES, ExecutableLimits, parse_command
-from marsyard.campaigns.definition.campaign import Campaign, find_value, leaves
+from marsyard.algorithms.exchange import parse_command
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.components import list_algorithms, list_parts
+from marsyard.campaigns.definition.parameter_paths import leaves
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
-from marsyard.scenarios.imports import relative_to, source_files
-from marsyard.scenarios.interface import HasAlgorithms, HasParts, Scenario
-from marsyard.scenarios.isolation.description import plain_options
-from marsyard.scenarios.offline_algorithms import answers_file, is_offline
+from marsyard.scenarios.custom_algorithms import algorithm_sources
+from marsyard.scenarios.imports import relative_to
+from marsyard.scenarios.offline_algorithms import answers_file
 from marsyard.scenarios.systems import UnknownScenarioError, scenario, scenario_source
-from marsyard.scenarios.tasks import algorithm_sources, custom_path, describe_custom
 from marsyard.scenarios.user_files import input_files
 
 #: Folders of the packages whose code determines rows; reports and commands do not affect rows.
@@ -110,62 +105,6 @@ def hash_inputs(definition: CampaignDefinition) -> dict[str, str]:
     return hashes
 
 
-def list_algorithms(definition: CampaignDefinition) -> tuple[str, ...]:
-    """List the algorithms in a definition or its dispersions: under test, then compared."""
-    selected_scenario = find_scenario(definition.scenario)
-    if not isinstance(selected_scenario, HasAlgorithms):
-        return ()
-    tested_key, compared_key = (
-        ".".join((*selected_scenario.algorithm_table, name)) for name in ("algorithm", "compared")
-    )
-    specs = [find_value(definition.parameters, tested_key), *find_value(definition.parameters, compared_key)]
-    if tested_key in definition.dispersions:
-        specs += definition.dispersions[tested_key].extremes()
-    return tuple(dict.fromkeys(str(spec) for spec in specs if spec))
-
-
-def own_limits(definition: CampaignDefinition) -> tuple[float, float]:
-    """Return the time (s) and memory (bytes) that the algorithms in processes of their own may use for one case."""
-    selected_scenario = find_scenario(definition.scenario)
-    if not isinstance(selected_scenario, HasAlgorithms):
-        return 0.0, 0.0
-    found = find_value(definition.parameters, ".".join((*selected_scenario.algorithm_table, "executable")))
-    limits = ExecutableLimits.model_validate(found if isinstance(found, Mapping) else {})
-    shipped = selected_scenario.task.shipped
-    custom = [spec for spec in list_algorithms(definition) if spec not in shipped and not is_offline(spec)]
-    count = len([spec for spec in custom if limits.isolated or spec.startswith(tuple(PREFIXES))])
-    return count * (limits.loading_s + limits.total_s), count * limits.memory_gb * 1e9
-
-
-def list_parts(definition: CampaignDefinition) -> tuple[str, ...]:
-    """List the import paths (``module:name``) of the custom parts in a definition or its dispersions."""
-    selected_scenario = find_scenario(definition.scenario)
-    if not isinstance(selected_scenario, HasParts):
-        return ()
-    parameter_trees = [definition.parameters]
-    for path, dispersion in definition.dispersions.items():
-        if any(f"{key}.".startswith(f"{path}.") for key in selected_scenario.part_keys):
-            for tree in dispersion.extremes():
-                for name in reversed(path.split(".")):
-                    tree = {name: tree}
-                parameter_trees.append(tree)
-    paths: dict[str, None] = {}
-    for tree in parameter_trees:
-        for key, kind in selected_scenario.part_keys.items():
-            value = find_value(tree, key)
-            specs = [value] if isinstance(value, str) else [str(item) for item in value or ()]
-            paths.update(dict.fromkeys(map(kind.path, specs)))
-    return tuple(paths)
-
-
-def find_scenario(name: object) -> Scenario | None:
-    """Return the scenario with a name; None if the name is invalid or unknown."""
-    try:
-        return scenario(name) if isinstance(name, str) and name else None
-    except UnknownScenarioError:
-        return None
-
-
 def definition_hash(definition: CampaignDefinition) -> str:
     """Compute the hash of the definition keys that determine the cases."""
     return stored_definition_hash(definition.model_dump(mode="json"))
@@ -220,66 +159,13 @@ def read_versions() -> dict[str, str]:
     except metadata.PackageNotFoundError:
         requirements = []
     names = {re.split(r"[^A-Za-z0-9._-]", text)[0] for text in requirements if "extra ==" not in text}
-    versions = {name: _distribution_version(name) or "not installed" for name in sorted({"marsyard", *names})}
+    versions = {name: distribution_version(name) or "not installed" for name in sorted({"marsyard", *names})}
     return {"python": platform.python_version(), **versions}
 
 
-def _distribution_version(name: str) -> str | None:
+def distribution_version(name: str) -> str | None:
     """Return the version of an installed distribution; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return None
-
-
-def describe_algorithms(campaign: Campaign) -> list[dict[str, Any]]:
-    """Describe the algorithms of a campaign, the one under test first; empty if the scenario has none.
-
-    Keys of each entry: `spec` (name in the campaign), `role` (`tested` or `compared`), `path` (class as
-    ``module:name``, or the file of the program or table), `version` (of the installed distribution, or the class's
-    `version` attribute; None if there is neither), `options` and `source_hash` (SHA-256, 16 digits; None without a
-    readable source).
-    """
-    selected_scenario = campaign.scenario
-    if not isinstance(selected_scenario, HasAlgorithms):
-        return []
-    compared = find_value(campaign.definition.parameters, ".".join((*selected_scenario.algorithm_table, "compared")))
-    parameters: Any = campaign.base_parameters()
-    for name in selected_scenario.algorithm_table:
-        parameters = getattr(parameters, name)
-    entries = []
-    for spec in list_algorithms(campaign.definition):
-        # shipped algorithms are installed with Marsyard; their sources are all of `marsyard.algorithms`
-        is_shipped = spec in selected_scenario.task.shipped
-        sources = list(source_files("marsyard.algorithms:") if is_shipped else custom_sources(spec))
-        if is_shipped:
-            configured_options = (value for _, value in parameters if isinstance(value, selected_scenario.task.options))
-            algorithm = selected_scenario.task.shipped[spec](next(configured_options, selected_scenario.task.options()))
-            algorithm_class, version = type(algorithm), _distribution_version("marsyard")
-            path = f"{algorithm_class.__module__}:{algorithm_class.__qualname__}"
-            options = plain_options(getattr(algorithm, "options", None))
-        else:
-            path, version, options = _describe_custom(spec)
-        entries.append(
-            {
-                "spec": spec,
-                "role": "compared" if spec in compared else "tested",
-                "path": path,
-                "version": version,
-                "options": options,
-                "source_hash": hash_sources(sources)[:16] if sources else None,
-            }
-        )
-    return entries
-
-
-def _describe_custom(spec: str) -> tuple[str, str | None, dict[str, Any]]:
-    """Return class or file, version and options of a custom algorithm."""
-    command = parse_command(spec)
-    if command is not None or is_offline(spec):
-        return (spec.partition(":")[2] if command is None else command.words[0]), None, {}
-    path, description = custom_path(spec), describe_custom(spec)
-    package = path.partition(":")[0].partition(".")[0]
-    versions = map(_distribution_version, metadata.packages_distributions().get(package, []))
-    version = next((text for text in versions if text is not None), None) or description.version
-    return path, version, dict(description.options)

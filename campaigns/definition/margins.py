@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.campaigns.definition.campaign_file import Requirement
-from marsyard.campaigns.errors import ENGINE_FAILURES
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 
 #: Margin of a case whose boolean metric is false, although its margin column is not negative.
 _MAX_VIOLATION_MARGIN = -1e-12

@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from marsyard.campaigns.definition.campaign_file import Key, Requirement, read_table
+from marsyard.campaigns.definition.campaign_file import Requirement
+from marsyard.campaigns.definition.toml_models import Key, read_table
 from marsyard.campaigns.errors import DefinitionError, Problem, unknown_name_message
 from marsyard.scenarios.systems import systems
 from marsyard.sim.parameters import Parameters

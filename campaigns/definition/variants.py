@@ -4,8 +4,9 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from marsyard.campaigns.definition.campaign import Campaign, value_at
-from marsyard.campaigns.definition.campaign_file import read_table
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.parameter_paths import value_at
+from marsyard.campaigns.definition.toml_models import read_table
 from marsyard.scenarios.systems import find_system
 from marsyard.sim.parameters import Parameters
 

@@ -22,10 +22,11 @@ from functools import cache
 from typing import Any, TypeVar
 
 from marsyard.campaigns.definition.identity import hash_code, read_versions
-from marsyard.campaigns.errors import CRASHED, CampaignError, WorkerExitError
+from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.batches import Batches
 from marsyard.campaigns.execution.work import TaskResult, Work
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import CRASHED, WorkerExitError
 
 Result = TypeVar("Result")
 #: Prefix of the address of a new cluster on this machine.
@@ -44,10 +45,10 @@ _thread_state = threading.local()
 
 
 #: Hash of the source code, and versions of the packages: plain types, which any worker can read.
-Identity = tuple[str, tuple[tuple[str, str], ...]]
+CodeIdentity = tuple[str, tuple[tuple[str, str], ...]]
 
 
-def check_identity(worker: str, theirs: Identity, ours: Identity) -> None:
+def check_identity(worker: str, theirs: CodeIdentity, ours: CodeIdentity) -> None:
     """Compare the code of a worker with that of the client. Raises CampaignError if they differ."""
     if theirs[0] != ours[0]:
         raise CampaignError(f"worker {worker} runs a different Marsyard source code than this program")
@@ -264,13 +265,13 @@ def _start_local_cluster(address: str) -> Any:
 
 
 @cache
-def identify_code() -> Identity:
+def identify_code() -> CodeIdentity:
     """Return the identity of the code in this process."""
     return hash_code(()), tuple(sorted(read_versions().items()))
 
 
 def _run_batch_isolated(
-    work: Work[Result], executors: int, identity: Identity
+    work: Work[Result], executors: int, identity: CodeIdentity
 ) -> tuple[float, list[TaskResult[Result]]]:
     """Run a batch in the worker process of this Dask thread; return the duration in seconds and the results.
 

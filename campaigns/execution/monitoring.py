@@ -22,11 +22,11 @@ from joblib.externals.loky.process_executor import BrokenProcessPool
 from marsyard.algorithms.processes import descendants, used_memory
 from marsyard.algorithms.processes import kill as kill_processes
 from marsyard.algorithms.worker_device import WORKER_NUMBER
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.supervisor import DUMP_SIGNAL, END_SIGNAL, find_marked_processes, is_stopped
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import load_task, run_batch
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, WorkerExitError
 
 _THREAD_VARIABLES = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS"),

@@ -22,6 +22,10 @@ DUMP_SIGNAL = signal.SIGUSR2
 END_SIGNAL = signal.SIGTERM
 #: Sent by Linux when the parent ends; it also resumes a supervisor that a case has stopped.
 _PARENT_SIGNAL = signal.SIGCONT
+#: Maximum seconds of repeated killing, since processes may start other processes meanwhile.
+_KILLING_S = 10.0
+#: Seconds between two rounds of killing.
+_PAUSE_S = 0.005
 
 
 def become_supervised(parent: int, folder: Path) -> None:
@@ -83,12 +87,6 @@ def _supervise(worker: int, parent: int, folder: Path, handled_signals: set[sign
         signal.signal(-status, signal.SIG_DFL)
     os.kill(os.getpid(), -status)
     os._exit(128 - status)  # as shells report a signal: 128 plus its number
-
-
-#: Maximum seconds of repeated killing, since processes may start other processes meanwhile.
-_KILLING_S = 10.0
-#: Seconds between two rounds of killing.
-_PAUSE_S = 0.005
 
 
 def find_marked_processes(mark: str) -> list[int]:

@@ -7,9 +7,7 @@ twenty times per second, and terminates a worker whose case exceeds a limit
 """
 
 import fcntl
-import math
 import os
-import re
 import shutil
 import tempfile
 import time
@@ -23,11 +21,13 @@ from typing import Any, TypeVar
 
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, CampaignError
+from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.batches import Batches
+from marsyard.campaigns.execution.machine_resources import free_memory
 from marsyard.campaigns.execution.monitoring import POLL_INTERVAL_S, MonitoredWorker
 from marsyard.campaigns.execution.work import TaskResult, Work
 from marsyard.campaigns.execution.worker_process import BatchResult
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT
 
 Result = TypeVar("Result")
 
@@ -44,11 +44,6 @@ _PREFIX = "marsyard-"
 _LOCK = "lock"
 #: Default memory limit of all workers together, as a fraction of the memory that is free at the start.
 _MEMORY_FRACTION = 0.8
-
-
-def available_cores() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 class LocalExecutor(AbstractContextManager["LocalExecutor"]):
@@ -223,13 +218,3 @@ def _remove_abandoned_folders() -> None:
                 shutil.rmtree(lock.parent, ignore_errors=True)
             finally:
                 os.close(descriptor)
-
-
-def free_memory() -> float:
-    """Return the available memory in bytes; infinite if the operating system does not report it."""
-    try:
-        text = Path("/proc/meminfo").read_text()
-    except OSError:
-        return math.inf
-    match = re.search(r"^MemAvailable:\s+(\d+) kB", text, re.MULTILINE)
-    return float(match[1]) * 1024.0 if match else math.inf

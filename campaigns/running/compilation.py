@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain
+from typing import NamedTuple
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.execution.work import Executor, Work
@@ -19,18 +20,26 @@ COMPILATION_NOTE = (
 )
 
 
-def list_compilations(scenario: str | None = None) -> list[tuple[str, str, tuple[str, ...]]]:
-    """List the campaigns that compile the kernels of a scenario's system, or of all systems.
+class Compilation(NamedTuple):
+    """A campaign that compiles the kernels of its scenario, with the overrides that make its cases small."""
 
-    Returns the scenario, the campaign, and the overrides that make its cases small.
-    """
+    scenario: str
+    campaign: str
+    overrides: tuple[str, ...]
+
+
+def list_compilations(scenario: str | None = None) -> list[Compilation]:
+    """List the campaigns that compile the kernels of a scenario's system, or of all systems."""
     compilations = (
         item
         for system in systems()
         if scenario is None or scenario in system.scenarios
         for item in system.compilation_campaigns.items()
     )
-    return [(load_campaign(name, overrides).definition.scenario, name, overrides) for name, overrides in compilations]
+    return [
+        Compilation(load_campaign(name, overrides).definition.scenario, name, overrides)
+        for name, overrides in compilations
+    ]
 
 
 def compile_campaign(name: str, overrides: Sequence[str]) -> None:
@@ -47,7 +56,7 @@ def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], Non
     """
     if kernels_are_ready(scenario):
         return
-    missing = [item for item in list_compilations(scenario) if not kernels_are_ready(item[0])]
+    missing = [item for item in list_compilations(scenario) if not kernels_are_ready(item.scenario)]
     if not missing:
         return
     note(COMPILATION_NOTE)
@@ -59,6 +68,5 @@ def compile_kernels(executor: Executor, scenario: str, note: Callable[[str], Non
         note(f"numeric kernels are compiled, {time.monotonic() - start_s:.0f} s")
 
 
-def _compile_item(compilations: Sequence[tuple[str, str, tuple[str, ...]]], number: int) -> None:
-    _scenario, name, overrides = compilations[number]
-    compile_campaign(name, overrides)
+def _compile_item(compilations: Sequence[Compilation], number: int) -> None:
+    compile_campaign(compilations[number].campaign, compilations[number].overrides)

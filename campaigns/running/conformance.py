@@ -4,52 +4,54 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
-from marsyard.campaigns.errors import CampaignError, WorkerExitError
+from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import accept_process_state
 from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.scenarios import conformance as suite
+from marsyard.campaigns.outcomes import WorkerExitError
+from marsyard.scenarios.conformance import candidates
+from marsyard.scenarios.conformance.checks import Finding
 
 #: Limits of output and memory of a conformance check, bytes.
 _OUTPUT_BYTES, _MEMORY_BYTES = 10e6, 4e9
 
 
-def create_subject(spec: str, task: str | None, limit_s: float) -> suite.CandidateAlgorithm:
+def create_subject(spec: str, task: str | None, limit_s: float) -> candidates.CandidateAlgorithm:
     """Create the subject of conformance checks from the name of an algorithm or of a custom part of the simulation.
 
     limit_s: time limit of one answer
     task: task of the algorithm; None for the task that its interface determines.
     Raises CampaignError if the name or the task is unknown.
     """
-    if task is not None and task not in suite.subject_kinds():
-        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(suite.subject_kinds())}")
+    if task is not None and task not in candidates.subject_kinds():
+        raise CampaignError(f"--task {task}: unknown; allowed: {', '.join(candidates.subject_kinds())}")
     try:
-        task_name = suite.determine_task(spec) if task is None else task
-        suite.check_subject(spec, task_name)
+        task_name = candidates.determine_task(spec) if task is None else task
+        candidates.check_subject(spec, task_name)
     except ValueError as error:
         raise CampaignError(str(error)) from error
-    return suite.CandidateAlgorithm(spec, task_name, limit_s)
+    return candidates.CandidateAlgorithm(spec, task_name, limit_s)
 
 
-def run_conformance_checks(subject: suite.CandidateAlgorithm) -> Iterator[suite.Finding]:
+def run_conformance_checks(subject: candidates.CandidateAlgorithm) -> Iterator[Finding]:
     """Run all checks in order; stop after the first check (an ordinary case) if its worker process dies."""
     # the time limit of an answer, the same time for the other work of the check, and 5 s
     limits = WorkLimits(2.0 * subject.limit_s + 5.0, _MEMORY_BYTES, _OUTPUT_BYTES)
     with LocalExecutor(1) as workers:
-        for number, (name, requirement) in enumerate(suite.check_names(subject)):
+        for number, (name, requirement) in enumerate(candidates.check_names(subject)):
             ((result,),) = workers.run(
-                Work(partial(suite.run_check, subject), [number], limits, load=partial(_load_subject, subject))
+                Work(partial(candidates.run_check, subject), [number], limits, load=partial(_load_subject, subject))
             )
             finding, error = result.result, result.error
             if finding is None and isinstance(error, WorkerExitError):
                 frames = [line.strip() for line in error.trace.splitlines() if line.strip().startswith("File ")][:1]
                 problem = f"{error.outcome}: {error}{f' ({frames[0]})' if frames else ''}"
                 advice = "it must return within the limits of time and memory for every image"
-                finding = suite.Finding(name, requirement, problem, advice)
+                finding = Finding(name, requirement, problem, advice)
             elif finding is None:
                 problem = f"{type(error).__name__}: {error}"
                 advice = "this is a defect of the checks or of the types in the answer"
-                finding = suite.Finding(name, requirement, problem, advice)
+                finding = Finding(name, requirement, problem, advice)
             elif finding.passed and result.changed:
                 problem = f"it changed the state of its process: {'; '.join(result.changed)}"
                 advice = "restore the state before returning, and end every thread and child process"
@@ -59,7 +61,7 @@ def run_conformance_checks(subject: suite.CandidateAlgorithm) -> Iterator[suite.
                 return
 
 
-def _load_subject(subject: suite.CandidateAlgorithm) -> None:
+def _load_subject(subject: candidates.CandidateAlgorithm) -> None:
     """Load and compile the subject of conformance checks in a worker."""
     subject.prepare()
     accept_process_state()

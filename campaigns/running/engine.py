@@ -9,37 +9,37 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from marsyard.campaigns.definition.algorithm_descriptions import describe_algorithms
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.campaign_file import CampaignDefinition, CaseLimits, key_text
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition, CaseLimits
 from marsyard.campaigns.definition.checks import NUMBERS, find_unknown_columns
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
-from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
-from marsyard.campaigns.errors import ENGINE_FAILURES, RETRYABLE, CampaignError, DefinitionError, Problem, StoreError
+from marsyard.campaigns.definition.identity import Identity, create_identity
+from marsyard.campaigns.definition.toml_models import key_text
+from marsyard.campaigns.errors import CampaignError, DefinitionError, Problem, StoreError
 from marsyard.campaigns.execution.cases import CompletedCase, run_cases
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
 from marsyard.campaigns.execution.work import Executor
+from marsyard.campaigns.outcomes import ENGINE_FAILURES, RETRYABLE
 from marsyard.campaigns.running.compilation import compile_kernels
 from marsyard.campaigns.running.progress import ProgressObserver
-from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
+from marsyard.campaigns.running.replay import replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE, Shard, read_shard
 from marsyard.campaigns.running.shared_inputs import prepare_inputs
+from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run, extend_confirmation, reserve_confirmation
 from marsyard.campaigns.store.lock import folder_lock
 from marsyard.campaigns.store.new_folder import claim_folder
 from marsyard.campaigns.store.origin import check_rows, describe_origin
-from marsyard.campaigns.store.products import ProductStore, create_product_selection
+from marsyard.campaigns.store.product_selection import create_product_selection
+from marsyard.campaigns.store.products import ProductStore
 from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
-from marsyard.campaigns.store.table import (
-    TABLE_FILE,
-    find_showcase,
-    find_worst_cases,
-    is_current,
-    numeric_metrics,
-    write_table,
-)
-from marsyard.scenarios.columns import Columns, row_columns
+from marsyard.campaigns.store.showcase import find_showcase, find_worst_cases
+from marsyard.campaigns.store.table import TABLE_FILE, is_current, numeric_metrics, write_table
+from marsyard.scenarios.columns import Columns
+from marsyard.scenarios.declared_columns import row_columns
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ import time
 from dataclasses import dataclass
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.errors import ENGINE_FAILURES
 from marsyard.campaigns.execution.cases import CompletedCase, run_cases
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
 from marsyard.campaigns.execution.work import Executor
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.campaigns.running.shared_inputs import InputPlan, find_case_inputs, plan_inputs, preparation_work
-from marsyard.campaigns.store.products import ALL_PRODUCTS
+from marsyard.campaigns.store.product_selection import ALL_PRODUCTS
 from marsyard.scenarios.interface import SelectsInputs
 
 #: Maximum number of trial cases; the first is excluded from the mean, since it loads code and terrains.

@@ -9,18 +9,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.campaign import Campaign, replace_value
+from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Retain
 from marsyard.campaigns.definition.identity import definition_hash
+from marsyard.campaigns.definition.parameter_paths import replace_value
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import resume_campaign, run_campaign
 from marsyard.campaigns.running.progress import ProgressObserver
-from marsyard.campaigns.running.replay import load_stored_campaign
+from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
+from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.interface import HasAlgorithms
-from marsyard.scenarios.offline_algorithms import ANSWERS, CASES, read_answers
+from marsyard.scenarios.offline_algorithms import ANSWERS, CASES
 from marsyard.scenarios.tasks import Task
 
 #: Files that describe an exported folder, for programs and for the team under test.

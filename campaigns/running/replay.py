@@ -1,25 +1,24 @@
-"""Load stored campaigns, and run single cases again (replay)."""
+"""Run single cases of a stored campaign again (replay)."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.campaign_file import CampaignDefinition, key_text, validation_problems
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
 from marsyard.campaigns.definition.identity import Identity, create_identity
-from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, DefinitionError, Problem
+from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.cases import run_cases
 from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
+from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
-from marsyard.campaigns.store.origin import check_origin, check_rows
-from marsyard.campaigns.store.products import ALL_PRODUCTS, REPLAYED_PRODUCTS, PackedProducts
+from marsyard.campaigns.store.origin import check_rows
+from marsyard.campaigns.store.packed_products import PackedProducts
+from marsyard.campaigns.store.product_selection import ALL_PRODUCTS, REPLAYED_PRODUCTS
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import stored_row
-from marsyard.scenarios.systems import UnknownScenarioError, scenario
 
 
 @dataclass(frozen=True)
@@ -101,24 +100,3 @@ def differing_columns(row: Row, stored: Row) -> tuple[str, ...]:
         if "time" not in name and name not in excluded_columns and values[0] != values[1]:
             differing.append(name)
     return tuple(differing)
-
-
-def load_stored_campaign(directory: Path, definition: CampaignDefinition) -> Campaign:
-    """Create the campaign of a stored definition; imports its scenario and algorithms.
-
-    Raises CampaignError if the folder was created elsewhere and names code, and DefinitionError if the scenario or
-    an algorithm cannot be imported, or a parameter is invalid.
-    """
-    check_origin(directory, definition)
-    try:
-        campaign = Campaign(definition, scenario(definition.scenario))
-        campaign.base_parameters()
-    except (UnknownScenarioError, ValidationError) as error:
-        problems = [("scenario", str(error))]
-        if isinstance(error, ValidationError):
-            errors = validation_problems(error, campaign.scenario.parameters_type)
-            problems = [(key_text(("parameters", *key)), message) for key, message in errors]
-        hint = "custom modules are imported from the current folder: start the command in the campaign's first folder"
-        problems.append(("", f"nothing was run or changed; {hint}"))
-        raise DefinitionError([Problem(str(directory), *problem) for problem in problems]) from error
-    return campaign

@@ -13,6 +13,14 @@ from pydantic import ConfigDict, Discriminator, Field, Tag, field_validator, mod
 
 from marsyard.campaigns.errors import suggest_similar
 from marsyard.campaigns.sampling import dispersion_base as base
+from marsyard.campaigns.sampling.distributions import (
+    STANDARD_NORMAL,
+    UnivariateDistribution,
+    create_scipy_distribution,
+    scipy_distributions,
+    scipy_parameters,
+    truncated_quantile,
+)
 
 #: Maximum number of levels of one grid.
 MAX_LEVELS = 100_000
@@ -186,7 +194,7 @@ class Normal(base.Dispersion):
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
         if self.sd is not None and not self.formulas:
-            base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, 0.5)
+            truncated_quantile(STANDARD_NORMAL, self._standard_limits, 0.5)
         return self
 
     @cached_property
@@ -203,7 +211,7 @@ class Normal(base.Dispersion):
         return float(self.sd)
 
     def quantile(self, probability: float) -> float:
-        standard_quantile = base.truncated_quantile(base.STANDARD_NORMAL, self._standard_limits, probability)
+        standard_quantile = truncated_quantile(STANDARD_NORMAL, self._standard_limits, probability)
         value = float(self.mean) + self._sd * standard_quantile
         return value if self.truncate is None else min(max(value, float(self.truncate[0])), float(self.truncate[1]))
 
@@ -280,7 +288,7 @@ class Scipy(base.Dispersion):
     @field_validator("distribution")
     @classmethod
     def _check_name(cls, name: str) -> str:
-        names = base.scipy_distributions()
+        names = scipy_distributions()
         if name not in names:
             hint = suggest_similar(name, [*BUILT_IN, *names])
             alternative = "a univariate distribution of scipy.stats by its name (norm, beta, poisson, ...)"
@@ -290,7 +298,7 @@ class Scipy(base.Dispersion):
     @model_validator(mode="after")
     def _check_parameters(self) -> Self:
         values = self.__pydantic_extra__ or {}
-        required, allowed = base.scipy_parameters(self.distribution)
+        required, allowed = scipy_parameters(self.distribution)
         problems = [
             f"unknown parameter '{name}'{suggest_similar(name, allowed)}" for name in values if name not in allowed
         ]
@@ -304,16 +312,16 @@ class Scipy(base.Dispersion):
     @property
     def continuous(self) -> bool:  # type: ignore[override]  # depends on the distribution's name
         """Whether the distribution has a density."""
-        return not base.scipy_distributions()[self.distribution]
+        return not scipy_distributions()[self.distribution]
 
     @cached_property
-    def _scipy_distribution(self) -> base.UnivariateDistribution:
+    def _scipy_distribution(self) -> UnivariateDistribution:
         parameters = {name: float(value) for name, value in (self.__pydantic_extra__ or {}).items()}
-        return base.create_scipy_distribution(self.distribution, parameters)
+        return create_scipy_distribution(self.distribution, parameters)
 
     def quantile(self, probability: float) -> float | int:
         limits = None if self.truncate is None else (float(self.truncate[0]), float(self.truncate[1]))
-        return base.truncated_quantile(self._scipy_distribution, limits, probability)
+        return truncated_quantile(self._scipy_distribution, limits, probability)
 
     def bounds(self) -> tuple[float, float] | None:
         if self.formulas:
@@ -334,10 +342,12 @@ _Dispersion = (
     | Annotated[GridDispersion, Tag("grid")]
     | Annotated[Scipy, Tag("scipy")]
 )
-#: Distributions implemented in this module; any other name is looked up in `scipy.stats`.
-BUILT_IN: Mapping[str, type[base.Dispersion]] = {
-    tag.tag: kind for kind, tag in map(get_args, get_args(_Dispersion)) if kind is not Scipy
+#: Classes of dispersions by the tag that pydantic adds to the location of an error.
+TAGGED_DISPERSIONS: Mapping[str, type[base.Dispersion]] = {
+    tag.tag: kind for kind, tag in map(get_args, get_args(_Dispersion))
 }
+#: Distributions implemented in this module; any other name is looked up in `scipy.stats`.
+BUILT_IN = {name: kind for name, kind in TAGGED_DISPERSIONS.items() if kind is not Scipy}
 
 
 def _select_tag(value: Any) -> str:

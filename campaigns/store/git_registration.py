@@ -12,11 +12,10 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
+from marsyard.campaigns.definition.campaign import CONFIRMATIONS_FILE
 from marsyard.campaigns.definition.loading import find_campaign
 from marsyard.campaigns.errors import CampaignError
 
-#: Name of a record that can be registered: git searches the history for it.
-RECORD_NAME = "confirmations.jsonl"
 #: Beginning of each reason.
 UNKNOWN = "No record of earlier runs is known here"
 _TIMEOUT_S = 60.0
@@ -28,8 +27,8 @@ def find_registration_problem(path: Path) -> str:
     if not path.is_file():
         return f"{UNKNOWN}: {path} does not exist."
     path = path.resolve()
-    if path.name != RECORD_NAME:
-        return f"{UNKNOWN}: {path} is not named {RECORD_NAME}."
+    if path.name != CONFIRMATIONS_FILE:
+        return f"{UNKNOWN}: {path} is not named {CONFIRMATIONS_FILE}."
     if find_repository(path.parent) is None:
         return f"{UNKNOWN}: {path} is in no git repository."
     try:
@@ -46,7 +45,7 @@ def _check_history(path: Path) -> str:
     if not _git(folder, "ls-tree", "HEAD", "--", f"./{path.name}", check=False):
         return f"{UNKNOWN}: {path} is not committed."
     options = ("--all", "--full-history", "-m", "--raw", "--no-abbrev", "--no-renames", "--format=")
-    changes = _git(folder, "log", *options, "--", f":(top,glob)**/{RECORD_NAME}").splitlines()
+    changes = _git(folder, "log", *options, "--", f":(top,glob)**/{CONFIRMATIONS_FILE}").splitlines()
     # a line of `--raw`: modes and object names before and after the change, the kind of change, a tab, and the path
     versions: dict[str, str] = {}
     for line in changes:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
-from marsyard.campaigns.definition.identity import custom_sources, hash_sources, list_algorithms, list_parts
+from marsyard.campaigns.definition.components import list_algorithms, list_parts
+from marsyard.campaigns.definition.identity import custom_sources, hash_sources
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.key import is_signature, sign

@@ -62,7 +62,7 @@ def write_first_record(
 
     - executor: description of the workers
     - command: words of the command that repeats the campaign in the current folder
-    - algorithms: see `marsyard.campaigns.definition.identity.describe_algorithms`
+    - algorithms: see `marsyard.campaigns.definition.algorithm_descriptions.describe_algorithms`
     - evidence: see `marsyard.campaigns.definition.evidence.Evidence`
     - origin: see `marsyard.campaigns.store.origin`
     """

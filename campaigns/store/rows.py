@@ -23,13 +23,18 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.errors import ENGINE_FAILURES, StoreError
+from marsyard.campaigns.errors import StoreError
+from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.campaigns.store import chain
 from marsyard.campaigns.store.temporary_files import replace_file
 from marsyard.scenarios.columns import LEADING, TRAILING
 from marsyard.scenarios.interface import Scalar
 
 ROWS_FILE = "cases.sqlite"
+#: Row of one case as stored.
+Row = Mapping[str, Scalar]
+#: Columns that the engine writes in front of and after those of the scenario.
+LEADING_COLUMNS, TRAILING_COLUMNS = ([column.name for column in columns] for columns in (LEADING, TRAILING))
 #: Version of the tables below, stored as `PRAGMA user_version`.
 STORE_VERSION = 3
 #: Identifier of the file type (`PRAGMA application_id`): "Mars".
@@ -354,9 +359,3 @@ def classify_value(value: Any) -> str:
     """Return the type of a value as in `RowStore.kinds`."""
     kind = type(value)
     return "big" if kind is int and not -(2**63) <= value < 2**63 else kind.__name__
-
-
-#: Row of one case as stored.
-Row = Mapping[str, Scalar]
-#: Columns that the engine writes in front of and after those of the scenario.
-LEADING_COLUMNS, TRAILING_COLUMNS = ([column.name for column in columns] for columns in (LEADING, TRAILING))

@@ -16,25 +16,19 @@ from SALib.analyze import sobol as sobol_indices
 from SALib.sample import sobol as sobol_design
 from scipy.special import ndtri
 
-from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.correlation import MAX_DRAW, MIN_DRAW
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.studies.contributions import MIN_COMMON, compute_budget
+from marsyard.campaigns.studies.point_runner import Candidate, CaseLimitError, PointRunner
 from marsyard.campaigns.studies.results import BUDGET, BudgetParameters, BudgetResult, SobolIndex
-from marsyard.campaigns.studies.runner import (
-    Candidate,
-    CaseLimitError,
-    PointRunner,
-    StudySession,
-    check_margin,
-    find_requirement,
-    start_study,
-)
+from marsyard.campaigns.studies.runner import StudySession, check_margin, find_requirement, start_study
 from marsyard.scenarios.error_sources import ScenarioSource, error_sources
 from marsyard.sim.streams import Streams
 

@@ -30,18 +30,10 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.studies import subset
 from marsyard.campaigns.studies.importance import fit_density
+from marsyard.campaigns.studies.point_runner import Candidate, CaseLimitError, PointRunner
 from marsyard.campaigns.studies.rare_decision import Basis, Decision, RareSample, RareVerdict, decide_rare
 from marsyard.campaigns.studies.results import RARE, RareParameters, RareResult, Replicate
-from marsyard.campaigns.studies.runner import (
-    Candidate,
-    CaseLimitError,
-    PointRunner,
-    StudySession,
-    check_margin,
-    continue_study,
-    find_requirement,
-    start_study,
-)
+from marsyard.campaigns.studies.runner import StudySession, check_margin, continue_study, find_requirement, start_study
 from marsyard.sim.streams import Streams
 
 #: Subset simulation stops at levels less likely than this fraction of the limit, which cannot change the verdict.

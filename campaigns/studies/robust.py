@@ -15,20 +15,22 @@ from pydantic import ValidationError
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
-from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition, Requirement
 from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.definition.variants import SystemVariant
 from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
-from marsyard.campaigns.running.replay import load_stored_campaign
+from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.origin import check_rows
 from marsyard.campaigns.store.rows import Row
 from marsyard.campaigns.store.table import TABLE_FILE, read_rows
+from marsyard.campaigns.studies.point_runner import Candidate, PointRunner
 from marsyard.campaigns.studies.results import ROBUST, RobustParameters, RobustResult, RobustVariant
-from marsyard.campaigns.studies.runner import Candidate, PointRunner, StudySession, check_identity, start_study
+from marsyard.campaigns.studies.runner import StudySession, check_identity, start_study
 from marsyard.campaigns.studies.study_record import STUDY_KEY
 from marsyard.sim.streams import Streams
 

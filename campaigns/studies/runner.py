@@ -8,44 +8,35 @@ is run again from its start. Cases with a stored row are not run again: their ro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from marsyard.campaigns.definition.campaign import Campaign, value_at
+from marsyard.campaigns.definition.algorithm_descriptions import describe_algorithms
+from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
-from marsyard.campaigns.definition.evidence import Evidence
-from marsyard.campaigns.definition.identity import Identity, create_identity, describe_algorithms
-from marsyard.campaigns.errors import ENGINE_FAILURES, CampaignError, StoreError, unknown_name_message
-from marsyard.campaigns.execution.cases import run_cases
+from marsyard.campaigns.definition.identity import Identity, create_identity
+from marsyard.campaigns.definition.parameter_paths import value_at
+from marsyard.campaigns.errors import CampaignError, unknown_name_message
 from marsyard.campaigns.execution.executors import ExecutorConfig, create_executor
-from marsyard.campaigns.execution.work import Executor
 from marsyard.campaigns.json_numbers import convert_to_json
 from marsyard.campaigns.running.compilation import compile_kernels
-from marsyard.campaigns.running.engine import check_metrics
 from marsyard.campaigns.running.progress import ProgressObserver
-from marsyard.campaigns.running.replay import load_stored_campaign
 from marsyard.campaigns.running.shared_inputs import prepare_inputs
+from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.sampling.design import ADAPTIVE, Design
 from marsyard.campaigns.sampling.dispersions import CyclicInteger, GridDispersion
-from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.confirmations import classify_run
 from marsyard.campaigns.store.lock import folder_lock
 from marsyard.campaigns.store.new_folder import claim_folder
 from marsyard.campaigns.store.origin import check_rows, describe_origin
-from marsyard.campaigns.store.products import ProductSelection
-from marsyard.campaigns.store.rows import ROWS_FILE, Row, RowStore, create_store
+from marsyard.campaigns.store.rows import ROWS_FILE, RowStore, create_store
 from marsyard.campaigns.store.table import TABLE_FILE, numeric_metrics, write_table
+from marsyard.campaigns.studies.point_runner import PointRunner
 from marsyard.campaigns.studies.results import BudgetResult, RareResult, RobustResult, SearchResult
 from marsyard.campaigns.studies.study_record import STUDY_KEY, StudyKind
-from marsyard.campaigns.studies.subset import NEW_STREAM
-from marsyard.sim.streams import Blend
-
-#: A study is stopped with an error if none of this number of first cases has finished.
-_MAX_FIRST_CRASHES = 20
-
 
 Parameters = TypeVar("Parameters")
 Result = TypeVar("Result", bound=RareResult | SearchResult | BudgetResult | RobustResult)
@@ -65,100 +56,6 @@ class StudySession(Generic[Parameters, Result]):
     study: Callable[[Campaign, Parameters, PointRunner], Any]
     executor: ExecutorConfig
     observer: ProgressObserver
-
-
-class CaseLimitError(Exception):
-    """The study needs more cases than its limit."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A point to be evaluated by one case (see `marsyard.campaigns.sampling.study_points.StudyPoint`).
-
-    - coordinates: standard normal numbers of the random dispersions
-    - stream: number of the case's random streams; None for new streams
-    - nominal: paths of the dispersions that have the campaign's parameter instead of a sampled value
-    - removed: names of the sources of error that the case does not have
-    - blend: components of the random streams, the last with the number `NEW_STREAM`; empty for one component
-    - values: paths and values of parameters that replace those of the campaign
-    """
-
-    coordinates: tuple[float, ...]
-    stream: int | None = None
-    nominal: tuple[str, ...] = ()
-    removed: tuple[str, ...] = ()
-    blend: Blend = ()
-    values: tuple[tuple[str, Any], ...] = ()
-
-    def point(self, case: int) -> StudyPoint:
-        """Return the point of the candidate as a case; new streams have the number of the case."""
-        stream = case if self.stream is None else self.stream
-        blend = tuple((case if number == NEW_STREAM else number, weight) for number, weight in self.blend)
-        return StudyPoint(self.coordinates, stream, self.nominal, self.removed, blend, self.values)
-
-
-class PointRunner:
-    """Runner of the cases of a study, in the order of their numbers; cases with a stored row are read.
-
-    - campaign: campaign with the design `adaptive`; its number of cases is the limit of the study
-    - directory, store: folder of the study, and its rows
-    """
-
-    def __init__(
-        self, campaign: Campaign, directory: Path, store: RowStore, executor: Executor, observer: ProgressObserver
-    ) -> None:
-        self._campaign, self._directory, self._store = campaign, directory, store
-        self._executor, self._observer = executor, observer
-        self._is_checked = self._has_finished_case = False
-        #: Number of cases evaluated so far.
-        self.n_cases = 0
-
-    @property
-    def evidence(self) -> Evidence:
-        """Kind of evidence of the study's seed."""
-        return Evidence.read(record.read(self._directory).get("evidence"))
-
-    def run(self, candidates: Sequence[Candidate], reserved_cases: int = 0) -> list[Row]:
-        """Evaluate points in parallel; return their rows in the same order.
-
-        reserved_cases: number of cases, out of the limit, that these points cannot use
-        Raises CaseLimitError before the first case beyond the limit, StoreError if a stored row has another point, and
-        CampaignError if none of the first cases finished.
-        """
-        first = self.n_cases
-        limit = self._campaign.definition.total_cases - reserved_cases
-        if first + len(candidates) > limit:
-            raise CaseLimitError(f"the study needs more than {limit} cases")
-        points = {case: item.point(case) for case, item in enumerate(candidates, start=first)}
-        rows = {case: row for case in points if (row := self._store.row(case)) is not None}
-        for case, row in rows.items():
-            if row.get(POINT_COLUMN) != points[case].text:
-                raise StoreError(f"{self._directory}: case {case} was run at another point; the study has changed")
-        missing = [case for case in points if case not in rows]
-        definition = self._campaign.definition
-        for batch in run_cases(
-            self._executor,
-            definition,
-            missing,
-            selection=ProductSelection(),
-            total=len(missing),
-            points={case: points[case] for case in missing},
-        ):
-            self._store.add(completed.row for completed in batch)
-            for completed in batch:
-                if completed.note:
-                    self._observer.note(completed.note)
-                if not self._is_checked and completed.row["outcome"] not in ENGINE_FAILURES:
-                    check_metrics(definition, completed.row, self._directory)
-                    self._is_checked = True
-                rows[int(completed.row["case"])] = completed.row
-                self._observer.step()
-        self.n_cases += len(candidates)
-        self._has_finished_case |= any(row["outcome"] not in ENGINE_FAILURES for row in rows.values())
-        if not self._has_finished_case and self.n_cases >= _MAX_FIRST_CRASHES:
-            error = next(iter(rows.values())).get("error")
-            raise CampaignError(f"{self._directory}: none of the first {self.n_cases} cases finished: {error}")
-        return [rows[case] for case in points]
 
 
 def prepare_campaign(campaign: Campaign, max_cases: int, streams: int | None = None) -> Campaign:

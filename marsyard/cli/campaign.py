@@ -144,7 +144,8 @@ def resume(
     trust: options.TrustOption = False,
 ) -> None:
     """Run the remaining cases of an interrupted or killed campaign, and evaluate it."""
-    from marsyard.campaigns.errors import RETRYABLE, CampaignError, unknown_name_message
+    from marsyard.campaigns.errors import CampaignError, unknown_name_message
+    from marsyard.campaigns.outcomes import RETRYABLE
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
     from marsyard.cli.studies import contains_study, continue_study_and_exit

@@ -24,7 +24,7 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
     """Create the parameters of the workers from the options `--jobs` and `--cluster`."""
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.execution.executors import ExecutorConfig
-    from marsyard.campaigns.execution.workers import available_cores
+    from marsyard.campaigns.execution.machine_resources import available_cores
 
     if jobs is not None and jobs < 1:
         raise CampaignError(f"--jobs {jobs}: at least one worker process is needed")

@@ -10,8 +10,9 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from marsyard.campaigns.definition.campaign import Campaign
-from marsyard.campaigns.definition.campaign_file import MAX_CASES, read_table
+from marsyard.campaigns.definition.campaign_file import MAX_CASES
 from marsyard.campaigns.definition.loading import load_campaign
+from marsyard.campaigns.definition.toml_models import read_table
 from marsyard.sim.parameters import Parameters
 
 #: The plan that is installed with Marsyard.

@@ -17,11 +17,13 @@ from rich.table import Table
 
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.campaigns.running.replay import load_stored_campaign, replay_in_executor
+from marsyard.campaigns.running.replay import replay_in_executor
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
+from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked
-from marsyard.campaigns.store.products import case_directory, save_packed
+from marsyard.campaigns.store.packed_products import save_packed
+from marsyard.campaigns.store.products import case_directory
 from marsyard.campaigns.store.record import stored_definition
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
 from marsyard.campaigns.store.temporary_files import replace_file

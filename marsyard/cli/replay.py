@@ -47,14 +47,9 @@ def replay(
     """Run one case again, write and plot its intermediate results, and compare its row with the stored one."""
     from marsyard.campaigns.running.replay import replay as rerun_case
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.campaigns.store.products import (
-        case_directory,
-        pack_products,
-        replace_files,
-        unpack_products,
-        write_packed,
-        write_stages,
-    )
+    from marsyard.campaigns.store.packed_products import pack_products, replace_files, unpack_products, write_packed
+    from marsyard.campaigns.store.products import case_directory
+    from marsyard.campaigns.store.stages import write_stages
     from marsyard.reports.presentation import write_case_figures
 
     exports = _requested_exports(rerun, glb, rosbag)

@@ -68,7 +68,8 @@ def confirmations(
 ) -> None:
     """List confirmations: evaluations of frozen algorithms on unseen seeds (`run --confirm`), with their results."""
     from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.store.confirmations import create_record, read_confirmations
+    from marsyard.campaigns.store.confirmation_record import read_record
+    from marsyard.campaigns.store.confirmations import create_record
     from marsyard.campaigns.store.git_registration import find_registration_problem
     from marsyard.reports.tables import confirmations_table
 
@@ -78,7 +79,7 @@ def confirmations(
         return
     if not file.is_file():
         raise CampaignError(f"{file}: no such file; `marsyard confirmations --create` creates it")
-    entries = read_confirmations(file)
+    entries = read_record(file).confirmations
     if as_json:
         typer.echo(json.dumps([asdict(entry) for entry in entries], indent=2))
     else:

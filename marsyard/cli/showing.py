@@ -12,8 +12,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.campaigns.definition.campaign import Campaign, leaves, value_at
-from marsyard.campaigns.definition.campaign_file import CampaignDefinition, description_at
+from marsyard.campaigns.definition.campaign import Campaign
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.parameter_paths import leaves, value_at
+from marsyard.campaigns.definition.toml_models import description_at
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
 from marsyard.reports.wording import count, requirement_text

@@ -328,10 +328,12 @@ def continue_study_and_exit(
 
 def finish_search(directory: Path, result: SearchResult) -> NoReturn:
     """Store files and images of the reduced violations, write the report, print the result, and exit."""
-    from marsyard.campaigns.running.replay import load_stored_campaign, replay
-    from marsyard.campaigns.store.products import case_directory, save_packed
+    from marsyard.campaigns.running.replay import replay
+    from marsyard.campaigns.running.stored_campaign import load_stored_campaign
+    from marsyard.campaigns.store.packed_products import save_packed
+    from marsyard.campaigns.store.products import case_directory
     from marsyard.campaigns.store.record import stored_definition
-    from marsyard.campaigns.studies.search import write_regression_campaigns
+    from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
 
     campaign = load_stored_campaign(directory, stored_definition(directory))
     files = write_regression_campaigns(campaign, result, directory)

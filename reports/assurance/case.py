@@ -13,7 +13,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.evidence import Confirmation
+from marsyard.campaigns.definition.confirmation import Confirmation
 from marsyard.reports.fits import Constant, read_constants
 from marsyard.reports.report_file import CampaignReport
 from marsyard.reports.stored import table

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from marsyard.campaigns.definition.identity import hash_sources
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.hidden_folders import hide_folders
-from marsyard.campaigns.store.confirmations import read_record
+from marsyard.campaigns.store.confirmation_record import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
 from marsyard.campaigns.studies.results import ROBUST_FOLDER

@@ -16,7 +16,7 @@ from typing import Any
 
 from marsyard.campaigns.definition.identity import stored_definition_hash
 from marsyard.campaigns.errors import CampaignError
-from marsyard.campaigns.store.confirmations import find_own_entry, read_record
+from marsyard.campaigns.store.confirmation_record import find_own_entry, read_record
 from marsyard.reports.assurance.case import AssuredRun, build_case
 from marsyard.reports.assurance.package import (
     CONFIRMATIONS,

@@ -22,7 +22,7 @@ from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.tables import error_summaries, statistics_rows
 from marsyard.reports.wording import NOTHING, format_fraction, label, magnitude_label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
-from marsyard.scenarios.descent.parameters import LandingParameters
+from marsyard.scenarios.descent.parameters import TouchdownParameters
 
 _FIRING = "firing_velocity_error_m_s"
 _FIRING_NOTE = (
@@ -243,7 +243,7 @@ def landing_fractions(landings: Rows) -> dict[str, rates.CaseFraction]:
 
 def _landing_model(subject: Subject) -> dict[str, str]:
     """Return the parameters of the campaign's model of the last seconds, for the note of the table of speeds."""
-    model = LandingParameters.model_validate(subject.run.parameter("landing") or {})
+    model = TouchdownParameters.model_validate(subject.run.parameter("landing") or {})
     return {
         "computation": f"{model.computation_s:g}",
         "deadband": f"{model.steering_deadband_m_s:g}",

@@ -12,7 +12,8 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from marsyard.reports.timeline.mesh import colour, ground_width_m, triangulate, vertex_colours
-from marsyard.scenarios.timeline import Ellipsoids, TimedImage, Timeline, grey_values
+from marsyard.scenarios.timeline import Ellipsoids, TimedImage, Timeline
+from marsyard.scenarios.timeline_surface import grey_values
 
 #: Name of the time line, seconds.
 _TIME = "time"

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from marsyard.algorithms.faults import AlgorithmError
+from marsyard.scenarios.custom_algorithms import algorithm_sources
 from marsyard.scenarios.input_copies import copy_inputs, hash_inputs
 from marsyard.scenarios.isolation.host import reset
-from marsyard.scenarios.tasks import algorithm_sources
 
 #: Modules of `marsyard` that an algorithm may import, with their submodules (docs/architecture.md).
 ALLOWED_MODULES = ("marsyard.sim.frames", "marsyard.sim.camera", "marsyard.sim.measurements", "marsyard.algorithms")

@@ -62,40 +62,40 @@ class SuiteRules:
 class EstimatorSuite(Suite):
     """Suite of an estimator that receives all measurements at once."""
 
-    protocol: SuiteRules
+    rules: SuiteRules
 
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
-        protocol = self.protocol
-        advice = f"see {protocol.interface} for methods and answers"
-        rule = "returns a well-formed answer to textured images"
-        yield Check("answer", rule, advice, lambda: protocol.describe(self._answer(protocol.measurements())))
-        advice = f"without a result return one of the failures {protocol.failures}; raise no exception"
-        for name, unusual in protocol.unusual.items():
+        rules = self.rules
+        advice = f"see {rules.interface} for methods and answers"
+        requirement = "returns a well-formed answer to textured images"
+        yield Check("answer", requirement, advice, lambda: rules.describe(self._answer(rules.measurements())))
+        advice = f"without a result return one of the failures {rules.failures}; raise no exception"
+        for name, unusual in rules.unusual.items():
             answer = "a failure" if unusual.reason else "a well-formed answer"
             yield Check(name, f"returns {answer} to {unusual.text}", advice, partial(self._check_unusual, unusual))
         yield from self.common_checks()
 
     def cases(self) -> Sequence[Any]:
         """See `Suite`."""
-        return [self.protocol.measurements()]
+        return [self.rules.measurements()]
 
     def _other_cases(self) -> Sequence[Any]:
-        return [inputs.make_noisy(self.protocol.measurements())]
+        return [inputs.make_noisy(self.rules.measurements())]
 
     def _call(self, algorithm: Any, case: Any, seed: int) -> Any:
         return algorithm.estimate(case)
 
     def _check_answer(self, answer: Any, case: Any) -> Any:
-        return self.protocol.check(answer, case)
+        return self.rules.check(answer, case)
 
     def _check_unusual(self, unusual: Unusual) -> str:
         descriptions = []
         for create in unusual.cases:
             answer = self._answer(create())
-            if unusual.reason and self.protocol.is_valid(answer):
+            if unusual.reason and self.rules.is_valid(answer):
                 raise BreachError(f"it answers {answer.outcome.name} to {unusual.text}: {unusual.reason}")
-            descriptions.append(self.protocol.describe(answer))
+            descriptions.append(self.rules.describe(answer))
         return "; ".join(descriptions)
 
 
@@ -111,13 +111,13 @@ class StreamSuite(EstimatorSuite):
     def checks(self) -> Iterator[Check]:
         """See `Suite`."""
         yield from super().checks()
-        rule, advice = "resets its state after an interrupted descent", "reset the whole state in start"
-        yield Check("start", rule, advice, self._check_restart)
+        requirement, advice = "resets its state after an interrupted descent", "reset the whole state in start"
+        yield Check("start", requirement, advice, self._check_restart)
 
     def _check_restart(self) -> str:
-        case = self.protocol.measurements()
+        case = self.rules.measurements()
         expected_fingerprint = fingerprint(self._answer(case))
-        estimator, create_interrupted = self.make(), self.protocol.interrupted or self.protocol.measurements
+        estimator, create_interrupted = self.make(), self.rules.interrupted or self.rules.measurements
         interrupted = copy_inputs(create_interrupted())
         estimator.stream.start(*interrupted.start_inputs)
         images = 0
@@ -133,8 +133,8 @@ class StreamSuite(EstimatorSuite):
 
     def _answer_time_s(self) -> float:
         """Measure the maximum time of an image in a second descent; the first descent compiles kernels."""
-        self._answer(self.protocol.measurements())
-        estimator, case = self.make(), copy_inputs(self.protocol.measurements())
+        self._answer(self.rules.measurements())
+        estimator, case = self.make(), copy_inputs(self.rules.measurements())
         estimator.stream.start(*case.start_inputs)
         times = [(is_image(event), measure_time_s(partial(estimator.process, event))) for event in case.events()]
         return max(elapsed_s for image, elapsed_s in times if image)

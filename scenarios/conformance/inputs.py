@@ -33,7 +33,7 @@ from marsyard.sim.sensor.presets import Preset
 Measurements = TypeVar("Measurements", bound=Any)
 
 #: Mean radiance factor of the plane, and radiance factor outside the plane.
-MEAN, BACKGROUND = 0.2, 0.1
+MEAN_RADIANCE, BACKGROUND_RADIANCE = 0.2, 0.1
 #: Side of the periodic texture in samples, and standard deviation of its values relative to their mean.
 _TEXTURE_SIZE, _TEXTURE_CONTRAST = 1024, 0.2
 #: Mean velocity of the descent, east, north, up, m/s.
@@ -80,7 +80,7 @@ class TexturedPlane:
         points = origins + np.where(visible, ranges, 1.0)[..., None] * directions - self.origin
         columns, rows = np.moveaxis(points @ self.axes.T, -1, 0) / self.step_m
         values = map_coordinates(texture(), [rows, columns], order=1, mode="grid-wrap")
-        return np.where(visible, MEAN * values, BACKGROUND).astype(np.float32)
+        return np.where(visible, MEAN_RADIANCE * values, BACKGROUND_RADIANCE).astype(np.float32)
 
 
 @cache

@@ -12,7 +12,7 @@ from marsyard.algorithms.answers import check_aim, check_update
 from marsyard.algorithms.interface import MastAim, PixelBox, TargetUpdate, TrackingState
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.scenarios.conformance.checks import BreachError, Check, Suite, measure_time_s
-from marsyard.scenarios.conformance.inputs import MEAN, TexturedPlane, texture
+from marsyard.scenarios.conformance.inputs import MEAN_RADIANCE, TexturedPlane, texture
 from marsyard.scenarios.input_copies import copy_inputs, hash_inputs
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
@@ -66,7 +66,9 @@ def _take_image(camera: CameraModel, box: PixelBox, blank: int | None) -> MastIm
     wall_axes = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
     wall = TexturedPlane(np.array([_WALL_DISTANCE_M, 0.0, 0.0]), wall_axes, _TEXTURE_STEP_M)
     radiance = wall.radiance(camera.crop(*box.corner, box.size))
-    return MastImage(np.clip(np.rint(_MEAN_DN / MEAN * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner)
+    return MastImage(
+        np.clip(np.rint(_MEAN_DN / MEAN_RADIANCE * radiance), 0, FULL_SCALE_DN).astype(np.uint16), box.corner
+    )
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_time_fault
+from marsyard.scenarios.descent.faults import add_time_fault
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.recorded import END_MARGIN_S, check_looks_down
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.motions import CustomMotion, MotionInputs
@@ -15,10 +16,8 @@ from marsyard.sim.dynamics.pose_files import TrajectoryFileError
 from marsyard.sim.dynamics.recorded import RecordedMotion
 from marsyard.sim.dynamics.swing import SwingDescent
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import Surface
+from marsyard.sim.terrain import Environment, Surface
 
-#: Gravity on Mars, m/s^2, used for a generic terrain.
-MARS_GRAVITY_M_S2 = 3.72
 #: Duration of a simulated descent before the first image, s.
 SIMULATED_LEAD_S = 5.0
 #: Margin of the inertial unit's data: after the start of the motion and after the thrusters' firing, s.
@@ -46,7 +45,7 @@ class DescentFlight:
 
 def gravity_m_s2(p: DescentScenarioParameters) -> float:
     """Return the gravity of the site, or of Mars for a generic terrain."""
-    return MARS_GRAVITY_M_S2 if p.preset is None else p.preset.environment.gravity_m_s2
+    return (Environment() if p.preset is None else p.preset.environment).gravity_m_s2
 
 
 def create_flight(p: DescentScenarioParameters, surface: Surface, streams: Streams) -> DescentFlight:

@@ -10,7 +10,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.scenarios.cameras import Optics, add_calibration_error
 from marsyard.scenarios.cameras import camera_optics as shared_optics
 from marsyard.scenarios.case_faults import HAZE_PATH_M
-from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters, draw_clouds
+from marsyard.scenarios.descent.faults import draw_clouds
+from marsyard.scenarios.descent.parameters import DescentCameraParameters, DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.heat_shield import HeatShield
 from marsyard.scenarios.radiance import add_haze

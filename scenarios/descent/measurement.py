@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64, UInt16
+from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from marsyard.scenarios.case_faults import Images
+from marsyard.scenarios.descent.faults import add_altitude_faults, add_attitude_faults
 from marsyard.scenarios.descent.flight import IMU_MARGIN_S, DescentFlight, gravity_m_s2, mean_velocities
 from marsyard.scenarios.descent.images import calibrated_camera, camera_optics
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_altitude_faults, add_attitude_faults
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.instruments import (
@@ -117,11 +119,8 @@ def add_increments(
     return replace(measurements, increments=increments, gravity_m_s2=gravity_m_s2(p))
 
 
-Counts = Sequence[UInt16[np.ndarray, "rows columns"]]
-
-
 def measure_exactly(
-    p: DescentScenarioParameters, world: DescentWorld, states: Sequence[State], images: Counts, detector: Detector
+    p: DescentScenarioParameters, world: DescentWorld, states: Sequence[State], images: Images, detector: Detector
 ) -> DescentMeasurements:
     """Create measurements without errors: true attitudes, altitudes, times and velocities, and the true camera."""
     camera = p.detector.delivered_camera(camera_optics(p.camera).camera)
@@ -145,7 +144,7 @@ def measure(
     p: DescentScenarioParameters,
     world: DescentWorld,
     motion: Trajectory,
-    images: Counts,
+    images: Images,
     detector: Detector,
     instruments: DescentInstruments,
     streams: Streams,

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.descent.images import camera_optics, draw_mounting
-from marsyard.scenarios.timeline import Timeline, surface_from_above
+from marsyard.scenarios.descent.simulation import Descent
+from marsyard.scenarios.timeline import Timeline
+from marsyard.scenarios.timeline_surface import surface_from_above
 from marsyard.scenarios.velocity_timeline import STEP_S, VelocityCase
-
-if TYPE_CHECKING:
-    from marsyard.scenarios.descent.scenario import Descent
 
 #: Half width of the shown ground divided by the altitude of the first image.
 _HALF_WIDTH_RATIO = 0.8

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marsyard.scenarios.descent.parameters import DescentScenarioParameters, add_terrain_fault
+from marsyard.scenarios.descent.faults import add_terrain_fault
+from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.radiance import sun_at, sunlight_ratio
 from marsyard.scenarios.views import SiteGround, Viewpoint, site_scene

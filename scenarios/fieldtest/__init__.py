@@ -1,8 +1,8 @@
 """The helicopter field test of DIMES (Johnson, Willson, Goguen, Alexander & Meller, sections III and IV).
 
 - `parameters`: parameters of campaigns
-- `imaging`: camera, sun, scene and exposure
-- `targets`, `attitude`: detection of surveyed targets, and estimation of attitudes from the targets and gyros
+- `flown_run`, `imaging`: flight of a run with its camera, and the images
+- `targets`, `target_detection`, `gyros`, `attitude`: surveyed targets, and attitudes from them and gyros
 - `run`: simulation and processing of a run, and selection of its triples
-- `scenario`: a case is one triple
+- `measurement`, `conditions`, `scenario`: a case is one triple
 """

@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 from pydantic import AwareDatetime, Field, model_validator
 
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.parts.scores import CustomScores, ScoredFlight
-from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import site_validator
 from marsyard.scenarios.velocity import VELOCITY
 from marsyard.sim.dynamics.helicopter import HelicopterParameters

@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.fieldtest import imaging
-from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory, add_thermal_drift, solve_attitude
-from marsyard.scenarios.fieldtest.parameters import ElevationParameters
-from marsyard.scenarios.fieldtest.targets import Sightings, Targets, detect_targets, project_targets
+from marsyard.scenarios.fieldtest.attitude import solve_attitude
+from marsyard.scenarios.fieldtest.elevation_model import simulate_elevation_model
+from marsyard.scenarios.fieldtest.flown_run import FlownRun, RunKey, field_camera
+from marsyard.scenarios.fieldtest.gyros import EarthRotation, InertialTrajectory, add_thermal_drift
+from marsyard.scenarios.fieldtest.target_detection import detect_targets
+from marsyard.scenarios.fieldtest.targets import Sightings, Targets, project_targets
 from marsyard.scenarios.fieldtest.triples import ImageMeasurements, Triple, draw_triples
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Motion
@@ -25,12 +26,10 @@ from marsyard.sim.sensor.gps import Gps
 from marsyard.sim.sensor.imu import DEG_H, Imu
 from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.sensor.instrument import Clock
-from marsyard.sim.terrain import Surface, site
+from marsyard.sim.terrain import site
 
 #: Number of points on the flight line whose mean ground height is the reference of the flight's heights.
 _GROUND_POINTS = 256
-#: Margin of the elevation model around the requested points, posts.
-_MARGIN_POSTS = 2
 #: Rays along each side of a pixel at the edges of the targets.
 _TARGET_EDGE_RAYS = 4
 #: Minimum number of sightings of a pass: two directions determine an attitude, one more checks it.
@@ -50,34 +49,14 @@ class FieldRun:
     - triples: triples of the run, one per case
     """
 
-    flown: imaging.FlownRun
+    flown: FlownRun
     truth: Motion
     images: ImageMeasurements
     attitudes: Rotation
     triples: tuple[Triple, ...]
 
 
-def simulate_elevation_model(
-    p: ElevationParameters, surface: Surface, points_m: Float64[np.ndarray, "n 2"], rng: np.random.Generator
-) -> RegularGridInterpolator:
-    """Simulate an elevation model of the ground around points; heights are linear between posts (paper, III.D.1).
-
-    The height of a post is the mean height of its cell plus a correlated error.
-    """
-    x, y = (
-        p.posting_m * np.arange(np.floor(low) - _MARGIN_POSTS, np.ceil(high) + _MARGIN_POSTS + 1.0)
-        for low, high in zip(points_m.min(axis=0) / p.posting_m, points_m.max(axis=0) / p.posting_m, strict=True)
-    )
-    level = int(np.clip(np.rint(np.log2(p.posting_m / surface.spacing_m)), 0, len(surface.levels) - 1))
-    ground = surface.height(*np.meshgrid(x, y, indexing="ij"), level)
-    sigma = p.correlation_m / p.posting_m
-    error = gaussian_filter(rng.standard_normal(ground.shape), sigma, mode="wrap")
-    # Gaussian smoothing reduces the variance of white noise to the fraction 1 / (4 pi sigma**2)
-    error *= p.error_m * np.sqrt(4.0 * np.pi) * sigma
-    return RegularGridInterpolator((x, y), ground + error)
-
-
-def simulate_run(key: imaging.RunKey, load_ground: LoadGround = SiteGround.from_bank) -> FieldRun:
+def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> FieldRun:
     """Simulate and process a run; the result depends only on the key."""
     p, run, generator = key.field_test, key.parameters, key.generator
     ground = imaging.run_ground(key, load_ground)
@@ -92,7 +71,7 @@ def simulate_run(key: imaging.RunKey, load_ground: LoadGround = SiteGround.from_
     clouds = None
     if run.clouds is not None:
         clouds = CloudLayer.draw(run.clouds, generator("clouds"), ground_m=float(flight.origin_m[2]))
-    flown = imaging.FlownRun(key, clouds, flight)
+    flown = FlownRun(key, clouds, flight)
     interval = p.images.interval_s
     pass_times = [np.arange(leg.start_s + 0.5 * interval, leg.end_s, interval) for leg in flight.passes]
     times = np.concatenate(pass_times)
@@ -124,7 +103,7 @@ def simulate_run(key: imaging.RunKey, load_ground: LoadGround = SiteGround.from_
     )
 
 
-def _estimate_attitudes(run: imaging.FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
+def _estimate_attitudes(run: FlownRun, ground: SiteGround, clock: Clock, gps: Gps) -> InertialSolution:
     """Simulate both passes over the targets and the gyros, and estimate the attitude over the flight."""
     p, flight, generator = run.key.field_test, run.flight, run.key.generator
     targets = Targets.draw(p.targets, ground.surface, flight.origin_m[:2], generator("targets"))
@@ -136,7 +115,7 @@ def _estimate_attitudes(run: imaging.FlownRun, ground: SiteGround, clock: Clock,
         if p.targets.sightings == "rendered":
             centroids = render_and_detect_targets(run, ground, targets, times, fixes)
         else:
-            true_camera = p.detector.delivered_camera(imaging.field_camera())
+            true_camera = p.detector.delivered_camera(field_camera())
             centroids = project_targets(targets, true_camera, flight.motion(times), p.targets.centroid_px, noise)
         sightings.append(Sightings.from_centroids(targets, camera, tags, fixes, centroids))
         if (count := len(sightings[-1].times_s)) < _MIN_SIGHTINGS:
@@ -155,7 +134,7 @@ def _estimate_attitudes(run: imaging.FlownRun, ground: SiteGround, clock: Clock,
 
 
 def render_and_detect_targets(
-    run: imaging.FlownRun,
+    run: FlownRun,
     ground: SiteGround,
     targets: Targets,
     times_s: Float64[np.ndarray, "images"],

@@ -1,4 +1,4 @@
-"""Parameters and faults of the landing scenario."""
+"""Parameters of the landing scenario."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.hda import HdaOptions
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.landing.faults import LandingFaults
-from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
+from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.meshes import MeshParameters
@@ -24,7 +25,6 @@ from marsyard.scenarios.site_parameters import (
     complete_terrain,
     preset_terrain,
 )
-from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.error_sources import ErrorSource

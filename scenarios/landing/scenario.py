@@ -11,12 +11,15 @@ from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
 from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.condition_columns import hash_images, image_columns
+from marsyard.scenarios.image_provenance import hash_images, image_columns
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing import score
+from marsyard.scenarios.landing.conditions import conditions
 from marsyard.scenarios.landing.measurement import measure
+from marsyard.scenarios.landing.motion_columns import motion_row, times_row
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.products import case_products
 from marsyard.scenarios.landing.rendered_flight import RenderedFlight
 from marsyard.scenarios.landing.timeline import landing_timeline
 from marsyard.scenarios.landing.touchdown import simulate_touchdown
@@ -56,7 +59,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
         flight, truth = case.flight, case.truth
         measurements = measure(p, flight, case.pair, streams)
         provenance = image_columns(p.render.backend, hash_images(case.pair.counts))
-        shared = {**score.conditions(case, measurements), **provenance}
+        shared = {**conditions(case, measurements), **provenance}
 
         def run(algorithm: str) -> AlgorithmRun[SiteEstimate]:
             return run_on_measurements(partial(p.make, algorithm, streams.case), check_site, measurements)
@@ -70,9 +73,9 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 **({} if answer is None else score.outcome_row(answer)),
                 **score.site_row(estimate, flight, truth),
                 **score.landing_row(touchdown, estimate, flight, truth),
-                **score.motion_row(estimate.details, flight, case.pair),
+                **motion_row(estimate.details, flight, case.pair),
                 **score.map_row(p, estimate, flight, truth),
-                **score.times_row(estimate.details),
+                **times_row(estimate.details),
             }
             scored = None
             if answer is not None:
@@ -85,6 +88,6 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
                 )
             is_converged = answer is not None and estimate.outcome.converged
             timeline = partial(landing_timeline, case, estimate, touchdown)
-            return Score(is_converged, row, score.products(case, estimate), scored, timeline)
+            return Score(is_converged, row, case_products(case, estimate), scored, timeline)
 
         return evaluate_case(p, shared, run, score_answer)

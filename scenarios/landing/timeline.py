@@ -19,8 +19,8 @@ from marsyard.scenarios.timeline import (
     TimedImage,
     TimedPoints,
     Timeline,
-    surface_from_above,
 )
+from marsyard.scenarios.timeline_surface import surface_from_above
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.render import Scene
 from marsyard.sim.sensor import height_above_ground

@@ -68,4 +68,4 @@ POSITION = SuiteRules(
     interface="algorithms/localisation/interface.py",
     interrupted=inputs.descent_on_shifted_map,
 )
-position_suite = partial(StreamSuite, protocol=POSITION)
+position_suite = partial(StreamSuite, rules=POSITION)

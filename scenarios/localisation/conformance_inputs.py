@@ -13,8 +13,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct
-from marsyard.scenarios.conformance.inputs import BLANKS, MEAN, Blank, TexturedPlane, texture
-from marsyard.scenarios.localisation.instruments import LanderCameraParameters, true_camera
+from marsyard.scenarios.conformance.inputs import BLANKS, MEAN_RADIANCE, Blank, TexturedPlane, texture
+from marsyard.scenarios.localisation.camera import LanderCameraParameters, true_camera
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
 from marsyard.sim.camera import Cahvore
 from marsyard.sim.frames import rigid
@@ -128,7 +128,7 @@ def _images() -> tuple[DetectorImage, ...]:
     images = []
     for time_s in _IMAGE_TIMES_S:
         radiance = ground.radiance(camera.transform(rigid(_attitude(time_s), true_position(time_s))))
-        counts = np.clip(np.rint(_OFFSET_DN + _MEAN_DN / MEAN * radiance), 0, _FULL_SCALE_DN).astype(np.uint16)
+        counts = np.clip(np.rint(_OFFSET_DN + _MEAN_DN / MEAN_RADIANCE * radiance), 0, _FULL_SCALE_DN).astype(np.uint16)
         images.append(DetectorImage(counts, float(time_s), camera, calibration))
     return tuple(images)
 

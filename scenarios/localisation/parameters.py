@@ -9,16 +9,19 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.localisation.options import LvsOptions
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_faults import Haze, SizedFaults
 from marsyard.scenarios.localisation import instruments
+from marsyard.scenarios.localisation.camera import LanderCameraParameters
+from marsyard.scenarios.localisation.detector import LANDER_DETECTOR
 from marsyard.scenarios.localisation.flight import ProfileParameters
 from marsyard.scenarios.localisation.image_schedule import ImageSchedule
+from marsyard.scenarios.localisation.imported_terrain import check_imported_terrain
 from marsyard.scenarios.localisation.initial_errors import InitialErrors
-from marsyard.scenarios.localisation.map_product import MapParameters
-from marsyard.scenarios.localisation.sites import check_imported_terrain, localisation_site
+from marsyard.scenarios.localisation.map_parameters import MapParameters
+from marsyard.scenarios.localisation.sites import localisation_site
 from marsyard.scenarios.localisation.task import LOCALISATION
 from marsyard.scenarios.site_parameters import DustOpacity, Location, RenderParameters, SunParameters, complete_terrain
-from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import CheckedTerrain
 from marsyard.sim.parameters import NonNegative, bounded_field
 from marsyard.sim.sensor import ClockParameters, DetectorParameters, ImuParameters, RadarParameters
@@ -66,8 +69,8 @@ class LocalisationScenarioParameters(AlgorithmSelection):
     map: MapParameters = MapParameters()
     flight: ProfileParameters = ProfileParameters()
     images: ImageSchedule = ImageSchedule()
-    camera: instruments.LanderCameraParameters = instruments.LanderCameraParameters()
-    detector: DetectorParameters = instruments.LANDER_DETECTOR
+    camera: LanderCameraParameters = LanderCameraParameters()
+    detector: DetectorParameters = LANDER_DETECTOR
     imu_class: Annotated[ImuClass, Field(description="class of the inertial unit")] = "ln-200"
     initial: InitialErrors = InitialErrors()
     altimeter: RadarParameters = instruments.RADAR

@@ -1,36 +1,28 @@
-"""Columns and products of a localisation case: conditions, errors of the estimates, covariance consistency, times.
+"""Columns of a localisation case: conditions, errors of the estimates, covariance consistency, times.
 
-Horizontal errors are relative to the map: the reference is the map position below which the lander truly is. The error
-relative to the world also contains the map's registration and distortion.
+Horizontal errors are relative to the map (`marsyard.scenarios.localisation.estimate_errors`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
-from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
+from marsyard.algorithms.localisation.interface import PositionEstimate
 from marsyard.scenarios.condition_columns import attitude_rate_deg_s, contrast_columns, off_nadir_deg, sun_columns
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.localisation.map_product import MapTruth
+from marsyard.scenarios.localisation.estimate_errors import EstimateErrors, attitude_error_deg, compute_errors
 from marsyard.scenarios.radiance import sun_at
 from marsyard.scenarios.streamed import StreamAnswers
-from marsyard.sim.dynamics import State
 
 if TYPE_CHECKING:
-    from marsyard.scenarios.localisation.scenario import LocalisedDescent
+    from marsyard.scenarios.localisation.simulation import LocalisedDescent
 
 #: Required horizontal accuracy, m, and time after the start in which it is required, s (Mars 2020).
 REQUIRED_M, REQUIRED_S = 40.0, 10.0
-#: Side of the stored map, pixels.
-_THUMBNAIL_PX = 512
 _NAN = float("nan")
 _AXES = ("east", "north", "up")
 
@@ -52,82 +44,12 @@ def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
         "images": len(images),
         "map_shift_m": float(np.hypot(*shift)),
         "initial_error_m": float(np.hypot(*(initial.position_m[:2] - reference))),
-        "initial_attitude_error_deg": _attitude_error_deg(initial.world_from_body, descent.initial_truth),
+        "initial_attitude_error_deg": attitude_error_deg(initial.world_from_body, descent.initial_truth),
         "off_nadir_max_deg": max(off_nadir_deg(state) for state in states),
         "attitude_rate_max_deg_s": max(attitude_rate_deg_s(state) for state in states),
         "altitude_last_m": float(states[-1].position_m[2] - world.surface.height(*states[-1].position_m[:2])),
         **p.faults.columns,
     }
-
-
-def _attitude_error_deg(estimate: Rotation, truth: State) -> float:
-    return float(np.degrees((truth.attitude * estimate.inv()).magnitude()))
-
-
-@dataclass(frozen=True)
-class EstimateErrors:
-    """Errors of one valid estimate: estimate minus truth.
-
-    - position_m: error (east, north, up) relative to the map
-    - world_m: horizontal error (east, north) relative to the world
-    - velocity_m_s, attitude_deg: magnitudes of the velocity error and of the attitude error
-    - sd_m: standard deviations of the position according to the estimator
-    - nees: normalised squared error of the horizontal position, chi-square with 2 degrees of freedom if consistent
-    """
-
-    time_s: float
-    position_m: Float64[np.ndarray, "3"]
-    world_m: Float64[np.ndarray, "2"]
-    velocity_m_s: float
-    attitude_deg: float
-    sd_m: Float64[np.ndarray, "3"]
-    nees: float
-
-    @property
-    def horizontal_m(self) -> float:
-        """Horizontal error relative to the map."""
-        return float(np.hypot(*self.position_m[:2]))
-
-    @classmethod
-    def from_estimate(cls, estimate: PositionEstimate, truth: State, map_truth: MapTruth) -> EstimateErrors:
-        """Compute the errors of a valid estimate from the true state at its time. Raises ValueError for a refusal."""
-        if (
-            estimate.position_m is None
-            or estimate.velocity_m_s is None
-            or estimate.world_from_body is None
-            or estimate.covariance is None
-        ):
-            raise ValueError(f"the estimate is {estimate.outcome.name}; allowed: VALID")
-        reference = np.append(map_truth.map_position(truth.position_m[:2]), truth.position_m[2])
-        error = estimate.position_m - reference
-        horizontal = estimate.covariance[:2, :2]
-        return cls(
-            time_s=estimate.time_s,
-            position_m=error,
-            world_m=estimate.position_m[:2] - truth.position_m[:2],
-            velocity_m_s=float(np.linalg.norm(estimate.velocity_m_s - truth.velocity_m_s)),
-            attitude_deg=_attitude_error_deg(estimate.world_from_body, truth),
-            sd_m=np.sqrt(np.diag(estimate.covariance)[:3]),
-            nees=float(error[:2] @ np.linalg.solve(horizontal, error[:2])),
-        )
-
-
-def compute_errors(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> list[EstimateErrors | None]:
-    """Compute the errors of each estimate, None for a refusal.
-
-    Estimates have time tags of the inertial unit, whose offset is subtracted for the true time.
-    """
-    first, last = descent.flight.span_s
-    return [
-        EstimateErrors.from_estimate(
-            estimate,
-            descent.flight.state(float(np.clip(estimate.time_s - descent.imu_offset_s, first, last))),
-            descent.map_truth,
-        )
-        if estimate.outcome is PositionOutcome.VALID
-        else None
-        for estimate in answers.estimates
-    ]
 
 
 def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> dict[str, Scalar]:
@@ -190,62 +112,3 @@ def _final_columns(error: EstimateErrors | None) -> dict[str, Scalar]:
         "attitude_error_deg": error.attitude_deg,
         "position_nees": error.nees,
     }
-
-
-def products(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> Mapping[str, Any]:
-    """Return the arrays for a case's figures.
-
-    ::
-
-        track               per estimate: time, error east, north, up, sd east, north, up (m); NaN for a refusal
-        outcomes            outcome of each estimate
-        inliers             landmarks used in each image; NaN without a match
-        true_xy_m           true positions on the map at the images; estimated_xy_m: estimates, NaN for a refusal
-        initial_xy_m        initial position (east, north) of inertial navigation
-        map                 appearance of the map, reduced; map_extent_m: west, east, south, north
-        image_1, image_2    first and last image
-        landmarks_px        measured pixels of the landmarks in the last image; landmarks_residual_px: their residuals;
-                            landmarks_used: whether the position uses them
-    """
-    errors = compute_errors(descent, answers)
-    nothing = np.full(7, np.nan)
-    track = np.stack(
-        [nothing if error is None else np.array([error.time_s, *error.position_m, *error.sd_m]) for error in errors]
-    )
-    estimates = answers.estimates
-    details = [estimate.details for estimate in estimates]
-    estimated = [np.full(2, np.nan) if item.position_m is None else item.position_m[:2] for item in estimates]
-    map_product = descent.measurements.map_product
-    side_px = min(_THUMBNAIL_PX, *map_product.appearance.shape)
-    low, high = np.quantile(map_product.appearance[::4, ::4], (0.005, 0.995))
-    scaled = np.clip(255.0 * (map_product.appearance - low) / max(float(high - low), 1e-9), 0.0, 255.0)
-    thumbnail = cv2.resize(scaled.astype(np.float32), (side_px, side_px), interpolation=cv2.INTER_AREA)
-    west, south = map_product.origin_m - 0.5 * map_product.pixel_m
-    rows, columns = map_product.appearance.shape
-    values: dict[str, Any] = {
-        "track": track,
-        "outcomes": [estimate.outcome.name for estimate in estimates],
-        "inliers": np.array(
-            [
-                _NAN if not isinstance(item, LocalisationDetails) or item.inliers is None else float(item.inliers)
-                for item in details
-            ]
-        ),
-        "true_xy_m": descent.map_truth.map_position(np.array([state.position_m[:2] for state in descent.states])),
-        "estimated_xy_m": np.stack(estimated),
-        "initial_xy_m": descent.measurements.initial.position_m[:2],
-        "map": thumbnail.astype(np.uint8),
-        "map_extent_m": np.array(
-            [west, west + columns * map_product.pixel_m, south, south + rows * map_product.pixel_m]
-        ),
-    }
-    if descent.images:
-        values |= {"image_1": descent.images[0].counts, "image_2": descent.images[-1].counts}
-    last = details[-2] if len(details) > 1 else None
-    if isinstance(last, LocalisationDetails) and last.measured_px is not None:
-        values |= {
-            "landmarks_px": last.measured_px,
-            "landmarks_residual_px": last.residuals_px,
-            "landmarks_used": last.used,
-        }
-    return values

@@ -9,8 +9,8 @@ from jaxtyping import Float64
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import PositionEstimate
-from marsyard.scenarios.localisation.instruments import true_camera
-from marsyard.scenarios.localisation.score import compute_errors
+from marsyard.scenarios.localisation.camera import true_camera
+from marsyard.scenarios.localisation.estimate_errors import compute_errors
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.scenarios.timeline import (
     CameraPose,
@@ -22,12 +22,11 @@ from marsyard.scenarios.timeline import (
     TimedImage,
     TimedPoints,
     Timeline,
-    grey_values,
-    surface_from_above,
 )
+from marsyard.scenarios.timeline_surface import grey_values, surface_from_above
 
 if TYPE_CHECKING:
-    from marsyard.scenarios.localisation.scenario import LocalisedDescent
+    from marsyard.scenarios.localisation.simulation import LocalisedDescent
 
 #: Half width of the shown ground divided by the altitude at the start.
 _HALF_WIDTH_RATIO = 1.2

@@ -15,8 +15,9 @@ from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.scenarios.cameras import camera_optics
-from marsyard.scenarios.localisation.instruments import LANDER_DETECTOR
-from marsyard.scenarios.localisation.map_product import MapParameters, make_map
+from marsyard.scenarios.localisation.detector import LANDER_DETECTOR
+from marsyard.scenarios.localisation.map_parameters import MapParameters
+from marsyard.scenarios.localisation.map_product import make_map
 from marsyard.scenarios.localisation.sites import localisation_site
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.radiance import add_haze

@@ -14,6 +14,7 @@ from marsyard.algorithms.dimes.binning import binned_size_for
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import lossy_bits_per_pixel, read_counts, read_flat_field, read_header
+from marsyard.scenarios.measured.image_table import ImageRow, read_table
 from marsyard.scenarios.measured.label_poses import describe_frame, is_mars_fixed, is_same_world, label_pose, world_from
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
@@ -21,18 +22,16 @@ from marsyard.scenarios.measured.layout import (
     MAP,
     TABLE_FILE,
     VELOCITY,
-    ImageRow,
     IngestError,
     IngestFile,
     SunTable,
     read_ingest_file,
-    read_table,
 )
 from marsyard.scenarios.measured.map_matching import TOLERANCE_PX
 from marsyard.scenarios.measured.map_registration import add_map, describe_poses
 from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
-from marsyard.scenarios.user_files import format_problems
+from marsyard.scenarios.user_tables import format_problems
 from marsyard.sim.camera import CameraModel, LabelFrame, mount_looking_down, read_framed_cameras, read_pds3_product
 from marsyard.sim.camera.pds3_label import is_pds3
 from marsyard.sim.frames import compose

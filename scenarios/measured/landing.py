@@ -13,15 +13,17 @@ from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
+from marsyard.scenarios.hda_stage_columns import motion_errors, stage_row
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.scenarios.landing_site import LANDING, motion_errors, stage_row
+from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
-from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
+from marsyard.scenarios.measured.measurements import body_pose, landing_measurements
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredSite
-from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.sim.camera import camera_pose
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.streams import Streams
@@ -51,11 +53,11 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
         """Run one flight."""
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
-        measurements = store.landing_measurements(p.case, images)
+        measurements = landing_measurements(p.case, images)
         pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.images])
         true_poses = None
         if p.case.truth.poses is not None:
-            first, second = (store.body_pose(*pose) for pose in p.case.truth.poses)
+            first, second = (body_pose(*pose) for pose in p.case.truth.poses)
             true_poses = first, second
         conditions: dict[str, Scalar] = {
             **case_row(p, images),

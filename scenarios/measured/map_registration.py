@@ -16,7 +16,7 @@ from marsyard.algorithms.localisation.posed_image import PosedImage
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import read_counts, read_elevation
 from marsyard.scenarios.measured.layout import IngestError, MapTable
-from marsyard.scenarios.user_files import format_problems
+from marsyard.scenarios.user_tables import format_problems
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import DetectorImage
 

@@ -10,13 +10,13 @@ from marsyard.algorithms.localisation.interface import MapProduct
 from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.scenarios.condition_columns import hash_images
+from marsyard.scenarios.image_provenance import hash_images
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.base import NAN, MeasuredParameters, MeasuredScenario
 from marsyard.scenarios.measured.counterpart import Counterpart, CounterpartParameters, render_counterpart
 from marsyard.scenarios.measured.map_matching import MapComparison, compare_with_map
 from marsyard.scenarios.measured.map_registration import extract_features, load_map, register_on_map
-from marsyard.scenarios.measured.scenarios import NAN, MeasuredParameters, MeasuredScenario
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.parameters import NonNegative
 from marsyard.sim.streams import Streams

@@ -9,7 +9,7 @@ SYSTEM = System(
     scenarios={
         "measured-velocity": "marsyard.scenarios.measured.velocity:MeasuredVelocityScenario",
         "measured-landing": "marsyard.scenarios.measured.landing:MeasuredLandingScenario",
-        "measured-matching": "marsyard.scenarios.measured.scenarios:MatchingScenario",
+        "measured-matching": "marsyard.scenarios.measured.matching:MatchingScenario",
         "measured-map": "marsyard.scenarios.measured.over_map:OverMapScenario",
     },
     tasks=("marsyard.scenarios.velocity:VELOCITY", "marsyard.scenarios.landing_site:LANDING"),

@@ -14,22 +14,17 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.algorithms.dimes import DimesDetails, DimesOptions
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
+from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance
 from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
-from marsyard.scenarios.measured.scenarios import MeasuredParameters, MeasuredScenario, case_row, distance
+from marsyard.scenarios.measured.measurements import descent_measurements
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
-from marsyard.scenarios.tasks import AlgorithmSelection
-from marsyard.scenarios.velocity import (
-    VELOCITY,
-    check_image_size,
-    check_last_interval,
-    consistency_row,
-    velocity_products,
-    velocity_row,
-)
+from marsyard.scenarios.velocity import VELOCITY, check_image_size, check_last_interval
+from marsyard.scenarios.velocity_columns import consistency_row, velocity_products, velocity_row
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.streams import Streams
@@ -67,7 +62,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         """Run one descent."""
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
-        measurements = store.descent_measurements(p.case, images)
+        measurements = descent_measurements(p.case, images)
         matches = match_images(images)
         axes = [
             image.camera.transform(RigidTransform.from_rotation(attitude.world_from_body)).boresight()

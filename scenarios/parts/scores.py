@@ -22,9 +22,9 @@ from pydantic import Field, field_validator
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import SiteEstimate, TargetUpdate, VelocityEstimate
+from marsyard.scenarios.algorithm_labels import labels
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.named import SCORE, check_columns
-from marsyard.scenarios.tasks import labels
 from marsyard.sim.dynamics import State, Trajectory
 from marsyard.sim.measurements import DescentMeasurements, LandingMeasurements, RoverMeasurements
 from marsyard.sim.parameters import Parameters

@@ -1,8 +1,7 @@
 """Simulate the closed loop of a run: at each stop visual odometry, tracking, navigation and drive, as in Fig. 12.
 
-A guide points the mast at each stop and estimates the target's position. `TrackerGuide` uses a tracker;
-`DesignationGuide` uses the position designated at the start and odometry, for drives whose images are used by many
-trackers. Visual odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
+A guide points the mast at each stop and estimates the target's position (`marsyard.scenarios.rover.guides`). Visual
+odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
 these measurements by the truth with errors, which is faster and isolates the causes of failures.
 
 Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
@@ -10,52 +9,32 @@ Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Float64
-from scipy.spatial.transform import RigidTransform
 
-from marsyard.algorithms.answers import check_aim, check_update
-from marsyard.algorithms.exchange import answer_time_s
-from marsyard.algorithms.interface import MastAim, TargetTracker, TrackingState
 from marsyard.algorithms.navigation.planner import NavigationOutcome
 from marsyard.algorithms.navigation.visual_odometry import MotionEstimate, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
-from marsyard.algorithms.vtt.placement import Placement
-from marsyard.algorithms.vtt.pointing import bounding_box, mast_angles
 from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.input_copies import InputCopy, Inputs
-from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
+from marsyard.scenarios.rover.designation import designate_from_start
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
-    Navigator,
     TargetEstimate,
     goal_position,
     is_finished,
     plan_step,
 )
-from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, NavigationCameras, oracle_heights
-from marsyard.scenarios.rover.parameters import LegParameters, MobilityParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.guides import Guide, TrackerGuide
+from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, oracle_heights
+from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
-from marsyard.scenarios.rover.stops import (
-    DesignatedTarget,
-    RunOutcome,
-    StereoCamera,
-    Stop,
-    StopView,
-    designate_from_start,
-    triangulate_point,
-)
-from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.rover.world import Rig, RunWorld, Vehicle
+from marsyard.scenarios.rover.run_state import RoverRun, Setup, Step, is_stuck
+from marsyard.scenarios.rover.stops import RunOutcome, StopView
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics.driving import Drive
-from marsyard.sim.dynamics.rover import Stance
 from marsyard.sim.frames import compose
-from marsyard.sim.measurements import DriveCommand, MastCalibration, RoverMeasurements, StereoMeasurement
+from marsyard.sim.measurements import DriveCommand, StereoMeasurement
 from marsyard.sim.streams import Streams
 
 #: Radius of the ground in a subframe around the target, divided by the target's distance: 8 deg, more than half the
@@ -67,194 +46,6 @@ VISUAL_TURN_RAD = np.radians(18.0)
 MAST_RANGES_M, BODY_RANGES_M = (1.4, 8.0), (0.35, 3.0)
 #: Azimuth between successive stereo pairs of the mast in a navigation update, radians.
 MAST_SPACING_RAD = np.radians(40.0)
-
-
-@dataclass
-class Setup:
-    """A rover in its world, with its cameras; its vehicle is at the start until a run moves it."""
-
-    world: RunWorld
-    rig: Rig
-    vehicle: Vehicle
-    camera: StereoCamera
-    navigation_cameras: NavigationCameras
-
-    @staticmethod
-    def draw(p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround) -> Setup:
-        """Create the set-up of a run and draw all its errors."""
-        rig = Rig.draw(p, streams)
-        world = RunWorld.from_parameters(p, rig.pixel_rad, streams, load_ground)
-        camera = StereoCamera.draw(p, streams)
-        navigation_cameras = NavigationCameras.draw(p, rig, streams)
-        return Setup(world, rig, Vehicle.at_start(p, world, rig, streams), camera, navigation_cameras)
-
-
-@dataclass(frozen=True)
-class Step:
-    """Commanded path and true displacement of a step, metres."""
-
-    commanded_m: float
-    displacement_m: float
-
-
-def is_stuck(steps: Sequence[Step], mobility: MobilityParameters) -> bool:
-    """Whether the rover hardly moved over its last steps; False before `mobility.stuck_steps` steps."""
-    last = steps[-mobility.stuck_steps :]
-    commanded_m, displacement_m = sum(step.commanded_m for step in last), sum(step.displacement_m for step in last)
-    return len(last) == mobility.stuck_steps and displacement_m < (1.0 - mobility.stuck_slip) * commanded_m
-
-
-@dataclass
-class RoverRun:
-    """State of a run in progress or finished: the rover in its world, its target, and what happened so far."""
-
-    setup: Setup
-    target: DesignatedTarget
-    stops: list[Stop] = field(default_factory=list)  #: stops with a tracking update, in order
-    outcome: RunOutcome = RunOutcome.NOT_AT_GOAL
-    handed_off: bool = False  #: whether the target was handed off to the arm at the end
-    placement: Placement | None = None  #: placement of the instrument; None without a hand-off
-    visual_odometry_updates: int = 0
-    visual_odometry_failures: int = 0  #: updates without an estimate; wheel odometry was used
-    autonav_updates: int = 0
-    navigator: Navigator = field(default_factory=Navigator)
-    odometry_pair: tuple[Stance, StereoMeasurement] | None = None  #: last pair of visual odometry, and its stance
-    time_s: float = 0.0  #: time since the start
-    drives_since_stop: list[Drive] = field(default_factory=list)
-    steps: list[Step] = field(default_factory=list)  #: all steps with a commanded path, in order
-
-    def create_target_estimate(self, position_rover: Float64[np.ndarray, "3"]) -> TargetEstimate:
-        """Create a target estimate from a position in the rover frame; add its range from the camera."""
-        position = np.asarray(position_rover)
-        return TargetEstimate(position, self.setup.rig.range_m(position))
-
-
-class TrackerGuide:
-    """The tracker under test as guide: it receives copies of its inputs, and its answers are checked."""
-
-    def __init__(self, p: RoverScenarioParameters, run: RoverRun, estimated_pose: RigidTransform) -> None:
-        """Create the tracker and designate the run's target; `estimated_pose` is the rover's estimated world pose."""
-        self._tracker: TargetTracker = TRACKING.make(p.algorithm, p.vtt, p.executable)
-        # a tracker in a process of its own cannot change its inputs
-        self._copies: list[InputCopy[Any]] = []
-        self._mast: MastCalibration = self._input(run.setup.rig.calibrated)
-        self._tracker.designate(self._input(run.target.designation), estimated_pose)
-
-    def _input(self, value: Inputs) -> Inputs:
-        """Return a copy of an input, or the input for a tracker in a process of its own."""
-        if is_remote(self._tracker):
-            return value
-        self._copies.append(InputCopy(value))
-        copied: Inputs = self._copies[-1].inputs
-        return copied
-
-    def _check_inputs(self) -> None:
-        """Raise AlgorithmError if the tracker changed the copies that it received; keep only that of the mast."""
-        for copy in self._copies:
-            copy.check()
-        del self._copies[1:]
-
-    def aim(self, run: RoverRun) -> MastAim | None:
-        """Return the tracker's mast angles and subframe boxes; None if the mast or cameras cannot show the target.
-
-        Raises AlgorithmError for an invalid answer, and the tracker's own errors.
-        """
-        answer = self._tracker.aim(run.setup.vehicle.estimated_pose, self._mast)
-        self._check_inputs()
-        return check_aim(answer, run.setup.rig.calibrated)
-
-    def observe(self, run: RoverRun, view: StopView) -> RunOutcome | None:
-        """Update the tracker and append the stop to the run; return the outcome if the run ends, else None.
-
-        Raises the same exceptions as `aim`.
-        """
-        images = self._input((view.images.left, view.images.right))
-        measurements = RoverMeasurements(*images, self._mast, *view.angles_rad, view.estimated_pose)
-        start_s = algorithm_time_s()
-        answer = self._tracker.update(measurements)
-        elapsed_s = algorithm_time_s() - start_s
-        self._check_inputs()
-        update = check_update(answer)
-        time_s = answer_time_s(update, elapsed_s)
-        run.stops.append(Stop.from_view(view, run.target.point_world, run.setup.rig.left, update, time_s))
-        if update.state is TrackingState.FAILURE:
-            return RunOutcome.LOST
-        return RunOutcome.NOT_SEEDED if update.position_rover is None else None
-
-    def target(self, run: RoverRun) -> TargetEstimate:
-        """Transform the target's last reported position by the estimated motion since that stop."""
-        stop = run.stops[-1]
-        if stop.update.position_rover is None:
-            raise ValueError("the tracker has not reported a target position yet")
-        current_from_stop = compose(run.setup.vehicle.estimated_pose.inv(), stop.estimated_pose)
-        return run.create_target_estimate(current_from_stop.apply(np.array(stop.update.position_rover)))
-
-
-@dataclass(frozen=True)
-class DesignationGuide:
-    """Guide by a designated position without tracking: odometry propagates the position. Stores all views.
-
-    `position_world` is the designated point in the estimated world frame, or None: the true point (an oracle). The
-    subframes contain the visible rock and a margin: they stand for full images, of which only this part is rendered.
-    """
-
-    margin_px: float
-    position_world: Float64[np.ndarray, "3"] | None
-    views: list[StopView] = field(default_factory=list)
-
-    def aim(self, run: RoverRun) -> MastAim | None:
-        """Return an aim at the estimated target; None if the mast cannot point there or a camera misses the rock."""
-        stance, rig = run.setup.vehicle.stance, run.setup.rig
-        angles = mast_angles(self.target(run).position_rover, rig.calibrated, use_both=False)
-        if angles is None:
-            return None
-        rig.point(*angles)
-        corners = run.setup.world.target_triangles.reshape(-1, 3)
-        corners = corners[corners[:, 2] > run.setup.world.rocks.position_m[run.setup.world.target_number, 2]]
-        in_head = np.asarray((stance.world_from_rover * rig.rover_from_head).inv().apply(corners.copy()))
-        boxes = []
-        for camera in (rig.left, rig.right):
-            pixels = camera.project(in_head)[0]
-            in_frame = pixels[camera.in_frame(pixels)]
-            box = bounding_box(in_frame, self.margin_px, camera) if len(in_frame) else None
-            if box is None:
-                return None
-            boxes.append(box)
-        # the mast does not move if its encoders already read these angles
-        return MastAim(*rig.state.readings_rad, *boxes)
-
-    def observe(self, run: RoverRun, view: StopView) -> RunOutcome | None:
-        """Store the view; the run continues."""
-        # a case that tracks over these views has one leg, and no drives of its own
-        self.views.append(replace(view, leg=0, drives=()))
-        return None
-
-    def target(self, run: RoverRun) -> TargetEstimate:
-        """Return the designated position in the rover frame of the estimated pose, or the true target position."""
-        if self.position_world is None:
-            true_pose = run.setup.vehicle.stance.world_from_rover
-            return run.create_target_estimate(true_pose.inv().apply(run.target.point_world.copy()))
-        return run.create_target_estimate(run.setup.vehicle.estimated_pose.inv().apply(self.position_world.copy()))
-
-    @classmethod
-    def designate(cls, run: RoverRun, margin_px: float, oracle: bool) -> DesignationGuide:
-        """Create the guide at the start; operators triangulate the point in images of the start.
-
-        Raises ValueError if the mast cannot point at the target or the point cannot be triangulated.
-        """
-        if oracle:
-            return cls(margin_px, None)
-        stance, rig = run.setup.vehicle.stance, run.setup.rig
-        point = run.target.point_world
-        angles = mast_angles(np.asarray(stance.world_from_rover.inv().apply(point.copy())), rig.calibrated, False)
-        if angles is None:
-            raise ValueError("the mast cannot point at the target's rock from the start of this drive")
-        rig.point(*angles)
-        position = triangulate_point(rig, stance, point)
-        return cls(margin_px, np.asarray(run.setup.vehicle.estimated_pose.apply(position)))
-
-
-Guide = TrackerGuide | DesignationGuide
 
 
 def run_case(p: RoverScenarioParameters, streams: Streams) -> RoverRun:

@@ -13,9 +13,9 @@ from jaxtyping import Float64
 from pydantic import Field, field_validator, model_validator
 
 from marsyard.algorithms.vtt import VttOptions
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.parts.scores import CustomScores, ScoredRun
 from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.tasks import AlgorithmSelection
 from marsyard.scenarios.terrain_files import site_validator
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.driving import SlipParameters

@@ -16,8 +16,8 @@ from marsyard.algorithms.vtt.placement import (
     tool_overlap_m,
 )
 from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.rover.closed_loop import RoverRun
 from marsyard.scenarios.rover.points import Vector, enclosing_spheres, ray_distances, sight_axes, spheres_near_line
+from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements
 
 NAN = float("nan")

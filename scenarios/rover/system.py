@@ -16,7 +16,7 @@ SYSTEM = System(
     summary="Position of a target that a rover approaches, tracked in the images of its mast cameras.",
     scenarios={
         "rover": "marsyard.scenarios.rover.scenario:RoverScenario",
-        "rover-drive": "marsyard.scenarios.rover.scenario:SharedDriveScenario",
+        "rover-drive": "marsyard.scenarios.rover.shared_drive:SharedDriveScenario",
     },
     tasks=("marsyard.scenarios.rover.task:TRACKING",),
     folder=_FOLDER,

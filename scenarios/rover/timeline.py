@@ -3,11 +3,12 @@
 import numpy as np
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.scenarios.rover.closed_loop import RoverRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.score import update_quantities
+from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.scenarios.rover.stops import Stop
-from marsyard.scenarios.timeline import CameraPose, Path, Series, TimedImage, TimedPoints, Timeline, surface_from_above
+from marsyard.scenarios.rover.updates import update_quantities
+from marsyard.scenarios.timeline import CameraPose, Path, Series, TimedImage, TimedPoints, Timeline
+from marsyard.scenarios.timeline_surface import surface_from_above
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.render import Scene
 

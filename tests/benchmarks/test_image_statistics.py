@@ -6,7 +6,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.validation.image_statistics import (
-    SIDE,
+    SIDE_PX,
     compute_ground_statistics,
     compute_image_statistics,
     compute_map_statistics,
@@ -18,18 +18,18 @@ from benchmarks.validation.image_statistics import (
 @pytest.mark.parametrize("exponent", [-1.5, -2.5])
 def test_slope_of_a_power_law_is_measured(exponent: float) -> None:
     rng = np.random.default_rng(2)
-    wavenumbers = np.hypot(*np.meshgrid(np.fft.fftfreq(4 * SIDE), np.fft.fftfreq(4 * SIDE)))
+    wavenumbers = np.hypot(*np.meshgrid(np.fft.fftfreq(4 * SIDE_PX), np.fft.fftfreq(4 * SIDE_PX)))
     wavenumbers[0, 0] = 1.0
     modes = np.fft.fft2(rng.standard_normal(wavenumbers.shape)) * wavenumbers ** (0.5 * exponent)
-    field = np.fft.ifft2(modes).real[:SIDE, :SIDE]
+    field = np.fft.ifft2(modes).real[:SIDE_PX, :SIDE_PX]
     assert spectral_slope(100.0 + field / field.std()) == pytest.approx(exponent, abs=0.15)
 
 
 def test_patchiness_is_the_ratio_of_local_contrasts() -> None:
     """One half of the image has noise of 10 %, the other half of 2 %."""
     rng = np.random.default_rng(3)
-    sd = np.where(np.arange(SIDE) < SIDE // 2, 0.1, 0.02)
-    statistics = compute_image_statistics(1000.0 * (1.0 + sd * rng.standard_normal((SIDE, SIDE))))
+    sd = np.where(np.arange(SIDE_PX) < SIDE_PX // 2, 0.1, 0.02)
+    statistics = compute_image_statistics(1000.0 * (1.0 + sd * rng.standard_normal((SIDE_PX, SIDE_PX))))
     assert statistics.local_p10 == pytest.approx(0.02, rel=0.1)
     assert statistics.local_p90 == pytest.approx(0.1, rel=0.1)
     assert statistics.patchiness == pytest.approx(statistics.local_p90 / statistics.local_p10)
@@ -49,10 +49,10 @@ def test_corner_brightness_is_relative_to_the_centre() -> None:
 def test_sparse_dark_spots_have_kurtosis_and_negative_skewness() -> None:
     """Gaussian noise has neither; 30 dark discs of 10 pixels radius in it have both, and a strong template."""
     rng = np.random.default_rng(4)
-    noise = 1000.0 * (1.0 + 0.02 * gaussian_filter(rng.standard_normal((SIDE, SIDE)), 3.0, mode="wrap") * 10.0)
+    noise = 1000.0 * (1.0 + 0.02 * gaussian_filter(rng.standard_normal((SIDE_PX, SIDE_PX)), 3.0, mode="wrap") * 10.0)
     spotted = noise.copy()
-    y, x = np.mgrid[:SIDE, :SIDE]
-    for row, column in rng.uniform(30.0, SIDE - 30.0, (30, 2)):
+    y, x = np.mgrid[:SIDE_PX, :SIDE_PX]
+    for row, column in rng.uniform(30.0, SIDE_PX - 30.0, (30, 2)):
         spotted[np.hypot(y - row, x - column) < 10.0] *= 0.5
     plain, spots = compute_image_statistics(noise), compute_image_statistics(spotted)
     assert max(abs(plain.kurtosis_4), abs(plain.kurtosis_8), abs(plain.skewness_8)) < 0.4

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.validation.image_statistics import compute_map_statistics
 from benchmarks.validation.map_checks import FLOWN, HALF_FIELD_DEG, PIXEL_M, decimate_map, rectify, reduce_to_map
-from marsyard.scenarios.localisation.instruments import LanderCameraParameters, true_camera
+from marsyard.scenarios.localisation.camera import LanderCameraParameters, true_camera
 
 
 def test_rectified_image_shows_directions_at_the_pixels_of_a_pinhole() -> None:

@@ -7,11 +7,13 @@ from marsyard.algorithms.answers import check_velocity
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.tasks import AlgorithmSelection, Task
-from marsyard.scenarios.velocity import VELOCITY, velocity_row
+from marsyard.scenarios.tasks import Task
+from marsyard.scenarios.velocity import VELOCITY
+from marsyard.scenarios.velocity_columns import velocity_row
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_scenario import ScenarioWithoutInputs
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.campaigns.store.confirmations import read_confirmations
+from marsyard.campaigns.store.confirmation_record import read_record
 from tests.command import Output
 from tests.marsyard.confirmation_project import (
     BAD_LUCK,
@@ -142,7 +142,7 @@ def stop_a_bad_run(marsyard: Command, folder: Path) -> list[Output]:
 
 
 def reuse_a_seed(marsyard: Command, folder: Path) -> list[Output]:
-    entry = read_confirmations(folder / RECORD)[0]
+    entry = read_record(folder / RECORD).confirmations[0]
     bank = f"bank_seed={entry.bank_seeds['bank_seed']}"
     same = ("run", "fake.toml", "--seed", entry.seed, "--jobs", 1, "--set", bank, "--out")
     return [

@@ -13,7 +13,8 @@ from marsyard.campaigns.definition.claims import confirmation_seed, freeze_algor
 from marsyard.campaigns.definition.evidence import EvidenceKind
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import StoreError
-from marsyard.campaigns.store.confirmations import create_record, read_confirmations, read_record
+from marsyard.campaigns.store.confirmation_record import read_record
+from marsyard.campaigns.store.confirmations import create_record
 from marsyard.campaigns.store.git_registration import find_registration_problem
 from marsyard.sim.terrain.bank import TerrainBank
 from tests.marsyard.confirmation_project import (
@@ -67,7 +68,7 @@ def test_first_confirmation_with_a_committed_record_passes(marsyard: Command, tm
     campaign = load_campaign("fake.toml")
     claim = freeze_algorithm(campaign).claim
     assert confirm(marsyard, "run-1") == (0, ["PASS"])
-    (entry,) = read_confirmations(tmp_path / RECORD)
+    (entry,) = read_record(tmp_path / RECORD).confirmations
     assert (entry.claim, entry.number, entry.cases, entry.results) == (claim, 1, 10, {"VELOCITY": "PASS"})
     stored = json.loads((tmp_path / "run-1" / "campaign.json").read_text())
     # seed and seed of the terrains follow from the content alone
@@ -92,14 +93,14 @@ def test_second_confirmation_adds_its_cases_to_the_first(
     assert [report["verdicts"][0][name] for name in ("n", "failures", "terrains")] == [20, 2, 20]
     assert "This run alone: 0 of 10 cases failed." in report["verdicts"][0]["note"]
     assert "joint evidence of the confirmations 1, 2" in report["evidence"]["text"]
-    first, second = read_confirmations(tmp_path / RECORD)
+    first, second = read_record(tmp_path / RECORD).confirmations
     assert second.seed == confirmation_seed(second.claim, first.head) != first.seed
     assert second.bank_seeds != first.bank_seeds
     # 50 cases with two failures are PASS, and so is the report of the first run
     assert confirm(marsyard, "run-3", "-n", 30) == (0, ["PASS"])
     assert marsyard("report", "run-1").status == 0
     assert json.loads((tmp_path / "run-1" / "report.json").read_text())["verdicts"][0]["n"] == 50
-    assert len(read_confirmations(tmp_path / RECORD)) == 3
+    assert len(read_record(tmp_path / RECORD).confirmations) == 3
 
 
 def test_unregistered_record_is_stated(marsyard: Command, tmp_path: Path) -> None:
@@ -123,11 +124,11 @@ def test_stopped_confirmation_is_repeated_with_the_same_cases(marsyard: Command,
     confirm(marsyard, "run-1")
     path = tmp_path / RECORD
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))  # as if the run had been killed
-    assert read_confirmations(path)[0].is_unfinished
+    assert read_record(path).confirmations[0].is_unfinished
     output = marsyard("run", "fake.toml", "--confirm", "--out", "run-2", "-n", 9)
     assert (output.status, "repeat it with all its cases: --confirm -n 10" in output.err) == (2, True)
     assert confirm(marsyard, "run-3") == (0, ["PASS"])
-    (entry,) = read_confirmations(path)
+    (entry,) = read_record(path).confirmations
     assert (entry.number, entry.is_unfinished) == (1, False)
     rows = [json.loads((tmp_path / name / "campaign.json").read_text())["seed"] for name in ("run-1", "run-3")]
     assert rows[0] == rows[1]
@@ -142,7 +143,7 @@ def test_appended_cases_are_announced_in_the_record(
         (tmp_path / "copy" / name).write_bytes((tmp_path / "run-1" / name).read_bytes())
     monkeypatch.setenv(*BAD_LUCK)
     assert marsyard("append", "run-1", 10, "--jobs", 1).status == 3
-    (entry,) = read_confirmations(tmp_path / RECORD)
+    (entry,) = read_record(tmp_path / RECORD).confirmations
     assert (entry.cases, entry.counted_cases, entry.first_cases) == (20, 20, 10)
     (counts,) = entry.counts.values()
     assert counts["terrains"] == [[0, 0, 0, 0, 1, 0, 10], [1, 0, 0, 0, 0, 0, 10]]
@@ -190,7 +191,7 @@ def test_errors_are_reported_before_the_first_case(marsyard: Command, tmp_path: 
     output = marsyard(*confirm, "--out", "run")
     assert (output.status, f"{RECORD}:1 is not an entry" in output.err) == (2, True)
     with pytest.raises(StoreError, match="not an entry"):
-        read_confirmations(tmp_path / RECORD)
+        read_record(tmp_path / RECORD)
     (tmp_path / "fake.toml").write_text(CAMPAIGN + CALIBRATION.replace("error_scale", "eror_scale"))
     output = marsyard("run", "fake.toml")
     assert (output.status, "calibration.runs[0].options[0]" in output.err) == (2, True)

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from marsyard.campaigns.store.products import load_products
-from marsyard.scenarios.interface import CaseResult, recording_timelines
+from marsyard.campaigns.store.packed_products import load_products
+from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.timeline import Timeline, timeline_products
+from marsyard.scenarios.timeline_recording import recording_timelines
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import RecordingWatch, run, write_campaign
 from tests.campaigns.fake_scenario import FakeParameters, FakeScenario

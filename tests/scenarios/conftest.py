@@ -5,7 +5,8 @@ from typing import Any
 
 import pytest
 
-from marsyard.scenarios.columns import ENGINE, Columns, row_columns
+from marsyard.scenarios.columns import ENGINE, Columns
+from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.systems import scenario_paths

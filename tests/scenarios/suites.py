@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.scenarios.conformance import CandidateAlgorithm, Finding, check_names, determine_task, run_check
+from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, check_names, determine_task, run_check
+from marsyard.scenarios.conformance.checks import Finding
 
 
 def run_suite(spec: str, *checks: str, task: str | None = None, limit_s: float = 60.0) -> dict[str, Finding]:

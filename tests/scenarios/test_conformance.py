@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.running.conformance import run_conformance_checks
-from marsyard.scenarios.conformance import CandidateAlgorithm, determine_task, inputs, trackers
+from marsyard.scenarios.conformance import inputs, trackers
+from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, determine_task
 from marsyard.scenarios.conformance.inputs import TexturedPlane
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING

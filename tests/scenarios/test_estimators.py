@@ -18,16 +18,19 @@ from marsyard.algorithms.exchange import ExecutableAlgorithm, ExecutableLimits, 
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
 from marsyard.reports.comparison import select_algorithm
-from marsyard.scenarios import tasks
+from marsyard.scenarios import custom_algorithms
+from marsyard.scenarios.algorithm_labels import labels
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
+from marsyard.scenarios.algorithm_selection import AlgorithmSelection, check_algorithms
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.interface import CaseResult, Failure, Scalar
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.streamed import StreamedEstimator
-from marsyard.scenarios.tasks import AlgorithmSelection, Task, check_algorithms, labels
-from marsyard.scenarios.velocity import VELOCITY, consistency_row
+from marsyard.scenarios.tasks import Task
+from marsyard.scenarios.velocity import VELOCITY
+from marsyard.scenarios.velocity_columns import consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
 
@@ -49,13 +52,13 @@ def test_module_that_raises_gives_a_message(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_entry_point_is_an_algorithm_name_unless_it_is_built_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    group = tasks.GROUP
+    group = custom_algorithms.GROUP
     entry_points = [
         EntryPoint(name, "marsyard.algorithms.dimes.homography:HomographyEstimator", group)
         for name in ("installed", "dimes")
     ]
     installed_entry_points = {entry_point.name: entry_point for entry_point in entry_points}
-    monkeypatch.setattr(tasks, "list_installed", lambda: installed_entry_points)
+    monkeypatch.setattr(custom_algorithms, "list_installed", lambda: installed_entry_points)
     assert isinstance(VELOCITY.make("installed", DimesOptions(), LIMITS), HomographyEstimator)
     assert not isinstance(VELOCITY.make("dimes", DimesOptions(), LIMITS), HomographyEstimator)
     with pytest.raises(ValueError, match=r"did you mean 'installed'.*dimes-plus.*homography, installed"):
@@ -180,8 +183,8 @@ def test_stream_and_three_image_estimators_are_distinguished(tmp_path: Path, mon
     (tmp_path / "stream_module.py").write_text(f"{STREAM_CLASS}{finish}\ndef make():\n    return Mine()\n")
     (tmp_path / "incomplete_stream.py").write_text(STREAM_CLASS)
     monkeypatch.chdir(tmp_path)
-    entry_point = EntryPoint("installed", "stream_module:Mine", tasks.GROUP)
-    monkeypatch.setattr(tasks, "list_installed", lambda: {"installed": entry_point})
+    entry_point = EntryPoint("installed", "stream_module:Mine", custom_algorithms.GROUP)
+    monkeypatch.setattr(custom_algorithms, "list_installed", lambda: {"installed": entry_point})
     for spec in ("stream_module:Mine", "stream_module:make", "installed", "exec-stream:cat", "serve-stream:cat -u"):
         VELOCITY.check(spec)
         assert isinstance(VELOCITY.make(spec, DimesOptions(), LIMITS), StreamedEstimator)

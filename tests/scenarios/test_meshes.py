@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.relief import Relief
-from marsyard.scenarios.meshes import MeshFileError, MeshParameters, add_meshes, read_mesh
+from marsyard.scenarios.mesh_files import MeshFileError, read_mesh
+from marsyard.scenarios.meshes import MeshParameters, add_meshes
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid

@@ -10,13 +10,14 @@ from marsyard.algorithms.exchange import ExecutableLimits, read_case
 from marsyard.algorithms.faults import AlgorithmError
 from marsyard.algorithms.hda import HdaOptions
 from marsyard.algorithms.interface import SiteOutcome, VelocityOutcome
+from marsyard.scenarios.algorithm_labels import labels
+from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.conformance import inputs
+from marsyard.scenarios.custom_algorithms import algorithm_sources
 from marsyard.scenarios.input_copies import hash_inputs
-from marsyard.scenarios.landing_site import LANDING
-from marsyard.scenarios.offline_algorithms import SITE_FORMAT, VELOCITY_FORMAT, read_answers
+from marsyard.scenarios.landing_site import LANDING, SITE_FORMAT
 from marsyard.scenarios.rover.task import TRACKING
-from marsyard.scenarios.tasks import algorithm_sources, labels
-from marsyard.scenarios.velocity import VELOCITY
+from marsyard.scenarios.velocity import VELOCITY, VELOCITY_FORMAT
 
 LIMITS = ExecutableLimits()
 HEADER = "case,outcome,velocity_east_m_s,velocity_north_m_s\n"

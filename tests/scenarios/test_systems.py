@@ -16,8 +16,10 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import DefinitionError
 from marsyard.cli.app import app
 from marsyard.doctor import CheckResult, check_systems
-from marsyard.scenarios import columns as column_declarations
-from marsyard.scenarios.columns import ENGINE, label, row_columns
+from marsyard.scenarios import declared_columns
+from marsyard.scenarios.columns import ENGINE
+from marsyard.scenarios.custom_algorithms import shipped_names
+from marsyard.scenarios.declared_columns import label, row_columns
 from marsyard.scenarios.systems import (
     SCENARIOS_FOLDER,
     UnknownScenarioError,
@@ -33,14 +35,13 @@ from marsyard.scenarios.systems import (
     systems,
     templates,
 )
-from marsyard.scenarios.tasks import shipped_names
 
 CACHED_FUNCTIONS = (
     registry,
     row_columns,
-    column_declarations._all_columns,
-    column_declarations.find_column,
-    column_declarations.label,
+    declared_columns._all_columns,
+    declared_columns.find_column,
+    declared_columns.label,
     shipped_names,
     requirements.shipped_requirements,
     requirements._read_shipped,
@@ -121,7 +122,7 @@ def test_columns_are_declared_once_with_a_meaning(name: str) -> None:
     ] == []
     # reports find labels, and texts of flags, by name: declarations of one name agree in all scenarios
     for column in columns:
-        found = column_declarations.find_column(column.name)
+        found = declared_columns.find_column(column.name)
         assert found is not None
         assert (column.label, column.population) == (found.label, found.population), column.name
         assert column.type is not bool or (column.meaning, column.kind) == (found.meaning, found.kind), column.name
@@ -135,7 +136,7 @@ def test_system_of_another_package_is_registered(install: Install) -> None:
     install(
         "mine",
         columns_source
-        + _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.scenarios:MatchingScenario'"),
+        + _format_system("mine", files).replace("'x:Y'", "'marsyard.scenarios.measured.matching:MatchingScenario'"),
         **{"catalogue/mine-one": 'scenario = "mine-case"\n'},
         requirements=f'[[requirements]]\nid = "MINE"\n{requirement}',
     )
@@ -219,7 +220,7 @@ def test_invalid_requirements_file_is_reported(install: Install, tmp_path: Path)
 
 
 def test_invalid_columns_affect_only_campaigns_of_the_system(install: Install, tmp_path: Path) -> None:
-    scenario_path = "marsyard.scenarios.measured.scenarios:MatchingScenario"
+    scenario_path = "marsyard.scenarios.measured.matching:MatchingScenario"
     install("mine", _format_system("mine", ", columns={'mine-case': 'mine:HERE'}").replace("x:Y", scenario_path))
     with pytest.raises(ValueError, match=r"mine:HERE is a PosixPath; allowed: a marsyard\.scenarios\.columns\.Columns"):
         row_columns("mine-case")

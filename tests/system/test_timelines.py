@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.scenarios.interface import CaseResult, recording_timelines
+from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.timeline import SurfacePatch, TimedImage, Timeline
+from marsyard.scenarios.timeline_recording import recording_timelines
 from tests.reports.timeline.test_exports import run_rerun
 
 pytestmark = pytest.mark.slow

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from marsyard.campaigns.store.confirmations import read_confirmations
+from marsyard.campaigns.store.confirmation_record import read_record
 from marsyard.scenarios.systems import catalogue
 from tests.marsyard.confirmation_project import RECORD, create_project, git, make_command
 from tools import confirm_queue as queue
@@ -41,7 +41,7 @@ def test_interrupted_queue_continues_where_it_stopped(tmp_path: Path, monkeypatc
     assert [command[:2] for command in commands] == [["run", "fake.toml"], ["run", "other.toml"], ["run", "other.toml"]]
     reports = [json.loads((tmp_path / "runs" / name / "report.json").read_text()) for name in ("fake", "other")]
     assert [(report["cases"], report["verdict"]) for report in reports] == [(10, "PASS"), (11, "PASS")]
-    assert [entry.cases for entry in read_confirmations(Path(RECORD))] == [10, 11]
+    assert [entry.cases for entry in read_record(Path(RECORD)).confirmations] == [10, 11]
     lines = [line.split(maxsplit=2) for line in (tmp_path / "runs" / "queue.log").read_text().splitlines()]
     assert len({tree for _, tree, _ in lines}) == 1
     assert [text.split(":")[0] for *_, text in lines] == ["start", "end", "start", "start", "end"]

@@ -7,9 +7,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.errors import WorkerExitError
 from marsyard.campaigns.execution.work import TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import WorkerExitError
 
 #: Maximum duration of runs that could wait forever, in seconds.
 MAX_DURATION_S = 60.0

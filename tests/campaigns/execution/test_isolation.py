@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.campaigns.errors import CRASHED, TIMED_OUT
 from marsyard.campaigns.execution import worker_process
-from marsyard.campaigns.execution.cases import make_unfinished_row
+from marsyard.campaigns.execution.case_rows import make_unfinished_row
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import request_fresh_worker
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import CRASHED, TIMED_OUT
 from tests.campaigns.execution.items import (
     MAX_DURATION_S,
     get_process_id,

@@ -16,11 +16,11 @@ from typing import Any
 import pytest
 
 from marsyard.algorithms.processes import descendants
-from marsyard.campaigns.errors import TIMED_OUT, WorkerExitError
 from marsyard.campaigns.execution import worker_process
 from marsyard.campaigns.execution.monitoring import BatchClock
 from marsyard.campaigns.execution.work import TaskResult, Work, WorkLimits
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import TIMED_OUT, WorkerExitError
 from tests.campaigns.execution.items import list_results, run_items
 
 

@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 
 from marsyard.algorithms.processes import used_memory
-from marsyard.campaigns.errors import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT, CampaignError
+from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.batches import MAX_BATCH, Batches
 from marsyard.campaigns.execution.work import Work, WorkLimits
 from marsyard.campaigns.execution.worker_process import StatusBoard, run_batch
 from marsyard.campaigns.execution.workers import LocalExecutor
+from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, TIMED_OUT, TOO_MUCH_OUTPUT
 from tests.campaigns.execution.items import get_process_id, list_results, read_exit, run_items, sleep_and_return
 
 

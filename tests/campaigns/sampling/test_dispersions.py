@@ -11,8 +11,9 @@ from pydantic import TypeAdapter, ValidationError
 from scipy import stats
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.sampling.dispersion_base import TAIL, Dispersion, scipy_distributions, scipy_parameters
+from marsyard.campaigns.sampling.dispersion_base import TAIL, Dispersion
 from marsyard.campaigns.sampling.dispersions import AnyDispersion
+from marsyard.campaigns.sampling.distributions import scipy_distributions, scipy_parameters
 from marsyard.sim.streams import Streams
 from tests.campaigns.fake_campaign import CampaignFile
 

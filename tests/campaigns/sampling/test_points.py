@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import norm, spearmanr
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.campaigns.sampling.dispersion_base import MAX_FORMULA_LENGTH, parse_formula
+from marsyard.campaigns.sampling.formulas import MAX_FORMULA_LENGTH, parse_formula
 from marsyard.campaigns.sampling.study_points import StudyPoint
 from tests.campaigns.fake_campaign import campaign_fixture
 

@@ -14,9 +14,10 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.store import record
+from marsyard.campaigns.studies.point_runner import Candidate
 from marsyard.campaigns.studies.rare import continue_rare
 from marsyard.campaigns.studies.results import SearchParameters, SearchResult
-from marsyard.campaigns.studies.runner import Candidate, prepare_campaign
+from marsyard.campaigns.studies.runner import prepare_campaign
 from marsyard.campaigns.studies.search import SearchStudy, start_search
 from tests.campaigns.fake_campaign import RecordingWatch, campaign_fixture
 from tests.campaigns.studies import limit_state

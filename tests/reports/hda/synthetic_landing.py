@@ -12,7 +12,7 @@ CELL_M, HEIGHT_M, FOCAL_PX = 0.25, 10.0, 240.0
 
 
 def synthetic_products() -> dict[str, Any]:
-    """Return products in the layout of `landing.score.products`, for a nadir camera with its x axis to the east."""
+    """Return products in the layout of `landing.products.case_products`, for a nadir camera with x axis to the east."""
     rng = np.random.default_rng(1)
     rows, columns = SHAPE
     corner = np.array([-0.5 * (columns - 1), 0.5 * (rows - 1)]) * CELL_M

@@ -10,7 +10,7 @@ IMAGES, REFUSED = 6, 2
 
 
 def synthetic_products() -> dict[str, Any]:
-    """Return products in the layout of `localisation.score.products`."""
+    """Return products in the layout of `localisation.products.case_products`."""
     rng = np.random.default_rng(1)
     times = np.append(0.5 + 2.0 * np.arange(IMAGES), 11.0)
     true = np.array([100.0, -50.0]) + times[:IMAGES, np.newaxis] * np.array([8.0, 3.0])

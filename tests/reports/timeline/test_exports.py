@@ -10,13 +10,13 @@ import pytest
 import trimesh
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.campaigns.store.products import pack_products, unpack_products
+from marsyard.campaigns.store.packed_products import pack_products, unpack_products
 from marsyard.reports.timeline.figure import draw_timeline
 from marsyard.reports.timeline.glb import write_glb
 from marsyard.reports.timeline.mesh import camera_outlines, triangulate
-from marsyard.scenarios.interface import recording_timelines
 from marsyard.scenarios.timeline import PRODUCT, CameraPose, SurfacePatch, Timeline, timeline_products
 from marsyard.scenarios.timeline import Path as TimelinePath
+from marsyard.scenarios.timeline_recording import recording_timelines
 from marsyard.sim.camera import Cahvore
 from tests.reports.timeline.timeline_example import CENTRE_M, make_camera, make_image, make_timeline
 

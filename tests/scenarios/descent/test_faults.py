@@ -10,16 +10,16 @@ from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.case_faults import add_detector_faults, corrupt_images
-from marsyard.scenarios.descent.flight import create_flight, states_at_images
-from marsyard.scenarios.descent.images import calibrated_camera, camera_optics, take_exposures
-from marsyard.scenarios.descent.parameters import (
-    DescentCameraParameters,
+from marsyard.scenarios.descent.faults import (
     DescentFaults,
     add_altitude_faults,
     add_attitude_faults,
     add_terrain_fault,
     add_time_fault,
 )
+from marsyard.scenarios.descent.flight import create_flight, states_at_images
+from marsyard.scenarios.descent.images import calibrated_camera, camera_optics, take_exposures
+from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.heat_shield import SHIELD_DIAMETER_M, HeatShield
 from marsyard.scenarios.radiance import add_haze

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.dimes import DimesOptions
 from marsyard.scenarios.conformance.parts import swinging_fall
 from marsyard.scenarios.descent.overlap import ZERO_PHASE_RADIUS_RAD, footprint, overlap_width_m, zero_phase_spot
-from marsyard.scenarios.descent.parameters import LandingParameters
-from marsyard.scenarios.descent.score import compute_touchdown
+from marsyard.scenarios.descent.parameters import TouchdownParameters
+from marsyard.scenarios.descent.touchdown import compute_touchdown
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics import State
 from marsyard.sim.sensor import preset
@@ -99,7 +99,7 @@ def test_slopes_over_a_kilometre_are_below_the_prior(name: str, sd_deg: float) -
 
 #: Time from the last image to the firing, s; enough for the computation.
 AVAILABLE_S = 17.0
-IDEAL = LandingParameters(steering_error=0.0, burn_error_m_s=0.0)
+IDEAL = TouchdownParameters(steering_error=0.0, burn_error_m_s=0.0)
 #: True horizontal velocity before the firing, m/s, with a magnitude of 15.
 TRUE_VELOCITY = np.array([12.0, -9.0])
 
@@ -145,7 +145,7 @@ def test_burn_is_steered_only_by_a_timely_estimate_above_the_deadband(
 
 
 def test_burn_and_steering_errors_have_the_specified_standard_deviation() -> None:
-    parameters = LandingParameters(steering_error=0.1, burn_error_m_s=1.0)
+    parameters = TouchdownParameters(steering_error=0.1, burn_error_m_s=1.0)
     touchdowns = [
         compute_touchdown(parameters, TRUE_VELOCITY, TRUE_VELOCITY.copy(), AVAILABLE_S, np.random.default_rng(seed))
         for seed in range(2000)

@@ -14,7 +14,7 @@ from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.faults import AlgorithmError, Fault
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.campaigns.definition.identity import own_limits
+from marsyard.campaigns.definition.components import own_limits
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.conformance.trackers import drive_to_target

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.cli.app import app
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.scenario import LocalisationScenario, LocalisedDescent
+from marsyard.scenarios.localisation.scenario import LocalisationScenario
+from marsyard.scenarios.localisation.simulation import LocalisedDescent
 from marsyard.scenarios.user_files import input_files
 from marsyard.sim.streams import Streams
 from tests.scenarios.localisation.test_scenario import COARSE, EXACT_MAP, SMALL

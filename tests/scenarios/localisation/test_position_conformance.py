@@ -10,7 +10,7 @@ import pytest
 
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.conformance import create_subject
-from marsyard.scenarios.conformance import CandidateAlgorithm, check_names, determine_task, subject_kinds
+from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, check_names, determine_task, subject_kinds
 from marsyard.scenarios.conformance.inputs import make_blank
 from marsyard.scenarios.localisation import conformance_inputs as inputs
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements

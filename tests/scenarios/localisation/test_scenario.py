@@ -18,7 +18,8 @@ from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.condition_columns import contrast_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation.parameters import LocalisationFaults, LocalisationScenarioParameters
-from marsyard.scenarios.localisation.scenario import LEAD_S, LocalisationScenario, LocalisedDescent
+from marsyard.scenarios.localisation.scenario import LocalisationScenario
+from marsyard.scenarios.localisation.simulation import LEAD_S, LocalisedDescent
 from marsyard.scenarios.systems import catalogue
 from marsyard.sim.measurements import ImuIncrements
 from marsyard.sim.sensor.instrument import Clock, ClockParameters

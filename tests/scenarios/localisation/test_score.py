@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
-from marsyard.campaigns.store.products import pack_products
-from marsyard.scenarios.columns import row_columns
+from marsyard.campaigns.store.packed_products import pack_products
+from marsyard.scenarios.declared_columns import row_columns
+from marsyard.scenarios.localisation.estimate_errors import EstimateErrors, compute_errors
 from marsyard.scenarios.localisation.fields import SmoothField
-from marsyard.scenarios.localisation.map_product import MapTruth
-from marsyard.scenarios.localisation.score import REQUIRED_M, EstimateErrors, answer_row, compute_errors, products
+from marsyard.scenarios.localisation.map_truth import MapTruth
+from marsyard.scenarios.localisation.products import case_products
+from marsyard.scenarios.localisation.score import REQUIRED_M, answer_row
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 
@@ -229,7 +231,7 @@ def test_products_of_valid_and_refused_estimates() -> None:
     answers = _answers(
         _refusal(2.0), _estimate(6.0, [3.0, 4.0, 5.0], details=details), _estimate(END_S, [1.0, 2.0, 3.0])
     )
-    stored = products(_make_descent(), answers)
+    stored = case_products(_make_descent(), answers)
     assert stored["outcomes"] == ["NO_COARSE_FIX", "VALID", "VALID"]
     assert np.isnan(stored["track"][0]).all()
     np.testing.assert_allclose(stored["track"][1], [6.5, 3.0, 4.0, 5.0, 2.0, 3.0, 5.0], atol=1e-9)
@@ -248,7 +250,7 @@ def test_products_of_valid_and_refused_estimates() -> None:
 
 
 def test_products_without_images() -> None:
-    stored = products(_make_descent(images=()), _answers(_refusal(END_S)))
+    stored = case_products(_make_descent(images=()), _answers(_refusal(END_S)))
     assert stored["track"].shape == (1, 7)
     assert "image_1" not in stored
     assert "landmarks_px" not in stored

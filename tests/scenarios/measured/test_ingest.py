@@ -15,7 +15,7 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.image_files import read_counts
 from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.layout import IngestError
-from marsyard.scenarios.measured.scenarios import MatchingScenario
+from marsyard.scenarios.measured.matching import MatchingScenario
 from marsyard.scenarios.measured.store import CasesFile, load_images
 from marsyard.sim.streams import Streams
 from tests.scenarios.measured.folders import read_rows, write_landing_folder, write_text_rows, write_velocity_folder

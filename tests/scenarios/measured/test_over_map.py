@@ -15,7 +15,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.localisation.map_sampling import elevation_at
 from marsyard.algorithms.localisation.options import LvsOptions
 from marsyard.algorithms.localisation.posed_image import PosedImage
-from marsyard.scenarios.localisation.map_product import MapParameters
+from marsyard.scenarios.localisation.map_parameters import MapParameters
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.measured import counterpart, store
 from marsyard.scenarios.measured.columns import MAP_COLUMNS

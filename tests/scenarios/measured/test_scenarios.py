@@ -12,7 +12,7 @@ from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.measured.ingest import ingest
 from marsyard.scenarios.measured.landing import MeasuredLandingScenario
-from marsyard.scenarios.measured.scenarios import MatchingScenario
+from marsyard.scenarios.measured.matching import MatchingScenario
 from marsyard.scenarios.measured.velocity import MeasuredVelocityScenario
 from marsyard.scenarios.parts import ScoredSite, ScoredVelocity
 from marsyard.sim.streams import Streams

@@ -6,8 +6,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marsyard.campaigns.definition.campaign_file import CampaignDefinition, validation_problems
-from marsyard.campaigns.definition.identity import custom_sources, list_parts
+from marsyard.campaigns.definition.campaign_file import CampaignDefinition
+from marsyard.campaigns.definition.components import list_parts
+from marsyard.campaigns.definition.identity import custom_sources
+from marsyard.campaigns.definition.toml_models import validation_problems
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.parts import named
 from marsyard.scenarios.parts.motions import CustomMotion

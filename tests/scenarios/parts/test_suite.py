@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marsyard.scenarios.conformance import determine_task
 from marsyard.scenarios.conformance import parts as part_checks
+from marsyard.scenarios.conformance.candidates import determine_task
 from tests.scenarios.suites import run_suite, write_module
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "docs" / "examples"

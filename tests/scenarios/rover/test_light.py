@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.scenarios.rover.closed_loop import RoverRun, run_case
+from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
+from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.sim.dynamics.rover import ROCKY_8, settle
 from marsyard.sim.frames import direction
 from marsyard.sim.sensor.mast import RESEARCH_MAST

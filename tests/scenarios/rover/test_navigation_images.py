@@ -8,8 +8,9 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.rover.closed_loop import RoverRun, map_terrain, prepare_run, run_case
+from marsyard.scenarios.rover.closed_loop import map_terrain, prepare_run, run_case
 from marsyard.scenarios.rover.parameters import MastCameraParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.sim.camera import write_cahvor
 from marsyard.sim.frames import rigid

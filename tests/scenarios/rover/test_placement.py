@@ -8,7 +8,7 @@ import trimesh
 
 from marsyard.algorithms.vtt.placement import Placement, PlacementOutcome, measure_surface
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.scenarios.rover.closed_loop import RoverRun, prepare_run, track_target
+from marsyard.scenarios.rover.closed_loop import prepare_run, track_target
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.placement import placement_row, placement_truth, sample_surface
 from marsyard.scenarios.rover.points import (
@@ -20,7 +20,9 @@ from marsyard.scenarios.rover.points import (
     ray_distances,
     spheres_near_line,
 )
-from marsyard.scenarios.rover.scenario import RoverScenario, SharedDriveParameters, SharedDriveScenario, place_target
+from marsyard.scenarios.rover.run_state import RoverRun
+from marsyard.scenarios.rover.scenario import RoverScenario, place_target
+from marsyard.scenarios.rover.shared_drive import SharedDriveParameters, SharedDriveScenario
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
 

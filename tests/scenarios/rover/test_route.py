@@ -12,7 +12,7 @@ from marsyard.algorithms.vtt import prediction
 from marsyard.algorithms.vtt.pointing import mast_angles
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.rover import closed_loop as closed_loop
-from marsyard.scenarios.rover.closed_loop import Step, is_stuck, run_case
+from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
     TargetEstimate,
@@ -22,8 +22,9 @@ from marsyard.scenarios.rover.flight_software import (
     plan_step,
 )
 from marsyard.scenarios.rover.parameters import LegParameters, MobilityParameters, RoverScenarioParameters
+from marsyard.scenarios.rover.run_state import Step, is_stuck
 from marsyard.scenarios.rover.scenario import RoverScenario
-from marsyard.scenarios.rover.world import Vehicle
+from marsyard.scenarios.rover.vehicle import Vehicle
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.streams import Streams

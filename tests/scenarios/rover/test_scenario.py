@@ -9,9 +9,9 @@ import pytest
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.scenario import (
+from marsyard.scenarios.rover.scenario import RoverScenario
+from marsyard.scenarios.rover.shared_drive import (
     DriveKey,
-    RoverScenario,
     SharedDriveParameters,
     SharedDriveScenario,
     render_drive,

@@ -1,4 +1,4 @@
-"""Scenarios of recorded images: what they share, and the comparison of images with their measured poses."""
+"""Parameters, scenario and columns that the tasks with recorded images share."""
 
 from __future__ import annotations
 
@@ -11,22 +11,18 @@ from jaxtyping import Float
 from pydantic import BaseModel, Field, model_validator
 
 from marsyard.scenarios.base import BaseScenario
-from marsyard.scenarios.condition_columns import hash_images
-from marsyard.scenarios.interface import CaseResult, Scalar
+from marsyard.scenarios.image_provenance import hash_images
+from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
 from marsyard.scenarios.measured.layout import TaskName
 from marsyard.sim.camera import camera_pose
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.streams import Streams
 
 Answer = TypeVar("Answer")
 ParametersType = TypeVar("ParametersType", bound=BaseModel)
 
 NAN = float("nan")
-#: Outcomes of `MatchingScenario`, which runs no algorithm.
-MATCHED, TOO_FEW = "MATCHED", "TOO_FEW_MATCHES"
 
 
 class MeasuredParameters(Parameters):
@@ -54,12 +50,6 @@ class MeasuredParameters(Parameters):
         return self.cases.stored.cases[self.number]
 
 
-class MatchingParameters(MeasuredParameters):
-    """Parameters of the comparison of images with their poses."""
-
-    task_name = "matching"
-
-
 class MeasuredScenario(BaseScenario[ParametersType]):
     """A scenario whose cases are stored files, so there are no inputs to prepare before the cases."""
 
@@ -69,26 +59,6 @@ class MeasuredScenario(BaseScenario[ParametersType]):
 
     def prepare(self, parameters: BaseModel, shared_input: int) -> None:
         """Do nothing: there is no input to prepare."""
-
-
-class MatchingScenario(MeasuredScenario[MatchingParameters]):
-    """Comparison of two or more images with their measured poses, without an algorithm."""
-
-    name = "measured-matching"
-    parameters_type = MatchingParameters
-
-    def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
-        """Run one case."""
-        p = self.check_parameters(parameters)
-        images = store.load_images(p.cases, p.case)
-        pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.images])
-        has_matches = all(pair.residuals_px.size for pair in pairs)
-        return CaseResult(
-            outcome=MATCHED if has_matches else TOO_FEW,
-            answered=has_matches,
-            row={**case_row(p, images), **agreement_row(pairs)},
-            products=agreement_products(images, pairs),
-        )
 
 
 def case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str, Scalar]:

@@ -1,0 +1,113 @@
+"""Columns of a run's conditions, from the simulated objects."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from marsyard.algorithms.vtt.accuracy import GOAL_M, START_M
+from marsyard.scenarios.condition_columns import sun_columns
+from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.rover.parameters import RoverScenarioParameters
+from marsyard.scenarios.rover.points import rover_shades_patch, sample_template
+from marsyard.scenarios.rover.run_state import RoverRun
+from marsyard.scenarios.rover.stops import StopView
+from marsyard.scenarios.rover.updates import errors_px, finite_max
+from marsyard.scenarios.rover.visibility import evaluate_visibility
+
+NAN = float("nan")
+
+
+def fixed_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
+    """Compute the columns of conditions that do not depend on the tracker, from the simulated objects."""
+    target, rocks, number = run.target, run.setup.world.rocks, run.setup.world.target_number
+    azimuth_error, elevation_error = np.degrees(run.setup.rig.mast.zeros_rad)
+    return {
+        "site": p.world.site,
+        "terrain": p.world.terrain,
+        "camera": p.camera.name,
+        "navcam": p.camera.name.endswith("navcam"),
+        "pancam": p.camera.name.endswith("pancam"),
+        "search_px": p.vtt.search_px,
+        "rock_diameter_m": float(rocks.diameter_m[number]),
+        "rock_height_m": float(rocks.height_m[number]),
+        "point_on_edge": target.on_edge,
+        "point_lit": target.lit,
+        "selectable": target.lit and not target.on_edge,
+        "incline": p.world.incline.name,
+        "visual_odometry": any(leg.visual_odometry for leg in p.legs),
+        "autonav": any(leg.autonav for leg in p.legs),
+        "map_by": next((leg.map_by for leg in p.legs if leg.autonav), "none"),
+        "roll_compensated": p.vtt.roll and p.algorithm != "pure-ncc",
+        "roll_ignored": not p.vtt.roll or p.algorithm == "pure-ncc",
+        "clear_sky": p.clouds is None or p.clouds.cover == 0.0,
+        "disparity_error_start_px": run.setup.rig.head.disparity_error_px(START_M),
+        "disparity_error_goal_px": run.setup.rig.head.disparity_error_px(GOAL_M),
+        "mast_azimuth_error_deg": float(azimuth_error),
+        "mast_elevation_error_deg": float(elevation_error),
+    }
+
+
+def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
+    """Compute the columns of conditions that depend on the tracker's run, from the simulated objects."""
+    stops, world = run.stops, run.setup.world
+    drives = [drive for stop in stops for drive in stop.drives]
+    lengths = np.array([drive.command.length_m for drive in drives])
+    is_moving = lengths > 0.0
+    slips = np.array([drive.slip for drive in drives])[is_moving]
+    distance = float(lengths.sum())
+    # range and time at the first and last stop, pose error at the last stop
+    ranges, times, pose_error = (NAN, NAN), (0.0, 0.0), NAN
+    if stops:
+        ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
+        position_error = stops[-1].estimated_pose.translation - stops[-1].stance.world_from_rover.translation
+        pose_error = float(np.linalg.norm(position_error))
+    sun = [world.sun.direction(time_s) for time_s in times]
+    exposures = np.array([stop.images.exposure_s for stop in stops], dtype=np.float64)
+    return {
+        "range_start_m": ranges[0],
+        "range_end_m": ranges[1],
+        "max_tilt_deg": float(np.degrees(finite_max(np.array([stop.stance.tilt_rad for stop in stops])))),
+        "distance_driven_m": distance,
+        "slip_mean": float(np.sum(slips * lengths[is_moving]) / distance) if distance > 0.0 else 0.0,
+        "slip_max": finite_max(slips) if np.any(is_moving) else 0.0,
+        "pose_error_m": pose_error,
+        "pose_error_fraction": pose_error / distance if distance > 0.0 else NAN,
+        "duration_min": times[1] / 60.0,
+        **sun_columns(sun[0]),
+        "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
+        "min_exposure_s": -finite_max(-exposures),  # minimum of the finite values
+        "max_exposure_s": finite_max(exposures),
+    }
+
+
+def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
+    """Compute the columns of the designated point's visibility at the stops of a run, and of the rover's shadow on it.
+
+    Stops count up to the first one with a lost or falsely tracked point: later poses follow from the tracker's error.
+
+    A run without stops has not lost sight of the point: it counts, as a failure, in the population of visible targets.
+    """
+    if not run.stops:
+        obliquity = {"obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
+        return {"point_in_view": True, **obliquity, **shadow_columns(p, run, [])}
+    heads = [stop.world_from_head for stop in run.stops]
+    columns = asdict(evaluate_visibility(run.setup.world, run.setup.rig, run.target.point_world, heads, p.vtt))
+    # NaN (not tracked) is an error, too
+    errors = np.nan_to_num(np.hypot(*errors_px(run).T), nan=np.inf) > p.score.false_track_px
+    end = int(np.argmax(errors)) + 1 if np.any(errors) else len(run.stops)
+    return {"point_in_view": columns.pop("in_view"), **columns, **shadow_columns(p, run, run.stops[:end])}
+
+
+def shadow_columns(p: RoverScenarioParameters, run: RoverRun, views: Sequence[StopView]) -> dict[str, Scalar]:
+    """Compute the columns of the rover's shadow: whether it is on the template of the designated point in any view."""
+    half_angle, mast = 0.5 * p.vtt.template_px * run.setup.rig.pixel_rad, run.setup.rig.calibrated.geometry
+
+    def is_in_shadow(view: StopView) -> bool:
+        viewpoint = run.setup.rig.camera_positions(view.world_from_head)[0]
+        patch = sample_template(viewpoint, run.target.point_world, half_angle)
+        sun = run.setup.world.sun.direction(view.time_s)
+        return rover_shades_patch(run.setup.vehicle.rover, view.stance, mast, view.angles_rad, patch, sun)
+
+    is_shadowed = p.rover_shadow and any(is_in_shadow(view) for view in views)
+    return {"rover_shadow_on_target": is_shadowed, "no_rover_shadow_on_target": not is_shadowed}
