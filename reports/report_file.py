@@ -10,8 +10,8 @@ from pydantic import TypeAdapter, ValidationError
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.reports.robustness import Robustness
 from marsyard.reports.sampling_design import SamplingDesign
-from marsyard.reports.statistics.samples import ErrorSummary
-from marsyard.reports.traceability import Algorithm
+from marsyard.reports.statistics.error_summary import ErrorSummary
+from marsyard.reports.tested_algorithms import Algorithm
 from marsyard.reports.validity import Validity
 from marsyard.reports.verdicts import Verdict
 from marsyard.sim.cache import hide_folders

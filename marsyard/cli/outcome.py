@@ -32,12 +32,13 @@ from marsyard.cli.showing import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
-from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
+from marsyard.reports.evaluation import Evaluation, evaluate_run
 from marsyard.reports.gallery import gallery_candidates
-from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.robustness import robustness_text
+from marsyard.reports.looks import record_look
+from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.robustness_sentences import robustness_text
 from marsyard.reports.stored import read_run
-from marsyard.reports.tables import verdict_table
+from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count
 from marsyard.sim.files import report_damage

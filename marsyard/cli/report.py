@@ -71,7 +71,7 @@ def confirmations(
     from marsyard.campaigns.store.confirmation_record import read_record
     from marsyard.campaigns.store.confirmations import create_record
     from marsyard.campaigns.store.git_registration import find_registration_problem
-    from marsyard.reports.tables import confirmations_table
+    from marsyard.reports.terminal_tables import confirmations_table
 
     if create:
         create_record(file)
@@ -99,21 +99,21 @@ def compare(
     """
     from marsyard.campaigns.errors import CampaignError
     from marsyard.cli.showing import grid_table
-    from marsyard.reports import comparison
+    from marsyard.reports import campaign_diff
     from marsyard.reports.stored import read_run
 
     runs = [read_run(directory) for directory in (first, second)]
     for run in runs:
         if run.recorded("study"):
             raise CampaignError(f"{run.directory} contains a study: its cases are chosen, so rates cannot be compared")
-    is_paired, differences = comparison.compare_campaigns(*runs)
-    names, have_same_terrains = [str(run.directory) for run in runs], comparison.have_same_terrains(*runs)
+    is_paired, differences = campaign_diff.compare_campaigns(*runs)
+    names, have_same_terrains = [str(run.directory) for run in runs], campaign_diff.have_same_terrains(*runs)
     if as_json:
         data = {"first": names[0], "second": names[1], "paired": is_paired, "same_terrains": have_same_terrains}
-        typer.echo(json.dumps({**data, "figures": comparison.campaign_diff_data(differences)}, indent=2))
+        typer.echo(json.dumps({**data, "figures": campaign_diff.campaign_diff_data(differences)}, indent=2))
         return
     out = create_console()
-    out.print(grid_table("Side by side", comparison.campaign_diff_grid(["first", "second"], differences)))
+    out.print(grid_table("Side by side", campaign_diff.campaign_diff_grid(["first", "second"], differences)))
     out.print(f"first: {names[0]}\nsecond: {names[1]}", markup=False, highlight=False, soft_wrap=True)
     terrains = "the same terrains: comparison by terrain" if have_same_terrains else "different terrains: unpaired"
     method = "same draws: paired comparison" if is_paired else f"different draws on {terrains}"
@@ -186,7 +186,8 @@ def nightly(
     from marsyard.cli import nightly_run
     from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
     from marsyard.cli.progress import campaign_progress
-    from marsyard.reports.history import FINISHED, INTERRUPTED, History, find_changes, list_comparisons
+    from marsyard.reports.history import FINISHED, INTERRUPTED, History, list_comparisons
+    from marsyard.reports.history_changes import find_changes
 
     path = plan or PLAN_FILE
     plan_definition, executor = read_plan(path), make_executor(jobs, None)
