@@ -11,7 +11,7 @@ from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import ELLIPSE
-from marsyard.reports.outcomes_by_size import NO_FAULT, OutcomesBySize
+from marsyard.reports.outcomes_by_size import NO_FAULT, ExtraColumn, OutcomesBySize
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section
 from marsyard.reports.statistics.ellipse import error_ellipse
@@ -136,7 +136,9 @@ def fault_outcomes(metric: str, bound: float) -> OutcomesBySize:
         cases="Cases",
         wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == NO_FAULT else f"{size:g}"),
         extra_columns=(
-            ("Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING),
+            ExtraColumn(
+                "Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING
+            ),
         ),
     )
 

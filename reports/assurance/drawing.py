@@ -9,6 +9,8 @@ from html import escape
 
 from marsyard.reports.assurance.elements import Element, ElementKind, State
 
+#: SVG dash pattern of the box of a defeater.
+_DASHES = 'stroke-dasharray="6 3"'
 #: Width of a box, gaps between columns and rows, height of a line of text, margin around the text, pixels.
 _WIDTH, _COLUMN_GAP, _ROW_GAP, _LINE, _PAD = 300.0, 56.0, 12.0, 15.0, 11.0
 _CHARACTERS = 44

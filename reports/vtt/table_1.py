@@ -19,7 +19,8 @@ from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import read_paper
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
-from marsyard.reports.vtt.goal import is_closed_loop, pointing_error_cm, selectable_targets
+from marsyard.reports.vtt.goal import pointing_error_cm
+from marsyard.reports.vtt.run_selection import is_closed_loop, selectable_targets
 from marsyard.reports.wording import NOTHING
 
 #: Table I as printed.

@@ -7,6 +7,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from marsyard.image_request import ImageRequest
 from marsyard.scenarios.horizon import HILL_NAME, add_unresolved_rocks, hill_objects
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.render import Frame, Scene
@@ -14,7 +15,7 @@ from marsyard.sim.render.objects import FIRST_MESH_NUMBER
 from marsyard.sim.render.rover import ROVER_NAME
 from marsyard.sim.terrain import RockField, site
 from marsyard.sim.terrain.sites import Hill
-from marsyard.site_images import ImageRequest, RenderedImage, render_images
+from marsyard.site_images import RenderedImage, render_images
 
 HILL = Hill(azimuth_deg=60.0, distance_m=3000.0, width_m=800.0, depth_m=600.0, height_m=90.0)
 MARS_RADIUS_M = 3.39e6

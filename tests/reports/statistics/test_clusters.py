@@ -183,13 +183,13 @@ def test_more_cases_do_not_make_the_verdict_worse() -> None:
 
 def test_search_for_a_statistic_ends_at_a_sufficient_probability(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes, rate, risk, calls = ((1, 4), (3, 12)), 0.21, 0.1, [0]
-    evaluate = clusters.TailFunction.of_pairs
+    evaluate = TailFunction.of_pairs
 
     def count(*arguments: Any) -> Any:
         calls[0] += 1
         return evaluate(*arguments)
 
-    monkeypatch.setattr(clusters.TailFunction, "of_pairs", count)
+    monkeypatch.setattr(TailFunction, "of_pairs", count)
     p_values = [TerrainCounts(sizes, statistic).p_value(rate) for statistic in range(12)]
     assert clusters.max_statistic(sizes, rate, risk) == sum(value <= risk for value in p_values) - 1
     calls[0] = 0
