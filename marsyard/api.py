@@ -186,7 +186,8 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import evaluate_and_store
-    from marsyard.cli.progress import RunLog, campaign_progress
+    from marsyard.cli.progress import campaign_progress
+    from marsyard.cli.run_log import RunLog
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:
@@ -228,7 +229,8 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     - pose: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
       sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
-    from marsyard.site_images import ImageRequest, render_images
+    from marsyard.image_request import ImageRequest
+    from marsyard.site_images import render_images
 
     return render_images(ImageRequest.from_defaults(site, camera, **pose), detector=detector)
 

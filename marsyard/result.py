@@ -15,14 +15,14 @@ from marsyard.campaigns.errors import CampaignError, unknown_name_message
 from marsyard.campaigns.store.packed_products import save_packed
 from marsyard.campaigns.store.products import case_directory
 from marsyard.campaigns.store.table import refresh_table
-from marsyard.reports import comparison, figures
+from marsyard.reports import campaign_diff, figures
+from marsyard.reports.case_views import write_case_figures
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.presentation import write_case_figures
-from marsyard.reports.products import thumbnail
 from marsyard.reports.report_file import PAGE_FILE
 from marsyard.reports.requirement_cases import CaseFinder, CaseSummary
 from marsyard.reports.stored import read_run
+from marsyard.reports.thumbnails import thumbnail
 from marsyard.scenarios.timeline import Timeline
 
 if TYPE_CHECKING:
@@ -189,8 +189,8 @@ class Result:
         One row per metric, with texts; p-values are two-sided and corrected for the number of metrics (Holm).
         """
         second = other.directory if isinstance(other, Result) else Path(other)
-        _, differences = comparison.compare_campaigns(read_run(self.directory), read_run(second))
-        grid = comparison.campaign_diff_grid(["this campaign", "other campaign"], differences)
+        _, differences = campaign_diff.compare_campaigns(read_run(self.directory), read_run(second))
+        grid = campaign_diff.campaign_diff_grid(["this campaign", "other campaign"], differences)
         return pd.DataFrame(grid.rows, columns=list(grid.head)).set_index(grid.head[0])
 
     @property

@@ -1,30 +1,23 @@
-"""Render images of a site with ground-truth layers, camera model and metadata.
+"""Render images of a site with ground truth.
 
 Used by the commands `marsyard render` and `gallery`, and by `marsyard.render_view`.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
-from difflib import get_close_matches
-from importlib.metadata import version
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, UInt16
 
+from marsyard.image_request import ImageRequest
 from marsyard.scenarios import views
 from marsyard.scenarios.horizon import add_unresolved_rocks
 from marsyard.scenarios.radiance import add_haze
-from marsyard.scenarios.terrain_model_sites import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
 from marsyard.sim import sensor
-from marsyard.sim.camera import BODY_FRAME, CameraModel, write_cahvor
+from marsyard.sim.camera import CameraModel
 from marsyard.sim.dynamics.rover import RoverParameters, Stance
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, PixelRays, Scene, Sun, process_renderer
@@ -32,79 +25,10 @@ from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.rover import rover_objects
 from marsyard.sim.sensor.mast import MER_MAST
 from marsyard.sim.streams import Streams
-from marsyard.sim.terrain import Site, sites
 from marsyard.sim.terrain.imported import embed
 
-#: Files of an image: 16-bit image, truth layers, camera model, and metadata.
-SUFFIXES = (".png", ".npz", ".cahvor", ".json")
 #: Radiance factor that maps to full scale (65535) without a detector model.
 FULL_SCALE_RADIANCE_FACTOR = 1.0
-MAX_ALTITUDE_M = 20000.0
-
-
-@dataclass(frozen=True)
-class ImageRequest:
-    """Site, camera, camera pose, sun direction and seed of an image to render; lengths in metres, angles in degrees."""
-
-    site: str
-    camera: str
-    scale: str
-    altitude_m: float
-    east_m: float
-    north_m: float
-    azimuth_deg: float
-    elevation_deg: float
-    sun_azimuth_deg: float
-    sun_elevation_deg: float
-    seed: int
-    max_hole_fraction: float
-
-    @classmethod
-    def from_defaults(cls, site: str, camera: str, **given: Any) -> ImageRequest:
-        """Create a request with the camera's default pose, changed by `given`; raises ValueError if invalid."""
-        if not is_terrain_file(site):
-            check_site_name(site)
-            _check_name("site", site, sites())
-        _check_name("camera", camera, sensor.PRESETS)
-        mounting = views.CAMERA_MOUNTINGS[camera]
-        defaults = {"scale": mounting.scale, "altitude_m": mounting.height_m, "elevation_deg": mounting.elevation_deg}
-        defaults |= dict.fromkeys(("east_m", "north_m", "azimuth_deg"), 0.0)
-        defaults |= {"sun_azimuth_deg": 250.0, "sun_elevation_deg": 35.0}
-        defaults |= {"seed": 1, "max_hole_fraction": MAX_HOLE_FRACTION}
-        changes = {name: value for name, value in given.items() if value is not None}
-        if is_terrain_file(site):  # the DTM is centred in the periodic terrain
-            terrain = load_site(site, float(changes.get("max_hole_fraction", MAX_HOLE_FRACTION))).terrain()
-            defaults |= dict.fromkeys(("east_m", "north_m"), 0.5 * terrain.samples * terrain.spacing_m)
-        request = cls(site=site, camera=camera, **(defaults | changes))
-        request._check()
-        return request
-
-    @property
-    def site_definition(self) -> Site:
-        """The preset site, or the site created from the DTM file. Raises ValueError if the file is not usable."""
-        return load_site(self.site, self.max_hole_fraction)
-
-    def _check(self) -> None:
-        ranges = {
-            "altitude": (self.altitude_m, 0.0, MAX_ALTITUDE_M),
-            "elevation": (self.elevation_deg, -90.0, 90.0),
-            "sun-elevation": (self.sun_elevation_deg, 0.0, 90.0),
-        }
-        for name, (value, low, high) in ranges.items():
-            is_above_minimum = value >= low if name == "elevation" else value > low
-            if not (is_above_minimum and value <= high):
-                allowed = f"{low:g}" if name == "elevation" else f"more than {low:g}"
-                raise ValueError(f"--{name} {value:g} is out of range; allowed: {allowed} to {high:g}")
-        for name in ("east_m", "north_m", "azimuth_deg", "sun_azimuth_deg"):
-            if not math.isfinite(value := getattr(self, name)):
-                option = name.rpartition("_")[0].replace("_", "-")
-                raise ValueError(f"--{option} {value} is not a finite number")
-        scales = [scale for scale in ("descent", "ground") if getattr(self.site_definition, scale) is not None]
-        if self.scale not in scales:
-            raise ValueError(
-                f"site {self.site} has no terrain at the scale '{self.scale}', which camera {self.camera} needs; "
-                f"allowed --scale: {', '.join(scales)}"
-            )
 
 
 @dataclass(frozen=True)
@@ -216,113 +140,3 @@ def _expose(
     )
     counts = auto_exposure.detector.expose(radiance, streams.generator("detector noise"))
     return auto_exposure, counts
-
-
-def truth_layers(image: RenderedImage) -> dict[str, Any]:
-    """Compute the ground-truth layers, each with the rows and columns of the image, and the pose."""
-    frame, scene = image.frame, image.scene
-    directions = frame.world_from_body.rotation.apply(frame.rays.directions.astype(np.float64))
-    phase = np.degrees(np.arccos(np.clip(-(directions @ scene.sun.direction), -1.0, 1.0)))
-    is_ground = np.isfinite(frame.range_m)
-    # Render again without diffuse light: pixels with zero radiance are in shadow.
-    direct_light = replace(scene.photometry, sky_fraction=0.0, sky_radiance=0.0, surrounding_albedo=0.0)
-    direct_frame = process_renderer(default_backend()).render(
-        scene.with_photometry(direct_light).with_edge_rays(1), frame.rays, frame.world_from_body
-    )
-    names = np.append(scene.objects.names, [-2, -1])  # body indices -2 (sky) and -1 (ground)
-    return {
-        "radiance_factor": frame.radiance,
-        "range_m": frame.range_m,
-        "point_m": frame.points_world(),
-        "normal": frame.normal,
-        "object": names[frame.body].astype(np.int32),
-        "shadow": is_ground & (direct_frame.radiance <= 0.0),
-        "phase_deg": np.where(is_ground, phase.reshape(is_ground.shape), np.nan).astype(np.float32),
-        "world_from_body": frame.world_from_body.as_matrix(),
-        **({} if image.filled is None else {"filled": image.filled}),
-    }
-
-
-def write_image(image: RenderedImage, request: ImageRequest, prefix: Path) -> list[Path]:
-    """Write the files of an image (see `SUFFIXES`); return their paths."""
-    png, npz, cahvor, metadata = (_build_path(prefix, image.suffix, ending) for ending in SUFFIXES)
-    is_encoded, png_bytes = cv2.imencode(".png", image.to_uint16())
-    if not is_encoded:
-        raise ValueError(f"{png} could not be encoded")
-    png.write_bytes(png_bytes.tobytes())
-    with npz.open("wb") as file:
-        np.savez(file, **truth_layers(image))
-    write_cahvor(image.camera_body, cahvor, f"{request.camera}{image.suffix} at {request.site}", frame=BODY_FRAME)
-    metadata.write_text(json.dumps(describe_image(image, request), indent=2) + "\n", encoding="utf-8")
-    return [png, npz, cahvor, metadata]
-
-
-def describe_image(image: RenderedImage, request: ImageRequest) -> dict[str, Any]:
-    """Return the metadata of an image: all inputs, and a description of the quantities in its files."""
-    columns, rows = image.camera_world.size
-    scene, auto_exposure, detector = image.scene, image.auto_exposure, None
-    png: dict[str, Any] = {
-        "holds": "radiance factor (I/F) relative to the solar irradiance at the ground",
-        "full_scale_radiance_factor": FULL_SCALE_RADIANCE_FACTOR,
-    }
-    if auto_exposure is not None:
-        detector = auto_exposure.detector.parameters
-        png = {
-            "holds": "detector counts, in the upper bits",
-            "multiplied_by": image.count_scale,
-            "exposure_s": detector.exposure_s,
-            "auto_exposure_converged": auto_exposure.converged,
-        }
-    return {
-        "marsyard": version("marsyard"),
-        "shot": asdict(request),
-        "image": image.suffix.lstrip("-") or "single",
-        "size": {"columns": columns, "rows": rows},
-        "png": png,
-        "npz": {
-            "object": "number of the visible rock; -1 ground, -2 sky",
-            "shadow": "no direct sunlight: a cast shadow, or a surface that faces away from the sun",
-            "frame": "world: x east, y north (grid north for a DTM), z up, metres",
-            "filled": "the pixel sees a filled hole of the DTM",
-        },
-        "cahvor": {"frame": "body frame; world_from_body transforms it to the world frame"},
-        "filled_fraction": None if image.filled is None else float(image.filled.mean()),
-        "world_from_body": image.frame.world_from_body.as_matrix().tolist(),
-        "sun_direction": scene.sun.direction.tolist(),
-        "photometry": asdict(scene.photometry),
-        "mesh": {name: getattr(scene, name) for name in ("mesh_finest_m", "mesh_half_width_m", "mesh_lines")},
-        "rocks_drawn": len(scene.objects),
-        "site": request.site_definition.model_dump(mode="json"),
-        "detector": None if detector is None else detector.model_dump(mode="json"),
-        "gl_backend": default_backend(),
-    }
-
-
-def _build_path(prefix: Path, suffix: str, ending: str) -> Path:
-    return prefix.with_name(f"{prefix.name}{suffix}{ending}")
-
-
-def check_files(prefix: Path, camera: str, overwrite: bool) -> None:
-    """Raise ValueError if the files cannot be written, or exist and `overwrite` is False."""
-    folder = prefix.parent
-    if prefix.name in ("", ".", ".."):
-        raise ValueError(f"--out {prefix} is not a file name; give a path without extension, such as images/gusev")
-    if not folder.is_dir():
-        raise ValueError(f"--out {prefix}: the folder {folder} does not exist")
-    if not os.access(folder, os.W_OK):
-        raise ValueError(f"--out {prefix}: the folder {folder} is not writable")
-    suffixes = ("",) if sensor.preset(camera).design.baseline_m is None else ("-left", "-right")
-    paths = [_build_path(prefix, suffix, ending) for suffix in suffixes for ending in SUFFIXES]
-    existing = [str(path) for path in paths if path.exists()]
-    if existing and not overwrite:
-        raise ValueError(f"{', '.join(existing)}: files exist; use --overwrite to replace them")
-
-
-def _check_name(kind: str, name: str, names: Iterable[str]) -> None:
-    """Raise ValueError for an unknown name; the message lists similar names."""
-    allowed = list(names)
-    if name in allowed:
-        return
-    similar = get_close_matches(name, allowed, n=1) or [item for item in allowed if name and name in item]
-    hint = f"; did you mean {' or '.join(similar)}?" if similar else "."
-    raise ValueError(f"no {kind} is called '{name}'{hint} Allowed: {', '.join(allowed)}")

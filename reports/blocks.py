@@ -1,25 +1,22 @@
-"""Blocks of report sections, created from rows: rates, outcomes by fault, distributions, quantiles, scatter plots.
+"""Blocks of report sections, created from rows: rates, distributions, and quantiles.
 
 A section is a function from rows to blocks (`marsyard.reports.section.create_section`). `docs/reports.md` contains an
 example. The argument `key` of these functions is the identifier of the figure on the page.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.column_values import numbers
-from marsyard.reports.plots import RateLine, cumulative_figure, rate_figure, scatter_panels, stacked_bars
+from marsyard.reports.plots import RateLine, cumulative_figure, rate_figure
 from marsyard.reports.rates import CONFIDENCE, CaseFraction, PooledRate, finite_values, varies
 from marsyard.reports.section import Block, Grid, svg_figure
-from marsyard.reports.statistics.drivers import MIN_CASES, estimate_driver
-from marsyard.reports.wording import NOTHING, coefficient, format_fraction, label, number, percent
+from marsyard.reports.wording import format_fraction, label, number, percent
 
 Rows = pd.DataFrame
 #: Function that computes a rate of rows.
@@ -28,8 +25,6 @@ RateFunction = Callable[[Rows], CaseFraction | PooledRate]
 _MAX_BINS, _MIN_CASES_IN_BIN = 5, 4
 #: Maximum number of values of a condition with a row each.
 _MAX_VALUES = 24
-#: Fault type of cases without a fault.
-NO_FAULT = "none"
 
 
 @dataclass(frozen=True)
@@ -60,9 +55,9 @@ def flag_rate(name: str, *conditions: str, value: bool = True) -> RateFunction:
 
     def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
-        masks = (rates.flag_mask(frame, condition) for condition in conditions)
+        masks = (populations.flag_mask(frame, condition) for condition in conditions)
         selected_rows = frame[np.logical_and.reduce([all_rows, *masks])]
-        return rates.fraction_of(rates.flag_mask(selected_rows, name) == value, selected_rows)
+        return rates.fraction_of(populations.flag_mask(selected_rows, name) == value, selected_rows)
 
     return compute_rate
 
@@ -154,64 +149,6 @@ def condition_bins(values: Float[np.ndarray, " n"], max_values: int = _MAX_BINS)
     return [bin_numbers == index for index in range(bins)]
 
 
-@dataclass(frozen=True)
-class OutcomesBySize:
-    """Outcomes of cases by type (column `fault`) and size of their fault.
-
-    - outcomes: function that returns a mask of the rows for each outcome, by its key in `report.json`; the table shows
-      a confidence interval for the last outcome of `styles`
-    - styles: for each outcome, its label and the style of its bars (`marsyard.reports.figure_style.BARS`), in order
-    - cases: heading of the number of rows
-    - wording: function that returns fault type and size in words; an unknown size is empty
-    - extra_columns: further columns of the table, each with its heading, its key in `report.json`, a function that
-      computes its value from the rows, and a function that formats the value
-    """
-
-    outcomes: Callable[[Rows], Mapping[str, Bool[np.ndarray, " n"]]]
-    styles: Mapping[str, tuple[str, str]]
-    cases: str
-    wording: Callable[[str, float], tuple[str, str]]
-    extra_columns: Sequence[tuple[str, str, Callable[[Rows], Any], Callable[[Any], str]]] = ()
-
-    def records(self, frame: Rows) -> list[dict[str, Any]]:
-        """Count the outcomes for each fault type and size; cases without a fault come first."""
-        records = []
-        for fault, size, rows in rates.group_by_size(frame, "fault", "fault_size", NO_FAULT):
-            masks = self.outcomes(rows)
-            last_outcome = [*self.styles][-1]
-            counts: dict[str, Any] = {name: int(mask.sum()) for name, mask in masks.items()}
-            counts[f"{last_outcome}_fraction"] = rates.fraction_of(masks[last_outcome], rows)
-            values = {name: compute(rows) for _, name, compute, _ in self.extra_columns}
-            records.append({"fault": fault, "size": size, "n": len(rows), **counts, **values})
-        return records
-
-    def blocks(self, frame: Rows, key: str, caption: str, note: str = "") -> list[Block]:
-        """Create stacked bars and a table of the outcomes; empty if no row has a fault."""
-        records = self.records(frame) if "fault" in frame else []
-        if all(record["fault"] == NO_FAULT for record in records):
-            return []
-        texts = [self.wording(record["fault"], record["size"]) for record in records]
-        last = [*self.styles][-1]
-        head = ["Fault", "Size", self.cases, *(name.capitalize() for name, _ in self.styles.values())]
-        head += [f"{self.styles[last][0].capitalize()}, interval", *(heading for heading, *_ in self.extra_columns)]
-        rows = [
-            [
-                *(name, size or NOTHING, f"{record['n']:,}"),
-                *(f"{record[outcome]:,} ({percent(record[outcome] / record['n'])})" for outcome in self.styles),
-                rates.interval_text(record[f"{last}_fraction"]),
-                *(format_value(record[name]) for _, name, _, format_value in self.extra_columns),
-            ]
-            for record, (name, size) in zip(records, texts, strict=True)
-        ]
-        percentages = {
-            name: (style, [100.0 * record[outcome] / record["n"] for record in records])
-            for outcome, (name, style) in self.styles.items()
-        }
-        figure = stacked_bars([" ".join(pair).strip() for pair in texts], percentages, f"% of {self.cases.lower()}")
-        figures = [svg_figure(figure, key, caption)]
-        return [Block(figures=figures, data={"rows": records}), Block(grid=Grid(head, rows), note=note)]
-
-
 def distribution_block(
     key: str, curves: Mapping[str, Float[np.ndarray, " n"]], labels: tuple[str, str], caption: str, heading: str = "",
     *, complementary: bool = False, bound: float | None = None,
@@ -233,77 +170,3 @@ def quantile_block(
         if values.size
     ]
     return Block(heading=heading, grid=Grid(["", *columns], rows), note=note) if rows else None
-
-
-@dataclass(frozen=True)
-class Effect:
-    """Effect of a condition on a response: their titles, Spearman's rank correlation with its interval, and bins.
-
-    centres, medians: medians of the condition and of the response in each bin of the condition
-    """
-
-    condition: str
-    response: str
-    rank_correlation: float
-    lower: float
-    upper: float
-    centres: list[float]
-    medians: list[float]
-
-
-def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[Effect]:
-    """Compute the effect of every condition `x` that varies on every response `y`."""
-    effects, groups = [], rates.terrain_groups(frame)
-    for condition in (condition for condition in x if varies(frame, condition.column)):
-        for response in y:
-            conditions, responses = condition.values(frame), response.values(frame)
-            bins = condition_bins(np.where(np.isfinite(responses), conditions, np.nan))
-            centres, medians = ([float(np.median(values[mask])) for mask in bins] for values in (conditions, responses))
-            ranks = estimate_driver(conditions, responses, groups, CONFIDENCE)
-            rank_values = (math.nan,) * 3 if ranks is None else (ranks.correlation, ranks.lower, ranks.upper)
-            effects.append(Effect(condition.title, response.title, *rank_values, centres, medians))
-    return effects
-
-
-def scatter_block(
-    frame: Rows, key: str, x: Sequence[Quantity], y: Sequence[Quantity], caption: str, heading: str = "",
-    note: str = "", *, logarithmic: bool = False, statistics: bool = True,
-) -> Block | None:  # fmt: skip
-    """Draw responses `y` against the conditions `x` that vary; None if no condition varies.
-
-    statistics: whether the block contains medians of bins, and rank correlations
-    """
-    effects = estimate_effects(frame, x, y)
-    if not effects:
-        return None
-    columns = {quantity.title: quantity.values(frame) for quantity in (*x, *y)}
-    panels = {
-        (effect.condition, effect.response): (
-            (columns[effect.condition], columns[effect.response]),
-            (effect.centres, effect.medians) if statistics else ((), ()),
-        )
-        for effect in effects
-    }
-    texts_by_condition: dict[str, list[str]] = {}
-    for effect in effects:
-        texts_by_condition.setdefault(effect.condition, []).append(correlation_text(effect))
-    head = ["Rank correlation", *(response.title for response in y)]
-    grid = Grid(head, [[name, *cells] for name, cells in texts_by_condition.items()]) if statistics else None
-    figure = svg_figure(scatter_panels(panels, logarithmic=logarithmic), key, caption, wide=len(effects) > 1)
-    note = note or (
-        f"The intervals are at {format_fraction(CONFIDENCE)} confidence. A dash means that there are fewer than "
-        f"{MIN_CASES} cases or only one value."
-    )
-    return Block(
-        heading=heading,
-        figures=[figure],
-        grid=grid,
-        note=note,
-        data={"effects": [asdict(effect) for effect in effects]},
-    )
-
-
-def correlation_text(effect: Effect) -> str:
-    """Format a rank correlation with its interval; a dash for NaN."""
-    value, lower, upper = map(coefficient, (effect.rank_correlation, effect.lower, effect.upper))
-    return NOTHING if math.isnan(effect.rank_correlation) else f"{value} ({lower} to {upper})"

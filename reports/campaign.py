@@ -2,49 +2,44 @@
 
 import json
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.temporary_files import write_atomic
-from marsyard.reports import common_sections, explorer, page
+from marsyard.reports import case_tables, common_sections
 from marsyard.reports.boundary import boundary_section
-from marsyard.reports.budget import budget_section, budget_sentences
+from marsyard.reports.budget import budget_section
 from marsyard.reports.column_selection import primary_metric
-from marsyard.reports.column_values import numbers
 from marsyard.reports.comparison import comparison_section
 from marsyard.reports.conditions import conditions_section
 from marsyard.reports.consistency import consistency_section
 from marsyard.reports.convergence import convergence_section
 from marsyard.reports.driver_section import drivers_section
 from marsyard.reports.evaluation import Evaluation, evaluate_run
-from marsyard.reports.gallery import CASES_PER_GROUP, gallery_views
-from marsyard.reports.overall import OverallVerdict, multiplicity_text
+from marsyard.reports.junit import junit_xml
+from marsyard.reports.outcome_counts import outcome_counts
+from marsyard.reports.page_context import page_context
 from marsyard.reports.page_environment import page_environment
 from marsyard.reports.presentation import presentations
-from marsyard.reports.rare import rare_section, rare_sentences
-from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport, StudySummary
-from marsyard.reports.requirement_cases import CaseFinder
-from marsyard.reports.robustness import robustness_text
-from marsyard.reports.robustness_section import robust_sentences, robustness_section
-from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.search import search_section, search_sentences
-from marsyard.reports.section import Grid, Section, SectionMaker, Subject
+from marsyard.reports.rare import rare_section
+from marsyard.reports.report_file import PAGE_FILE, REPORT_JSON, SCHEMA, CampaignReport
+from marsyard.reports.robustness_section import robustness_section
+from marsyard.reports.robustness_sentences import robustness_text
+from marsyard.reports.search import search_section
+from marsyard.reports.section import Section, SectionMaker, Subject
 from marsyard.reports.signature import sign_report
-from marsyard.reports.stored import StoredRun, table
-from marsyard.reports.tables import error_summaries, outcome_counts, statistics_grid
-from marsyard.reports.traceability import junit_xml, read_algorithms, requirement_evidence, verification_csv
-from marsyard.reports.validity import validity_section
-from marsyard.reports.verdicts import Verdict
-from marsyard.reports.wording import count, label, number
+from marsyard.reports.study_sentences import describe_study
+from marsyard.reports.tables import error_summaries
+from marsyard.reports.tested_algorithms import read_algorithms
+from marsyard.reports.traceability import requirement_evidence, verification_csv
+from marsyard.reports.validity_section import validity_section
 
 #: Sections of every campaign, in the page's order; `conditions_section` ends the page.
 COMMON_SECTIONS: tuple[SectionMaker, ...] = (
@@ -119,114 +114,11 @@ def section_makers() -> list[SectionMaker]:
     return [*first_makers, *COMMON_SECTIONS, *system_makers, conditions_section]
 
 
-def page_context(
-    run: StoredRun, subject: Subject, verdicts: Sequence[Verdict], overall: OverallVerdict, extra: Sequence[Section]
-) -> dict[str, Any]:
-    """Create the context of the page's template; statistics use the cases of `subject`, other values all cases."""
-    metric, bound = subject.metric, subject.bound
-    crash_text = f"{count(overall.crashed, 'case')} crashed. Fix the cause before you use the verdict."
-    cautions = [crash_text] if overall.crashed else []
-    finder = CaseFinder(subject.run, verdicts)
-    gallery = gallery_views(run, finder.worst_violations(CASES_PER_GROUP))
-    context: dict[str, Any] = {
-        "run": run,
-        "description": str(run.recorded("description") or ""),
-        "study_sentences": study_sentences(run.record),
-        "overall_verdict": overall,
-        "cautions": [*cautions, *sampling_cautions(run, metric)],
-        "interrupted": run.recorded("state") not in (None, "finished"),
-        "verdicts": [page.verdict_row(verdict) for verdict in verdicts],
-        "multiplicity": multiplicity_text(verdicts),
-        "metric": metric,
-        "metric_label": "" if metric is None else label(metric),
-        "metric_title": "" if metric is None else label(metric)[:1].upper() + label(metric)[1:],
-        "bound": bound,
-        "extra_sections": extra,
-        "outcomes": page.outcome_grid(run.all_cases, str(run.definition.get("scenario") or "")),
-        "outcome_figures": page.outcome_figures(run.all_cases),
-        "crashed": page.crashed_rows(run),
-        "dispersions": page.dispersion_grid(subject.run),
-        "requirement_cases": finder.requirement_cases(),
-        "gallery": gallery,
-        "links": {case.case: f"#case-{case.case}" for case in gallery},
-        "summaries": {case.case: finder.summary(case.case) for case in gallery},
-        "provenance": page.list_provenance(run),
-        "versions": page.list_versions(run),
-        "definition": json.dumps(run.definition, indent=2, ensure_ascii=False, default=str),
-        "algorithms": read_algorithms(run.record),
-        "rerun": page.rerun_commands(run),
-        "rerun_is_stored": run.command is not None,
-        "replay": page.replay_command(run, "CASE"),
-        "gallery_command": shlex.join(["marsyard", "report", str(run.directory), "--gallery"]),
-    }
-    cases_with_images = [str(case.case) for case in gallery]
-    if metric is None:
-        empty_table = page.CaseTable((), ())
-        context |= {"error_figures": [], "driver_figures": [], "statistics": Grid((), ())}
-        return context | {"explorer": None, "worst": empty_table, "unanswered": empty_table}
-    context["explorer"], random_run = None, subject.run
-    if np.isfinite(numbers(random_run.frame, metric)).any():
-        data, script = (
-            explorer.explorer_data(random_run, metric, finder.explored_requirements(), cases_with_images),
-            explorer.read_script(),
-        )
-        content_hash = page.script_hash(script)
-        context["explorer"] = {"data": data, "json": page.embed_json(data), "script": script, "hash": content_hash}
-    return context | {
-        "error_figures": page.error_figures(random_run.frame, random_run.all_cases, metric, bound),
-        "driver_figures": page.driver_figures(random_run.frame, metric, bound, random_run.driver_columns(metric)),
-        "statistics": statistics_grid(random_run.all_cases, metric),
-        "worst": page.worst_cases(random_run, metric, cases_with_images),
-        "unanswered": page.unanswered_cases(random_run, metric, cases_with_images),
-    }
-
-
-def sampling_cautions(run: StoredRun, metric: str | None) -> list[str]:
-    """List warnings about the sampling: a design that is not random, plots of a part of the cases, a nominal case."""
-    sampling = read_sampling_design(run.definition)
-    cautions = []
-    if not sampling.independent and not run.recorded("study"):
-        cautions.append(
-            f"The cases are not independent random samples: {sampling.text}. Statistics describe these cases; "
-            "intervals, bounds and probabilities on this page assume independent samples and do not apply to them."
-        )
-    if run.is_truncated:
-        cautions.append(
-            f"Verdicts, outcomes, answers, statistics and convergence use all {len(run.all_cases):,} cases. Scatter "
-            f"plots, conditions and drivers use the first {len(run.frame):,} cases"
-            f"{', which are also a random sample' if sampling.independent else ''}."
-        )
-    nominal_rows = run.frame[run.frame["case"] == 0] if sampling.nominal and "case" in run.frame else run.frame[:0]
-    if len(nominal_rows):
-        nominal_text = str(nominal_rows["outcome"].iloc[0]) if "outcome" in nominal_rows else "stored"
-        if metric is not None:
-            nominal_text += f", {label(metric)} {number(float(numbers(nominal_rows, metric)[0]))}"
-        cautions.append(f"Case 0 is the nominal case ({nominal_text}). It is excluded from verdicts and statistics.")
-    return cautions
-
-
-def study_sentences(record: Mapping[str, Any]) -> list[str]:
-    """Describe the result of a study, the most important sentence first; empty for an ordinary campaign."""
-    sentences = (rare_sentences, search_sentences, budget_sentences, robust_sentences)
-    return [text for describe in sentences for text in describe(record)]
-
-
-def describe_study(record: Mapping[str, Any]) -> StudySummary | None:
-    """Return kind, requirement and main result of a study for `report.json`; None for an ordinary campaign."""
-    study, sentences = table(record.get("study")), study_sentences(record)
-    if not study:
-        return None
-    # the first sentence of a rare study is its verdict, the second the probability
-    main_sentences = sentences[1:2] if study.get("kind") == "rare" else sentences[:1]
-    sentence = "".join(main_sentences) or "The study is not finished."
-    return StudySummary(str(study.get("kind")), str(study.get("requirement") or ""), sentence)
-
-
 def build_report(evaluation: Evaluation, subject: Subject, extra_sections: Sequence[Section]) -> CampaignReport:
     """Create the record of `report.json`."""
     run, overall_verdict, metric = evaluation.run, evaluation.overall_verdict, subject.metric
     summaries = error_summaries(subject.all_cases, metric) if metric is not None else []
-    worst_rows = [] if metric is None else page.worst_cases(subject.run, metric).rows
+    worst_rows = [] if metric is None else case_tables.worst_cases(subject.run, metric).rows
     return CampaignReport(
         schema=SCHEMA,
         campaign=run.name,

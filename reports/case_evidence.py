@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from marsyard.reports.statistics.clusters import ClusteredCases
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
 
 Mask = Bool[np.ndarray, " n"]  #: Property of each case.
 Groups = Int[np.ndarray, " n"]  #: Index of each case's terrain, from 0.

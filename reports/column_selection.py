@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marsyard.reports.column_values import _is_number, numbers
+from marsyard.reports.column_values import is_number, numbers
 from marsyard.reports.statistics.drivers import rank_correlation
 from marsyard.scenarios.columns import split_unit
 
@@ -39,7 +39,7 @@ def primary_metric(frame: pd.DataFrame, requirements: Sequence[Mapping[str, Any]
     requirement_metrics = [str(requirement.get("metric", "")) for requirement in requirements]
     error_columns = [str(column) for column in frame.columns if "error_" in str(column) and split_unit(str(column))[1]]
     names = (*requirement_metrics, *error_columns)
-    return next((name for name in names if name in frame and _is_number(frame, name)), None)
+    return next((name for name in names if name in frame and is_number(frame, name)), None)
 
 
 def looks_like_condition(name: str) -> bool:
@@ -60,7 +60,7 @@ def driver_columns(
     candidates = [
         name
         for name in names
-        if name not in excluded_names and is_condition(name) and _is_number(frame, name) and frame[name].nunique() > 1
+        if name not in excluded_names and is_condition(name) and is_number(frame, name) and frame[name].nunique() > 1
     ]
     candidates = distinct_columns(frame, candidates)
     preferred_names = [name for prefix in _PREFERRED_DRIVERS for name in candidates if name.startswith(prefix)]

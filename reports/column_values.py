@@ -15,9 +15,10 @@ def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
 
 def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
     """Whether a column contains numbers of more than one value."""
-    return _is_number(frame, column) and frame[column].nunique() > 1
+    return is_number(frame, column) and frame[column].nunique() > 1
 
 
-def _is_number(frame: pd.DataFrame, column: str) -> bool:
+def is_number(frame: pd.DataFrame, column: str) -> bool:
+    """Whether a column contains numbers; flags are not numbers."""
     dtype = frame[column].dtype
     return pd.api.types.is_numeric_dtype(dtype) and not pd.api.types.is_bool_dtype(dtype)

@@ -6,14 +6,16 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool
 
-from marsyard.reports import rates
-from marsyard.reports.blocks import NO_FAULT, OutcomesBySize, Rows
+from marsyard.reports import populations, rates
+from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import ELLIPSE
+from marsyard.reports.outcomes_by_size import NO_FAULT, ExtraColumn, OutcomesBySize
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section
-from marsyard.reports.statistics.samples import circular_error, error_ellipse
+from marsyard.reports.statistics.ellipse import error_ellipse
+from marsyard.reports.statistics.error_summary import circular_error
 from marsyard.reports.wording import NOTHING, format_fraction, interval, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 from marsyard.scenarios.declared_columns import enabling_columns
@@ -46,14 +48,14 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
     Fractions that need other columns are omitted if the rows do not have them.
     """
     frame = subject.all_cases
-    if not rates.is_flag(frame, "answered") or frame.empty:
+    if not populations.is_flag(frame, "answered") or frame.empty:
         return {}
-    is_answered = rates.population_mask(frame, "valid")
+    is_answered = populations.population_mask(frame, "valid")
     fractions = {"answered (of all cases)": rates.fraction_of(is_answered, frame)}
     for column in enabling_columns(map(str, frame.columns)):
-        if not rates.is_flag(frame, column.name):
+        if not populations.is_flag(frame, column.name):
             continue
-        is_enabled, is_completed = (rates.population_mask(frame, name) for name in (column.name, "completed"))
+        is_enabled, is_completed = (populations.population_mask(frame, name) for name in (column.name, "completed"))
         fractions[f"answered, of cases {column.population}"] = rates.fraction_of(
             is_answered[is_enabled], frame[is_enabled]
         )
@@ -61,7 +63,7 @@ def answer_fractions(subject: Subject) -> Mapping[str, rates.CaseFraction]:
             ~is_enabled[is_completed], frame[is_completed]
         )
     if subject.metric is not None and subject.bound is not None:
-        is_wrong = ~rates.success_mask(frame[is_answered], subject.metric, subject.bound)
+        is_wrong = ~populations.success_mask(frame[is_answered], subject.metric, subject.bound)
         name = f"wrong answers: error above {subject.bound:g} {split_unit(subject.metric)[1]} (of answers)"
         fractions[name] = rates.fraction_of(is_wrong, frame[is_answered])
     return fractions
@@ -114,7 +116,7 @@ def scatter_section(subject: Subject) -> Section | None:
 
 def _classify_answers(rows: Rows, metric: str, bound: float) -> dict[str, Bool[np.ndarray, " n"]]:
     """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers."""
-    is_answered, is_correct = rates.population_mask(rows, "valid"), rates.success_mask(rows, metric, bound)
+    is_answered, is_correct = populations.population_mask(rows, "valid"), populations.success_mask(rows, metric, bound)
     return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
 
 
@@ -122,7 +124,7 @@ def find_frequent_refusal(rows: Rows) -> str:
     """Return the most frequent outcome of cases without an answer; empty if all cases have an answer."""
     if "outcome" not in rows:
         return ""
-    refusals = rows.loc[~rates.population_mask(rows, "valid"), "outcome"].value_counts()
+    refusals = rows.loc[~populations.population_mask(rows, "valid"), "outcome"].value_counts()
     return str(refusals.index[0]) if len(refusals) else ""
 
 
@@ -134,14 +136,16 @@ def fault_outcomes(metric: str, bound: float) -> OutcomesBySize:
         cases="Cases",
         wording=lambda fault, size: (label(fault), "" if math.isnan(size) or fault == NO_FAULT else f"{size:g}"),
         extra_columns=(
-            ("Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING),
+            ExtraColumn(
+                "Most frequent refusal", "most_frequent_refusal", find_frequent_refusal, lambda text: text or NOTHING
+            ),
         ),
     )
 
 
 def faults_section(subject: Subject) -> Section | None:
     """Create the section on outcomes by fault and size; None without faults or bound."""
-    if subject.metric is None or subject.bound is None or not rates.is_flag(subject.frame, "answered"):
+    if subject.metric is None or subject.bound is None or not populations.is_flag(subject.frame, "answered"):
         return None
     unit, confidence = split_unit(subject.metric)[1], format_fraction(CONFIDENCE)
     note = note_text("common.faults", bound=f"{subject.bound:g}", unit=unit, confidence=confidence)

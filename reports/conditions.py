@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool
-from scipy import stats
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.statistics.samples import quantile_bounds
+from marsyard.reports.terrain_variance import terrain_variance
 from marsyard.reports.wording import format_fraction, label, note_text, number, percent, plain_value
 from marsyard.scenarios.columns import split_unit
 
@@ -43,7 +43,7 @@ _TERRAINS_NOTE = note_text("common.terrains")
 def conditions_section(subject: Subject) -> Section | None:
     """Create the section on errors by condition; None without errors, answers or a condition that varies."""
     frame, metric = subject.frame, subject.metric
-    if metric is None or not rates.is_flag(frame, "answered"):
+    if metric is None or not populations.is_flag(frame, "answered"):
         return None
     tables = {
         column: [_summarize_bin(frame[mask], metric, name) for name, mask in bins]
@@ -97,44 +97,9 @@ def bin_conditions(
                 yield column, [(name, positions == index) for index, name in enumerate(names)]
 
 
-def terrain_variance(frame: pd.DataFrame, column: str) -> dict[str, Any] | None:
-    """Analyse the variance of an error column with terrains as random effects; None without repeated terrains.
-
-    Keys: `part` (the column), `terrains` (their number), `within_sd` of errors within a terrain, `between_sd` of the
-    terrains' means, `fraction` of the variance between terrains (intraclass correlation), `p_value` of equal means
-    (F-test).
-    """
-    groups = rates.terrain_groups(frame)
-    values = numbers(frame, column)
-    finite = np.isfinite(values) & rates.population_mask(frame, "valid")
-    if groups is None or not finite.any():
-        return None
-    _, index = np.unique(groups[finite], return_inverse=True)
-    errors, sizes = values[finite], np.bincount(index).astype(np.float64)
-    cases, terrains = errors.size, sizes.size
-    if terrains < 2 or cases == terrains:
-        return None
-    means = np.bincount(index, weights=errors) / sizes
-    # mean squares; the expectation of `between` is `within` + effective_size * (variance between terrains)
-    within = float(((errors - means[index]) ** 2).sum()) / (cases - terrains)
-    between = float((sizes * (means - errors.mean()) ** 2).sum()) / (terrains - 1)
-    # effective number of cases per terrain, for terrains with unequal numbers of cases
-    effective_size = (cases - float((sizes**2).sum()) / cases) / (terrains - 1)
-    variance_between = max(between - within, 0.0) / effective_size
-    p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
-    return {
-        "part": column,
-        "terrains": terrains,
-        "within_sd": float(np.sqrt(within)),
-        "between_sd": float(np.sqrt(variance_between)),
-        "fraction": variance_between / (variance_between + within) if variance_between + within > 0.0 else 0.0,
-        "p_value": p_value,
-    }
-
-
 def _summarize_bin(rows: pd.DataFrame, metric: str, name: str) -> dict[str, Any]:
     """Summarize a bin: answers, mean and SD of the signed errors, upper confidence bound of the 99 % quantile."""
-    is_answered = rates.population_mask(rows, "valid")
+    is_answered = populations.population_mask(rows, "valid")
     answered_rows = rows[is_answered]
     magnitude, groups = np.abs(numbers(answered_rows, metric)), rates.terrain_groups(answered_rows)
     finite = np.isfinite(magnitude)

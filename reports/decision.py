@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.bounds import Looks, add_clustered_bounds, add_independent_bounds
 from marsyard.reports.case_evidence import CaseEvidence, Mask, RequirementEvidence
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign
 from marsyard.reports.statistics import proportions
-from marsyard.reports.statistics.proportions import SequentialTest
+from marsyard.reports.statistics.sequential import SequentialTest
 from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, AllCases, Status, Verdict, min_cases_for_rate
 from marsyard.reports.wording import count
 
@@ -85,10 +85,10 @@ def requirement_masks(frame: pd.DataFrame, requirement: Mapping[str, Any]) -> tu
     if _describe_missing_column(frame, verdict):
         return None
     try:
-        member = rates.population_mask(frame, verdict.population)
+        member = populations.population_mask(frame, verdict.population)
     except ValueError:
         return None
-    return member, rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale)
+    return member, populations.success_mask(frame, verdict.metric, verdict.bound, verdict.scale)
 
 
 def collect_evidence(
@@ -103,7 +103,10 @@ def collect_evidence(
     if _describe_problem(frame, verdict):
         return None
     try:
-        masks = [mask(frame, verdict.population) for mask in (rates.population_mask, rates.population_mask_if_answered)]
+        masks = [
+            mask(frame, verdict.population)
+            for mask in (populations.population_mask, populations.population_mask_if_answered)
+        ]
     except ValueError:
         return None
     return RequirementEvidence(
@@ -115,8 +118,8 @@ def _case_evidence(
     verdict: Verdict, member: Mask, sampling: SamplingDesign, frame: pd.DataFrame, *, has_own_terrains: bool = True
 ) -> CaseEvidence:
     """Collect the results of all cases (`frame`) with regard to a population (`member`)."""
-    _, has_unknown_flag = rates.population_and_unknown_masks(frame, verdict.population.split(" and "))
-    success = rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag & member
+    _, has_unknown_flag = populations.population_and_unknown_masks(frame, verdict.population.split(" and "))
+    success = populations.success_mask(frame, verdict.metric, verdict.bound, verdict.scale) & ~has_unknown_flag & member
     in_first_look = sampling.mask_first_look(frame)
     if in_first_look is None:
         in_first_look = np.ones(member.size, dtype=np.bool_)
@@ -140,8 +143,8 @@ def _evaluate(
     if problem:
         return replace(verdict, reason=problem)
     try:
-        members = rates.population_mask(frame, verdict.population)
-        members_and_unfinished = rates.population_mask_if_answered(frame, verdict.population)
+        members = populations.population_mask(frame, verdict.population)
+        members_and_unfinished = populations.population_mask_if_answered(frame, verdict.population)
     except ValueError as error:
         text = str(error)
         return replace(verdict, reason=f"{text[:1].upper()}{text[1:]}.")
@@ -231,7 +234,7 @@ def _status_by_rate(rate: float, n: int, probability: float) -> Status:
 
 def _complete_columns(frame: pd.DataFrame, verdict: Verdict) -> pd.DataFrame:
     """Add the columns of a requirement that are missing because no case finished; their values are missing."""
-    if frame.empty or not rates.engine_failed(frame).all():
+    if frame.empty or not populations.engine_failed(frame).all():
         return frame
     flags = [name for name in verdict.population.split(" and ") if name not in ("all", "completed", "valid")]
     missing = [name for name in (*verdict.metric.split(" + "), *flags) if name not in frame]
@@ -252,7 +255,7 @@ def _describe_missing_column(frame: pd.DataFrame, verdict: Verdict) -> str:
     missing_column = next((part for part in verdict.metric.split(" + ") if part not in frame), None)
     if missing_column is not None:
         return f"The rows have no column '{missing_column}', which is the requirement's metric."
-    if not math.isfinite(verdict.bound) and not rates.is_flag(frame, verdict.metric):
+    if not math.isfinite(verdict.bound) and not populations.is_flag(frame, verdict.metric):
         return "The requirement has no bound, and its metric is not a column of true and false."
     return ""
 

@@ -40,8 +40,8 @@ _DENSITY = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
 _TAIL_NODE, _MAX_TAIL_FRACTION = 7.0, 0.01
 
 
-class Kind(StrEnum):
-    """Kind of a change, see above; VALUE: another value of a parameter that the campaign does not disperse."""
+class ChangeKind(StrEnum):
+    """ChangeKind of a change, see above; VALUE: another value of a parameter that the campaign does not disperse."""
 
     MEAN_UP = "mean up"
     MEAN_DOWN = "mean down"
@@ -61,7 +61,7 @@ class Change:
     - value: index of the value of `choice`
     """
 
-    kind: Kind
+    kind: ChangeKind
     sizes: Changes
     weights: Float64[np.ndarray, "changes n"]
     efficiency: Changes
@@ -79,7 +79,7 @@ def draw_coordinates(
 
 
 @dataclass(frozen=True)
-class Quantity:
+class DispersedQuantity:
     """A dispersion with its values at `_NODES`; empty for values without numbers (`choice`).
 
     is_absolute: whether mean and standard deviation are the same for all cases (no formula)
@@ -90,7 +90,7 @@ class Quantity:
     is_absolute: bool
 
     @classmethod
-    def of(cls, campaign: Campaign, path: str, case: int) -> Quantity:
+    def of(cls, campaign: Campaign, path: str, case: int) -> DispersedQuantity:
         """Create the quantity of a path. Formulas are evaluated for one case: relative sizes depend on it little."""
         dispersion = campaign.marginals[path]
         if isinstance(dispersion, Choice):
@@ -127,7 +127,7 @@ class Quantity:
         if not self.values.size:
             return change.sizes
         mean, deviation = self.declared
-        moves_mean = change.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN)
+        moves_mean = change.kind in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN)
         signed = change.sizes * sign_of(change.kind)
         moments = np.array(
             [self.moments(size, 1.0) if moves_mean else self.moments(0.0, 1.0 + size) for size in signed]
@@ -138,9 +138,9 @@ class Quantity:
         return sizes / deviation if (np.diff(sizes) > 0.0).all() else None
 
 
-def sign_of(kind: Kind) -> float:
+def sign_of(kind: ChangeKind) -> float:
     """Return the sign of a change of mean, standard deviation or probability."""
-    return -1.0 if kind in (Kind.MEAN_DOWN, Kind.NARROWER) else 1.0
+    return -1.0 if kind in (ChangeKind.MEAN_DOWN, ChangeKind.NARROWER) else 1.0
 
 
 def list_changes(dispersion: Any, z: Float64[np.ndarray, " n"]) -> Iterator[Change]:
@@ -157,15 +157,15 @@ def list_changes(dispersion: Any, z: Float64[np.ndarray, " n"]) -> Iterator[Chan
             # E w^2 = (1 - a)^2 + 2 a (1 - a) + a^2 / P
             efficiency = 1.0 / (1.0 - steps**2 + steps**2 / probability)
             sizes = steps * math.sqrt((1.0 - probability) / probability)
-            yield Change(Kind.MORE_FREQUENT, sizes, weights, efficiency, others + ratio, index)
+            yield Change(ChangeKind.MORE_FREQUENT, sizes, weights, efficiency, others + ratio, index)
         return
     shifts = steps * math.sqrt(-math.log(fraction))
-    for kind, sign in ((Kind.MEAN_UP, 1.0), (Kind.MEAN_DOWN, -1.0)):
+    for kind, sign in ((ChangeKind.MEAN_UP, 1.0), (ChangeKind.MEAN_DOWN, -1.0)):
         weights = np.exp(sign * shifts[:, None] * z - 0.5 * shifts[:, None] ** 2)
         yield Change(kind, shifts, weights, np.exp(-(shifts**2)))
     # E w^2 = 1 / (s sqrt(2 - s^2)), infinite from s^2 = 2
     root = math.sqrt(1.0 - fraction**2)
-    for kind, limit in ((Kind.WIDER, math.sqrt(1.0 + root)), (Kind.NARROWER, math.sqrt(1.0 - root))):
+    for kind, limit in ((ChangeKind.WIDER, math.sqrt(1.0 + root)), (ChangeKind.NARROWER, math.sqrt(1.0 - root))):
         scales = 1.0 + steps * (limit - 1.0)
         weights = np.exp(0.5 * z**2 * (1.0 - scales[:, None] ** -2)) / scales[:, None]
         yield Change(kind, np.abs(scales - 1.0), weights, scales * np.sqrt(np.maximum(2.0 - scales**2, 0.0)))

@@ -2,24 +2,31 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.column_selection import driver_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
-from marsyard.reports.statistics.changes import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
+from marsyard.reports.statistics.multiple_tests import correct_holm
 from marsyard.reports.wording import coefficient, format_fraction, label, note_text, p_text, percent
 
 #: Maximum number of ranked conditions, and of cases that are used for the ranking.
 MAX_CONDITIONS, MAX_CASES = 12, 20_000
-#: Column, statistics and corrected p-value of each driver.
-RankedDrivers = Sequence[tuple[str, Driver, float]]
+
+
+class RankedDriver(NamedTuple):
+    """A condition (a column of the rows) with its effect, and the p-value corrected for the number of conditions."""
+
+    column: str
+    driver: Driver
+    p_value: float
 
 
 def drivers_section(subject: Subject) -> Section | None:
@@ -30,7 +37,7 @@ def drivers_section(subject: Subject) -> Section | None:
     frame = subject.frame.head(MAX_CASES)
     responses = {"the size of errors": np.abs(numbers(frame, metric))}
     if subject.bound is not None:
-        responses["failures"] = (~rates.success_mask(frame, metric, subject.bound)).astype(np.float64)
+        responses["failures"] = (~populations.success_mask(frame, metric, subject.bound)).astype(np.float64)
     columns = driver_columns(frame, metric, MAX_CONDITIONS, subject.run.is_condition)
     ranked_drivers = {
         name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
@@ -56,7 +63,7 @@ def drivers_section(subject: Subject) -> Section | None:
     return Section("explained", "Influences", title, [*blocks, Block(note=note)], data)
 
 
-def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np.ndarray, " n"]) -> RankedDrivers:
+def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np.ndarray, " n"]) -> list[RankedDriver]:
     """Rank columns by the fraction of a response's variance that they explain, largest first; correct the p-values."""
     groups = rates.terrain_groups(frame)
     drivers: Mapping[str, Driver] = {
@@ -66,4 +73,4 @@ def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np
     }
     p_values = dict(zip(drivers, correct_holm([driver.p_value for driver in drivers.values()]), strict=True))
     order = sorted(drivers, key=lambda column: (-drivers[column].fraction, column))
-    return [(column, drivers[column], p_values[column]) for column in order]
+    return [RankedDriver(column, drivers[column], p_values[column]) for column in order]

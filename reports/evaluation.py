@@ -1,4 +1,4 @@
-"""Evaluation of a stored campaign: overall verdict, exit status, and the next evaluation of a sequential campaign.
+"""Evaluation of a stored campaign: verdicts, overall verdict, and exit status.
 
 A study is a run of `marsyard rare`, `search`, `budget` or `robust`; its verdict does not follow from success rates.
 """
@@ -12,17 +12,14 @@ from typing import Any
 
 import pandas as pd
 
-from marsyard.campaigns.definition.claims import requirement_key
 from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind
-from marsyard.campaigns.store.confirmations import add_result
 from marsyard.campaigns.studies.results import BUDGET, RARE, ROBUST, SEARCH
 from marsyard.reports.decision import collect_evidence, evaluate_requirements
 from marsyard.reports.joint import JointEvidence, describe_contribution, qualify_verdict, read_joint_evidence
 from marsyard.reports.overall import QUALIFIED_EXIT_CODE, OverallVerdict, combine_verdicts, compute_exit_code
-from marsyard.reports.rates import engine_failed
+from marsyard.reports.populations import engine_failed
 from marsyard.reports.robustness import Robustness, evaluate_robustness
 from marsyard.reports.sampling_design import SamplingDesign, read_sampling_design
-from marsyard.reports.statistics.proportions import confidence_at, planned_looks, proportion_lower, proportion_upper
 from marsyard.reports.stored import StoredRun, read_columns, read_run, table
 from marsyard.reports.validity import Validity, assess_validity
 from marsyard.reports.variants import (
@@ -32,7 +29,7 @@ from marsyard.reports.variants import (
     evaluate_variants,
     read_robust_studies,
 )
-from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
+from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count
 
 #: Headline of a study that decides no requirement.
@@ -191,44 +188,3 @@ def withhold_verdict(verdict: Verdict, evidence: Evidence) -> Verdict:
         return replace(verdict, additional_cases=None)
     reason = f"The verdict would be {verdict.status}. {evidence.text}"
     return replace(verdict.withhold(reason), withheld_status=verdict.status)
-
-
-def record_look(evaluation: Evaluation) -> None:
-    """Append the result of a finished confirmation to its record, if the record contains the run."""
-    evidence, run = evaluation.evidence, evaluation.run
-    if evidence.kind is not EvidenceKind.CONFIRMATION:
-        return
-    own = read_joint_evidence(evidence).own
-    if own is None:  # stated in the verdict
-        return
-    design, counts = evaluation.sampling.with_open_end, {}
-    for requirement in run.requirements:
-        part = collect_evidence(run.all_cases, requirement, design, has_own_terrains=bool(own.bank_seeds))
-        if part is not None:
-            counts[requirement_key(requirement)] = part.to_table()
-    results = {verdict.requirement_id: str(verdict.status) for verdict in evaluation.verdicts}
-    add_result(evidence, len(run.all_cases), results, counts)
-
-
-def next_look(verdicts: Sequence[Verdict], sampling: SamplingDesign, cases: int) -> int | None:
-    """Return the number of cases at the next look (planned evaluation); None if the campaign may stop.
-
-    The campaign may stop if every requirement is decided or can no longer be decided by the remaining cases.
-    Requirements that are evaluated by the observed rate (`decide_by = "estimate"`) are ignored.
-    """
-    if sampling.max_cases is None or cases >= sampling.max_cases:
-        return None
-    remaining = sampling.max_cases - cases
-    risk_fraction = planned_looks(sampling.max_cases)[-1].risk_fraction
-    for verdict in verdicts:
-        if verdict.status is not Status.INSUFFICIENT or verdict.decide_by == ESTIMATE:
-            continue
-        if not 0.0 < verdict.probability < 1.0 or not 0.0 < verdict.confidence < 1.0:
-            continue
-        confidence = confidence_at(verdict.confidence, risk_fraction)
-        successes, n = verdict.n - verdict.failures, verdict.n + remaining
-        # bounds for independent cases; bounds for shared terrains are not tighter
-        can_pass = proportion_lower(successes + remaining, n, confidence) >= verdict.probability
-        if can_pass or proportion_upper(successes, n, confidence) < verdict.probability:
-            return next(look.cases for look in planned_looks(sampling.max_cases) if look.cases > cases)
-    return None

@@ -14,8 +14,8 @@ from markupsafe import Markup
 
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import is_varying_number, numbers
-from marsyard.reports.page import replay_command
-from marsyard.reports.rates import engine_failed
+from marsyard.reports.populations import engine_failed
+from marsyard.reports.provenance import replay_command
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.wording import label
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from marsyard.reports.blocks import Rows
-from marsyard.reports.rates import all_flags, finite_values, flag_fraction, fraction_text, median_text
+from marsyard.reports.populations import all_flags
+from marsyard.reports.rates import finite_values, flag_fraction, fraction_text, median_text
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section
 from marsyard.reports.wording import NOTHING
 

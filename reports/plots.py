@@ -23,7 +23,6 @@ Values = Float[np.ndarray, " n"]
 _LINES = ("-", "--", ":", "-.")
 
 
-@in_page_style
 def axis_edge(magnitudes: Float[np.ndarray, " n"], bound: float | None) -> float:
     """Compute the end of an axis of magnitudes: the maximum, limited to 1.1 to 3 times the bound.
 

@@ -1,80 +1,18 @@
-"""Boolean masks of populations (subsets of a campaign's cases), rates with confidence intervals, and their texts."""
+"""Rates and statistics of rows: fractions with confidence intervals, pooled rates, quantiles, and their texts."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.reports.column_values import numbers
-from marsyard.reports.statistics.clusters import ClusteredCases
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.proportions import Interval, proportion_interval
 from marsyard.reports.statistics.samples import is_interpolated
 from marsyard.reports.wording import NOTHING, number, percent
-
-
-def success_mask(frame: pd.DataFrame, metric: str, bound: float, scale: float = 1.0) -> Bool[np.ndarray, " n"]:
-    """Create the mask of the cases with |scale * metric| <= bound, or with a true metric if the bound is NaN.
-
-    Cases with a missing value and unfinished cases are failures. A metric may be a sum of columns, joined by " + ".
-    """
-    is_finished = ~engine_failed(frame)
-    if math.isnan(bound):
-        return np.asarray(flag_mask(frame, metric) & is_finished, dtype=np.bool_)
-    values = sum((numbers(frame, column) for column in metric.split(" + ")), np.zeros(len(frame)))
-    return np.asarray((np.abs(scale * values) <= bound) & is_finished, dtype=np.bool_)
-
-
-def population_mask(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Create the mask of a population: `all`, `completed`, `valid`, a flag column, or several joined by " and ".
-
-    A case with a missing flag, such as a crashed case, belongs to the population. Raises ValueError without the column.
-    """
-    return population_and_unknown_masks(frame, population.split(" and "))[0]
-
-
-def population_and_unknown_masks(
-    frame: pd.DataFrame, populations: Sequence[str]
-) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Create the masks of the intersection of populations, and of its cases with a missing flag."""
-    is_member, is_unknown = np.ones(len(frame), dtype=np.bool_), np.zeros(len(frame), dtype=np.bool_)
-    for population in populations:
-        if population == "completed":
-            is_member &= ~engine_failed(frame)
-        elif population != "all":
-            column = "answered" if population == "valid" else population
-            if not is_flag(frame, column):
-                raise ValueError(f"the rows have no column '{column}' of true and false, which defines a population")
-            is_missing = frame[column].isna().to_numpy(dtype=np.bool_)
-            is_member &= flag_mask(frame, column) | is_missing
-            is_unknown |= is_missing
-    return is_member, is_member & is_unknown
-
-
-def is_flag(frame: pd.DataFrame, column: str) -> bool:
-    """Whether a column exists and contains only true, false and missing values."""
-    return column in frame and all(isinstance(value, bool | np.bool_) for value in frame[column].dropna().unique())
-
-
-def engine_failed(frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Create the mask of the cases that the engine could not finish."""
-    if "outcome" not in frame:
-        return np.zeros(len(frame), dtype=np.bool_)
-    return frame["outcome"].isin(ENGINE_FAILURES).to_numpy(dtype=np.bool_)
-
-
-def population_mask_if_answered(frame: pd.DataFrame, population: str) -> Bool[np.ndarray, " n"]:
-    """Create the mask of a population, extended by the unfinished cases that would belong to it with a valid answer.
-
-    The populations `valid` and `completed` exclude unfinished cases; here only the other flags decide for such cases.
-    """
-    flags = [name for name in population.split(" and ") if name not in ("valid", "completed")]
-    return np.asarray(
-        population_mask(frame, population) | (population_and_unknown_masks(frame, flags)[0] & engine_failed(frame))
-    )
 
 
 def terrain_groups(frame: pd.DataFrame) -> Int[np.ndarray, " n"] | None:
@@ -190,19 +128,6 @@ def percentile_interval(resampled: Float[np.ndarray, " b"]) -> Interval:
     """Compute the two-sided percentile interval of a resampled statistic."""
     low, high = np.quantile(resampled, (0.5 * (1.0 - CONFIDENCE), 0.5 * (1.0 + CONFIDENCE)))
     return float(low), float(high)
-
-
-def flag_mask(frame: pd.DataFrame, name: str) -> Bool[np.ndarray, " n"]:
-    """Create the mask of the true values of a column; missing values are false."""
-    if not is_flag(frame, name):
-        return np.zeros(len(frame), dtype=np.bool_)
-    return np.asarray(frame[name].eq(True).fillna(False).to_numpy(dtype=np.bool_))
-
-
-def all_flags(frame: pd.DataFrame, *names: str) -> Bool[np.ndarray, " n"]:
-    """Create the mask of the rows in which all flags are true; names that are not flag columns are ignored."""
-    masks = [flag_mask(frame, name) for name in names if is_flag(frame, name)]
-    return np.asarray(np.logical_and.reduce([np.ones(len(frame), dtype=np.bool_), *masks]))
 
 
 def finite_values(frame: pd.DataFrame, column: str, scale: float = 1.0) -> Float[np.ndarray, " n"]:

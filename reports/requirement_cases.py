@@ -1,7 +1,6 @@
 """Cases of each requirement: the violations first, then the cases nearest to the limit, each with its cause.
 
-The margin of a case is that of `marsyard.campaigns.definition.margins`: negative for a violation, infinite outside the
-population. A driver is a condition that may affect the metric.
+A driver is a condition that may affect the metric.
 """
 
 import math
@@ -11,17 +10,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pandas as pd
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
-from marsyard.reports import rates
+from marsyard.reports.case_margins import compute_margins
+from marsyard.reports.cell_values import to_float
 from marsyard.reports.column_values import numbers
 from marsyard.reports.explorer import ExploredRequirement, ExploredStatus
 from marsyard.reports.presentation import Cause, system_presentation
-from marsyard.reports.products import thumbnail, to_float
 from marsyard.reports.section import Grid, build_grid
 from marsyard.reports.stored import StoredRun
+from marsyard.reports.thumbnails import thumbnail
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import NOTHING, count, label, number, percent
 from marsyard.scenarios.columns import split_unit
@@ -327,39 +326,6 @@ class CaseFinder:
                 "Example": lambda entry: f"case {examples[entry[0]]}",
             },
         )
-
-
-def compute_margins(
-    frame: pd.DataFrame, verdict: Verdict, margin_column: str | None = None
-) -> Float[np.ndarray, " n"] | None:
-    """Compute the margin of each row; None if the rows lack a column of the requirement.
-
-    The result equals `marsyard.campaigns.definition.margins.compute_margin` of each row.
-    """
-    columns = verdict.metric.split(" + ") if math.isfinite(verdict.bound) else [verdict.metric]
-    if any(column not in frame for column in columns):
-        return None
-    is_met = rates.success_mask(frame, verdict.metric, verdict.bound, verdict.scale)
-    if math.isfinite(verdict.bound):
-        values = np.sum([numbers(frame, column) for column in columns], axis=0)
-        margins = verdict.bound - np.abs(verdict.scale * values)
-    else:
-        graded = numbers(frame, margin_column) if margin_column else np.full(len(frame), np.nan)
-        limited = np.where(is_met, np.maximum(graded, 0.0), np.minimum(graded, -1e-12))
-        margins = np.where(np.isnan(graded), np.where(is_met, 1.0, -1.0), limited)
-    try:
-        is_member, is_unknown = _population_masks(frame, verdict.population)
-    except ValueError:
-        return None
-    margins = np.where(np.isnan(margins) | is_unknown, -np.inf, margins)
-    return np.where(rates.engine_failed(frame), -np.inf, np.where(is_member, margins, np.inf))
-
-
-def _population_masks(frame: pd.DataFrame, population: str) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return the masks of a population and of its cases with a missing flag, regardless of unfinished cases."""
-    return rates.population_and_unknown_masks(
-        frame, [name for name in population.split(" and ") if name != "completed"]
-    )
 
 
 def _describe_margin(item: _Evaluated, margin: float) -> tuple[str, str]:

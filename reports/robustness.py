@@ -24,7 +24,6 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from scipy.special import rel_entr
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import CampaignDefinition
@@ -32,19 +31,26 @@ from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.sampling.dispersions import Choice
 from marsyard.reports.case_evidence import CaseEvidence
 from marsyard.reports.decision import collect_evidence
-from marsyard.reports.dispersion_changes import Change, Kind, Quantity, draw_coordinates, list_changes, sign_of
+from marsyard.reports.dispersion_changes import (
+    Change,
+    ChangeKind,
+    DispersedQuantity,
+    draw_coordinates,
+    list_changes,
+    sign_of,
+)
 from marsyard.reports.sampling_design import SamplingDesign
-from marsyard.reports.statistics.weighted import Crossing, WeightedRates, find_crossing, weighted_rates
+from marsyard.reports.statistics.crossing import Crossing, find_crossing
+from marsyard.reports.statistics.divergence import population_divergence
+from marsyard.reports.statistics.weighted import WeightedRates, weighted_rates
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import ESTIMATE, Verdict
-from marsyard.reports.wording import format_fraction, number, percent
+from marsyard.reports.wording import number, percent
 from marsyard.scenarios.columns import split_unit, to_words
 
 if TYPE_CHECKING:
     from marsyard.scenarios.interface import Scenario
 
-#: Statements hold for each change, but not for several at once.
-_ONE = "one change at a time"
 #: Name of the parameter of a change of all dispersions at once.
 ALL_DISPERSIONS = "all dispersions"
 
@@ -85,7 +91,7 @@ class Robustness:
 
     requirement: str
     parameter: str
-    kind: Kind
+    kind: ChangeKind
     unit: str
     assumed: Number
     spread: Number
@@ -104,16 +110,16 @@ class Robustness:
     def name(self) -> str:
         """The quantity that changes, in words."""
         words = f"{to_words(split_unit(self.parameter)[0])}{f' = {self.value}' if self.value else ''}"
-        if self.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN):
+        if self.kind in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN):
             return f"mean of {words}"
-        return f"standard deviation of {words}" if self.kind in (Kind.WIDER, Kind.NARROWER) else words
+        return f"standard deviation of {words}" if self.kind in (ChangeKind.WIDER, ChangeKind.NARROWER) else words
 
     def format_value(self, value: float, change: float) -> str:
         """Format the quantity after a change, or the change in assumed spreads if the quantity has no number."""
-        if self.kind is Kind.MORE_FREQUENT:
+        if self.kind is ChangeKind.MORE_FREQUENT:
             return percent(value)
-        if math.isnan(value) or self.kind is Kind.DIVERGENCE:
-            sign = "−" if self.kind in (Kind.MEAN_DOWN, Kind.NARROWER) else "+"
+        if math.isnan(value) or self.kind is ChangeKind.DIVERGENCE:
+            sign = "−" if self.kind in (ChangeKind.MEAN_DOWN, ChangeKind.NARROWER) else "+"
             return f"{sign}{number(change)} spreads"
         return f"{number(value)} {self.unit}".rstrip()
 
@@ -134,7 +140,7 @@ class Robustness:
         return self._describe(self.fails_at, self.change, f"PASS {passes}")
 
     def _describe(self, value: float, change: float, addition: str = "") -> str:
-        if self.kind is Kind.DIVERGENCE:
+        if self.kind is ChangeKind.DIVERGENCE:
             return f"any change of {self.name} up to a divergence of {number(value)} nat"
         assumed = "" if math.isnan(self.assumed) else f"{self.format_value(self.assumed, 0.0)} assumed"
         notes = "; ".join(filter(None, (assumed, addition)))
@@ -165,7 +171,7 @@ def evaluate_robustness(
         case_numbers = frame["case"].to_numpy(dtype=np.int64)
         coordinates = draw_coordinates(campaign, case_numbers)
         for index, path in enumerate(campaign.drawn_paths):
-            quantity = Quantity.of(campaign, path, int(case_numbers[0]))
+            quantity = DispersedQuantity.of(campaign, path, int(case_numbers[0]))
             for change in list_changes(quantity.dispersion, coordinates[:, index]):
                 if (sizes := quantity.sizes(change)) is not None:
                     scaled = replace(change, sizes=sizes)
@@ -184,8 +190,8 @@ def select_met(verdicts: Sequence[Verdict]) -> list[Verdict]:
 
 def sort_key(item: Robustness) -> tuple[int, float]:
     """Sort changes of parameters that show FAIL first, by their size, then the others by that for which PASS holds."""
-    if item.fail_text or item.kind is Kind.VALUE:
-        return 0 if item.kind is Kind.VALUE else 1, item.change
+    if item.fail_text or item.kind is ChangeKind.VALUE:
+        return 0 if item.kind is ChangeKind.VALUE else 1, item.change
     sizes = (size for size in (item.lower, item.change, math.inf) if not math.isnan(size))
     return 2, next(sizes)
 
@@ -228,7 +234,9 @@ def change_rates(verdict: Verdict, cases: CaseEvidence, change: Change) -> Weigh
     )
 
 
-def _find_change(path: str, quantity: Quantity, change: Change, verdict: Verdict, cases: CaseEvidence) -> Robustness:
+def _find_change(
+    path: str, quantity: DispersedQuantity, change: Change, verdict: Verdict, cases: CaseEvidence
+) -> Robustness:
     """Find the smallest change of one kind of a dispersion that turns PASS into FAIL."""
     rates, by_rate = change_rates(verdict, cases, change), verdict.decide_by == ESTIMATE
     crossing = find_crossing(change.sizes, rates, 1.0 - verdict.probability, decides_by_rate=by_rate)
@@ -239,7 +247,7 @@ def _find_change(path: str, quantity: Quantity, change: Change, verdict: Verdict
         spread = math.sqrt(assumed * (1.0 - assumed))
     else:
         mean, spread = quantity.declared if quantity.is_absolute else (math.nan, math.nan)
-        assumed = mean if change.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN) else spread
+        assumed = mean if change.kind in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN) else spread
     step = sign_of(change.kind) * spread
     is_complete = is_choice and crossing.reach == float(change.sizes[-1])
     return Robustness(
@@ -258,27 +266,9 @@ def _find_change(path: str, quantity: Quantity, change: Change, verdict: Verdict
     )
 
 
-def binary_divergence(rate: float, reference: float) -> float:
-    """Compute the Kullback-Leibler divergence of two binary distributions, rate > reference; 0 for other rates."""
-    if math.isnan(reference):
-        return math.nan
-    return 0.0 if rate <= reference else float(rel_entr(rate, reference) + rel_entr(1.0 - rate, 1.0 - reference))
-
-
-def population_divergence(rate: float, reference: float, member_rate: float) -> float:
-    """Compute the smallest divergence of the distribution of all cases that changes the failure rate of a population.
-
-    - rate, reference: failure rates in the population after and before the change
-    - member_rate: fraction of all cases that belong to the population, before the change
-    """
-    divergence = binary_divergence(rate, reference)
-    is_bounded = math.isfinite(divergence) and member_rate < 1.0
-    return -math.log1p(member_rate * math.expm1(-divergence)) if is_bounded else divergence
-
-
 def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:
     """Find the divergence of all dispersions that turns PASS into FAIL, from the bounds without a change."""
-    none = Change(Kind.DIVERGENCE, np.zeros(1), np.ones((1, cases.member.size)), np.ones(1))
+    none = Change(ChangeKind.DIVERGENCE, np.zeros(1), np.ones((1, cases.member.size)), np.ones(1))
     rates, permitted = change_rates(verdict, cases, none), 1.0 - verdict.probability
     groups = cases.groups if cases.clustered else None
     # rate of the population among all cases, of which each bound is the worse one
@@ -293,58 +283,7 @@ def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:
     crossing = Crossing(change, lower, upper, math.nan, float(rates.effective_units[0]))
     outcome = Outcome.of(crossing, is_complete=False)
     return Robustness(
-        verdict.requirement_id, ALL_DISPERSIONS, Kind.DIVERGENCE, "nat", assumed=0.0, spread=1.0,
+        verdict.requirement_id, ALL_DISPERSIONS, ChangeKind.DIVERGENCE, "nat", assumed=0.0, spread=1.0,
         passes_at=0.5 * lower**2, fails_at=0.5 * change**2, confidence=verdict.confidence, outcome=outcome,
         **asdict(crossing),
     )  # fmt: skip
-
-
-def reach_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
-    """Describe the smallest change of one distribution up to which a verdict is met; empty if it is not, or unknown."""
-    changes = [
-        item
-        for item in records
-        if item.requirement == verdict.requirement_id and item.kind not in (Kind.DIVERGENCE, Kind.VALUE)
-    ]
-    # unknown changes (NaN) of an evaluation by rate are larger than those of others
-    known = [item for item in changes if item.lower > 0.0]
-    if not known or not verdict.status.is_met:
-        return ""
-    nearest = min(known, key=lambda item: item.lower)
-    return f"holds up to {number(nearest.lower)} spreads ({nearest.name}, {nearest.kind})"
-
-
-def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes: int = 3) -> str:
-    """Describe how far the PASS of a requirement reaches, and the nearest changes to FAIL; empty without records."""
-    own = [item for item in records if item.requirement == verdict.requirement_id]
-    if not own:
-        return ""
-    shifts = [item.lower for item in own if item.kind in (Kind.MEAN_UP, Kind.MEAN_DOWN) and item.lower > 0.0]
-    factors = [item.lower for item in own if item.kind is Kind.WIDER and item.lower > 0.0]
-    ball = next(item for item in own if item.kind is Kind.DIVERGENCE)
-    ranges = [f"for a shift of any mean by {number(min(shifts))} standard deviations"] if shifts else []
-    ranges += [f"for any standard deviation up to + {percent(min(factors))}"] if factors else []
-    if ball.lower > 0.0:
-        ranges.append(f"for any change of all dispersions up to a divergence of {number(ball.passes_at)} nat")
-    nearest: dict[str, Robustness] = {}
-    for item in sorted(own, key=sort_key):
-        if item.fail_text and item is not ball:
-            nearest.setdefault(item.parameter, item)
-    changes = "; ".join(item.fail_text for item in [*nearest.values()][:max_changes])
-    by_rate = verdict.decide_by == ESTIMATE
-    # a calibration excludes PASS
-    word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"
-    confidence = f"{format_fraction(verdict.confidence)} confidence"
-    word = f"Met by the rate (no confidence, {_ONE})" if by_rate else f"{word} ({confidence}, {_ONE})"
-    none = "These cases do not show PASS."
-    if verdict.status.is_met:
-        none = f"The cases are too few to state how far PASS reaches (effective number: {ball.effective_cases:.0f})."
-    reach = f"{word} {', '.join(ranges)}." if ranges else none
-    examined = sum(item.kind not in (Kind.DIVERGENCE, Kind.VALUE) for item in own)
-    by_chance = math.floor(examined * (1.0 - verdict.confidence) + 1e-9)
-    chance = (
-        f" (of {examined} examined, of which at most {by_chance} appear by chance on average)"
-        if by_chance and changes
-        else ""
-    )
-    return f"{reach} Nearest changes to FAIL{chance}: {changes or 'unknown, because too few cases fail'}."

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from marsyard.campaigns.studies.results import ROBUST
-from marsyard.reports.dispersion_changes import Kind
+from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.figure_style import MARKERS, MUTED, SERIES, in_page_style, new_axes
 from marsyard.reports.robustness import ALL_DISPERSIONS, Outcome, Robustness, sort_key
 from marsyard.reports.section import Block, Grid, Section, svg_figure
@@ -21,7 +21,12 @@ from marsyard.reports.wording import NOTHING, count, note_text, number, percent
 
 #: Maximum number of rows of the table of a requirement, and of parameters in the figure.
 _MAX_ROWS, _MAX_PARAMETERS = 12, 16
-_DIRECTIONS = {Kind.MEAN_UP: ", up", Kind.MEAN_DOWN: ", down", Kind.WIDER: ", up", Kind.NARROWER: ", down"}
+_DIRECTIONS = {
+    ChangeKind.MEAN_UP: ", up",
+    ChangeKind.MEAN_DOWN: ", down",
+    ChangeKind.WIDER: ", up",
+    ChangeKind.NARROWER: ", down",
+}
 _OUTCOMES: Mapping[Outcome, str] = {Outcome.FOUND: "", Outcome.REFUSED: "unknown beyond", Outcome.NONE: "none up to"}
 
 
@@ -46,7 +51,7 @@ def change_grid(records: Sequence[Robustness]) -> Grid:
     rows = [
         [
             f"{item.name}{_DIRECTIONS.get(item.kind, '')}",
-            NOTHING if item.kind is Kind.DIVERGENCE else item.format_value(item.assumed, 0.0),
+            NOTHING if item.kind is ChangeKind.DIVERGENCE else item.format_value(item.assumed, 0.0),
             NOTHING if math.isnan(item.lower) else item.format_value(item.passes_at, item.lower),
             item.format_value(item.fails_at, item.change) if item.outcome is Outcome.FOUND else _OUTCOMES[item.outcome],
             number(item.change) if item.outcome is Outcome.FOUND else f"> {number(item.reach)}",
@@ -84,7 +89,7 @@ def _verdict_text(item: VariantVerdict | None) -> str:
 def _draw(records: Sequence[Robustness]) -> Figure:
     """Draw the changes of parameters for each requirement, in assumed spreads; those to FAIL are first."""
     drawn = {(item.parameter, item.value, item.kind, item.requirement): item for item in records}
-    ordered = sorted(records, key=lambda item: (item.kind is not Kind.DIVERGENCE, *sort_key(item)))
+    ordered = sorted(records, key=lambda item: (item.kind is not ChangeKind.DIVERGENCE, *sort_key(item)))
     keys = list(dict.fromkeys((item.parameter, item.value, item.kind) for item in ordered))[:_MAX_PARAMETERS]
     requirements = list(dict.fromkeys(item.requirement for item in records))
     figure, axes = new_axes(8.6, 1.3 + 0.36 * len(keys))

@@ -17,7 +17,6 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from marsyard.reports.section import Block, Grid, Section, Subject
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.validation_rows import (
     QUANTITIES,
@@ -27,12 +26,12 @@ from marsyard.reports.validation_rows import (
     merge_ranges,
     rows_of_system,
 )
-from marsyard.reports.wording import NOTHING, count, note_text, percent
+from marsyard.reports.wording import count, percent
 from marsyard.scenarios.imports import import_object
 from marsyard.scenarios.systems import System, find_system
 
 #: Kinds of rows that define each domain, and its description.
-_DOMAINS: Mapping[str, tuple[tuple[RowKind, ...], str]] = {
+DOMAINS: Mapping[str, tuple[tuple[RowKind, ...], str]] = {
     "verification": ((RowKind.VERIFICATION,), "with independent calculations"),
     "comparison": ((RowKind.VALIDATION, RowKind.FIT), "with flight or test data"),
 }
@@ -88,7 +87,7 @@ class Validity:
         return [*texts, *(f"Missed check ({item.kind}): {item.text}." for item in self.missed)]
 
     def _describe(self, domain: Domain) -> str:
-        description = _DOMAINS[domain.kind][1]
+        description = DOMAINS[domain.kind][1]
         if all(item.checked is None for item in domain.coverage):
             return f"No check compares the simulation of this system {description}."
         parts = []
@@ -111,7 +110,7 @@ def assess_validity(run: StoredRun) -> Validity:
     values = {name: list(_read_values(run, system, items)) for name, items in system.conditions.items()}
     domains = tuple(
         _compare(kind, values, [row for row in rows if row.kind in kinds and row.is_met], len(frame))
-        for kind, (kinds, _) in _DOMAINS.items()
+        for kind, (kinds, _) in DOMAINS.items()
     )
     missed = (row for row in rows if row.is_met is False)
     return Validity(len(frame), domains, tuple(MissedCheck(row.text, row.kind, row.conditions.text) for row in missed))
@@ -194,27 +193,3 @@ def _read_preset(system: System, site: str, path: Sequence[str]) -> Any:
     for name in path:
         value = getattr(value, name, None)
     return value
-
-
-def validity_section(subject: Subject) -> Section | None:
-    """Create the section with the domain of validity; None for the system of another package."""
-    validity = assess_validity(subject.run)
-    if not validity.domains:
-        return None
-    rows = [
-        [
-            f"{QUANTITIES[item.quantity]}, compared {_DOMAINS[domain.kind][1]}",
-            format_range(item.cases),
-            NOTHING if item.checked is None else format_range(item.checked),
-            f"{item.outside:,} ({percent(item.outside / validity.cases)})",
-        ]
-        for domain in validity.domains
-        for item in domain.coverage
-    ]
-    grid = Grid(["Quantity", "Cases", "Checked", "Cases outside"], rows)
-    missed = Grid(
-        ["Missed check", "Kind", "Conditions"], [[item.text, item.kind, item.conditions] for item in validity.missed]
-    )
-    blocks = [Block(grid=grid, note=note_text("common.validity"))]
-    blocks += [Block(heading="Checks that miss their limit", grid=missed)] if validity.missed else []
-    return Section("validity", "Validity", "Conditions in which the simulation was checked", blocks)

@@ -18,13 +18,14 @@ from marsyard.campaigns.definition.parameter_paths import value_at
 from marsyard.campaigns.json_numbers import Number
 from marsyard.campaigns.studies.results import ROBUST, ROBUST_FOLDER, RobustVariant
 from marsyard.reports import rates
+from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import collect_evidence
-from marsyard.reports.dispersion_changes import Kind
-from marsyard.reports.requirement_cases import compute_margins
+from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.robustness import Outcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
-from marsyard.reports.statistics.clusters import ClusteredCases
-from marsyard.reports.statistics.weighted import find_crossing, weighted_rates
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
+from marsyard.reports.statistics.crossing import find_crossing
+from marsyard.reports.statistics.weighted import weighted_rates
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, StoredRun, read_run
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.scenarios.columns import split_unit
@@ -200,7 +201,7 @@ def _find_step(
     crossing = find_crossing(grid / spread, result, 1.0 - verdict.probability, decides_by_rate=by_rate)
     step = math.copysign(spread, farthest - assumed)
     return Robustness(
-        verdict.requirement_id, path, Kind.VALUE, split_unit(path)[1], assumed=assumed, spread=spread,
+        verdict.requirement_id, path, ChangeKind.VALUE, split_unit(path)[1], assumed=assumed, spread=spread,
         passes_at=assumed + step * crossing.lower, fails_at=assumed + step * crossing.change,
         confidence=verdict.confidence, outcome=Outcome.of(crossing, is_complete=False), **asdict(crossing),
     )  # fmt: skip

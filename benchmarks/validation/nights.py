@@ -8,7 +8,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from marsyard.reports.history import FINISHED, Comparison, History, NightCampaign, find_changes, list_comparisons
+from marsyard.reports.history import FINISHED, History, NightCampaign, list_comparisons
+from marsyard.reports.history_changes import Comparison, find_changes
 from marsyard.reports.statistics.changes import Metric, Sample
 
 #: Assignments of cases to terrains.

@@ -15,10 +15,11 @@ from scipy.stats import norm, poisson, truncnorm
 
 from benchmarks.validation.records import Check, Measure
 from marsyard.reports.case_evidence import CaseEvidence
-from marsyard.reports.dispersion_changes import Change, Kind, list_changes
+from marsyard.reports.dispersion_changes import Change, ChangeKind, list_changes
 from marsyard.reports.robustness import change_rates
-from marsyard.reports.statistics.clusters import ClusteredCases
-from marsyard.reports.statistics.weighted import MIN_EFFECTIVE, Crossing, find_crossing, weighted_rates
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
+from marsyard.reports.statistics.crossing import Crossing, find_crossing
+from marsyard.reports.statistics.weighted import MIN_EFFECTIVE, weighted_rates
 from marsyard.reports.verdicts import Verdict
 
 _CONFIDENCE = 0.9
@@ -35,7 +36,7 @@ class _State:
     """A limit state: kind of change, permitted rate, region of failures, and rate after a change of a size."""
 
     name: str
-    kind: Kind
+    kind: ChangeKind
     permitted: float
     fails: Callable[[np.ndarray], np.ndarray]
     rate: Callable[[float], float]
@@ -67,37 +68,39 @@ def _conditional_rate(shift: float) -> float:
 _LIMIT, _COUNT, _TRUNCATED = norm.isf(0.02), ndtri(poisson.cdf(4, 2.0)), ndtri(truncnorm.cdf(1.42, -1.0, 1.5))
 _CORE, _SPREAD = norm.ppf(0.51), math.hypot(1.8, 0.6)
 _STATES = (
-    _State("mean of a normal load", Kind.MEAN_UP, 0.05, lambda z: z[:, 0] > _LIMIT, lambda d: norm.sf(_LIMIT - d)),
     _State(
-        "standard deviation of a normal load, wider", Kind.WIDER, 0.05,
+        "mean of a normal load", ChangeKind.MEAN_UP, 0.05, lambda z: z[:, 0] > _LIMIT, lambda d: norm.sf(_LIMIT - d)
+    ),
+    _State(
+        "standard deviation of a normal load, wider", ChangeKind.WIDER, 0.05,
         lambda z: np.abs(z[:, 0]) > 2.4, lambda d: 2.0 * norm.sf(2.4 / (1.0 + d)),
     ),
     _State(
-        "standard deviation of a normal load, narrower", Kind.NARROWER, 0.05,
+        "standard deviation of a normal load, narrower", ChangeKind.NARROWER, 0.05,
         lambda z: np.abs(z[:, 0]) < _CORE, lambda d: 2.0 * ndtr(_CORE / (1.0 - d)) - 1.0,
     ),
     _State(
-        "mean of a log-normal load (heavy tail)", Kind.MEAN_UP, 0.05,
+        "mean of a log-normal load (heavy tail)", ChangeKind.MEAN_UP, 0.05,
         lambda z: np.exp(z[:, 0] + 0.5 * z[:, 1]) > 10.0, lambda d: norm.sf((math.log(10.0) - d) / math.sqrt(1.25)),
     ),
     _State(
-        "mean of a Poisson number (discrete)", Kind.MEAN_UP, 0.05,
+        "mean of a Poisson number (discrete)", ChangeKind.MEAN_UP, 0.05,
         lambda z: (poisson.ppf(ndtr(z[:, 0]), 2.0) >= 5) & (z[:, 1] > 0.0), lambda d: 0.5 * norm.sf(_COUNT - d),
     ),
     _State(
-        "mean of a truncated normal load", Kind.MEAN_UP, 0.05,
+        "mean of a truncated normal load", ChangeKind.MEAN_UP, 0.05,
         lambda z: truncnorm.ppf(ndtr(z[:, 0]), -1.0, 1.5) > 1.42, lambda d: norm.sf(_TRUNCATED - d),
     ),
     _State(
-        "mean of one of two loads with the correlation 0.8", Kind.MEAN_UP, 0.05,
+        "mean of one of two loads with the correlation 0.8", ChangeKind.MEAN_UP, 0.05,
         lambda z: 1.8 * z[:, 0] + 0.6 * z[:, 1] > _LIMIT * _SPREAD, lambda d: norm.sf(_LIMIT - 1.8 * d / _SPREAD),
     ),
     _State(
-        "mean on which another dispersion depends", Kind.MEAN_UP, 0.05,
+        "mean on which another dispersion depends", ChangeKind.MEAN_UP, 0.05,
         lambda z: z[:, 0] + np.exp(0.5 * z[:, 0]) * z[:, 1] > 4.4, _conditional_rate,
     ),
     _State(
-        "mean of a load, population of 31 %", Kind.MEAN_UP, 0.1,
+        "mean of a load, population of 31 %", ChangeKind.MEAN_UP, 0.1,
         lambda z: z[:, 0] > 2.2, lambda d: norm.sf(2.2 - d) / norm.sf(0.5 - d), lambda z: z[:, 0] > 0.5,
     ),
 )  # fmt: skip
@@ -150,7 +153,7 @@ def _run_terrains(rng: np.random.Generator, trials: int) -> Iterator[Measure]:
             z, terrain = rng.standard_normal(groups.size), rng.standard_normal(terrains)
             success = common * terrain[groups] + own * z <= norm.isf(permitted) + own * shift
             weights = np.exp(sizes[:, None] * z - 0.5 * sizes[:, None] ** 2)
-            change = Change(Kind.MEAN_UP, sizes, weights, np.exp(-(sizes**2)))
+            change = Change(ChangeKind.MEAN_UP, sizes, weights, np.exp(-(sizes**2)))
             rates = change_rates(_judge(success, groups, permitted), _evidence(success, groups), change)
             is_covered.append(float(rates.upper[1]) >= permitted)
         claim = (

@@ -6,10 +6,10 @@ from typing import Any
 
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.parameter_paths import leaves
+from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.outcomes import ENGINE_FAILURES
 from marsyard.campaigns.store.rows import LEADING_COLUMNS, TRAILING_COLUMNS, Row
 from marsyard.scenarios.interface import CaseResult, Scalar
-from marsyard.sim.cache import hide_folders
 
 #: Maximum bit length of stored integers: a float64 is below 2 ** 1024.
 _MAX_INT_BITS = 1023

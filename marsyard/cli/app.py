@@ -1,17 +1,14 @@
-"""The command line `marsyard`: registers all commands; defines `list`, `show` and `doctor`.
+"""The command line `marsyard`: registers all commands; defines `doctor`.
 
 Commands import their dependencies when they run, so that ``--help`` is fast.
 """
 
 import importlib
-import json
 import os
 import sys
-import tomllib
 import traceback
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
@@ -20,16 +17,22 @@ from typer.core import TyperCommand, TyperGroup
 
 from marsyard.cli.assure import assure
 from marsyard.cli.campaign import append, merge, resume, run
+from marsyard.cli.catalogue import list_campaigns, show
+from marsyard.cli.compilation import compile_kernels
 from marsyard.cli.conformance import conformance
 from marsyard.cli.console import create_console
+from marsyard.cli.dashboard import dashboard
+from marsyard.cli.dataset import dataset
 from marsyard.cli.errors import Exit, handle_user_errors
-from marsyard.cli.export import dataset, export, score
-from marsyard.cli.housekeeping import clean, compile_kernels
-from marsyard.cli.new import ingest, new
-from marsyard.cli.options import CampaignArgument, JsonOption, SetOption
+from marsyard.cli.export import export, score
+from marsyard.cli.housekeeping import clean
+from marsyard.cli.ingest import ingest
+from marsyard.cli.new import new
+from marsyard.cli.nightly import nightly
+from marsyard.cli.options import JsonOption
 from marsyard.cli.render import gallery, render
 from marsyard.cli.replay import replay
-from marsyard.cli.report import compare, confirmations, dashboard, nightly, report
+from marsyard.cli.report import compare, confirmations, report
 from marsyard.cli.studies import budget, rare, robust, search
 from marsyard.cli.terrain import app as terrain
 
@@ -65,66 +68,6 @@ app = typer.Typer(
     "2 the command or a file is invalid; 3 no verdict: too few cases, or cases that are not independent random draws; "
     "4 all requirements met, but a person must judge the evidence; 130 interrupted.",
 )
-
-
-@handle_user_errors
-def list_campaigns(as_json: JsonOption = False) -> None:
-    """List the built-in campaigns."""
-    from rich.table import Table
-    from rich.text import Text
-
-    from marsyard.scenarios.systems import catalogue, problems
-
-    for problem in problems():
-        typer.echo(f"warning: {problem}", err=True)
-    keys = ("scenario", "cases", "description")
-    rows, table = [], Table()
-    for heading in ("campaign", *keys):
-        table.add_column(heading, overflow="fold")
-    for name, path in catalogue().items():
-        try:
-            definition = tomllib.loads(path.read_text(encoding="utf-8"))  # not validated: `run` reports errors
-        except (OSError, ValueError) as error:
-            definition = {"description": f"cannot be read: {error}"}
-        rows.append({"name": name, "file": str(path), **{key: definition.get(key) for key in keys}})
-        table.add_row(Text(name), *(Text(str(definition.get(key, ""))) for key in keys))
-    if as_json:
-        typer.echo(json.dumps(rows, indent=2))
-    else:
-        create_console().print(table)
-
-
-@handle_user_errors
-def show(
-    campaign: CampaignArgument,
-    override: SetOption = None,
-    draw: Annotated[
-        int | None, Option(metavar="N", help="Show the drawn parameter values of the first N cases.")
-    ] = None,
-    figure: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="With --draw: write histograms and pairwise scatter plots (.svg, .png)."),
-    ] = None,
-    as_json: Annotated[bool, Option("--json", help="Print JSON, with all draws.")] = False,
-) -> None:
-    """Show a campaign: parameters, dispersions with their sources, requirements; with --draw its random values."""
-    from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.campaigns.errors import CampaignError
-    from marsyard.cli.showing import describe_campaign, show_campaign, show_draws, write_draws_figure
-
-    if figure is not None and draw is None:
-        raise CampaignError("--figure plots draws: give the number of cases with --draw N")
-    definition = load_campaign(campaign, override or [])
-    if figure is not None and draw is not None:
-        write_draws_figure(definition, draw, figure)
-    if as_json:
-        typer.echo(json.dumps(describe_campaign(definition, draw), indent=2))
-    elif draw is None:
-        show_campaign(definition, create_console())
-    else:
-        show_draws(definition, draw, create_console())
-    if figure is not None:
-        typer.echo(f"figure: {figure}", err=as_json)
 
 
 def doctor(as_json: JsonOption = False) -> None:

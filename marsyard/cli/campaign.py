@@ -12,6 +12,7 @@ from typer import Argument, Option
 from marsyard.cli import options
 from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
+from marsyard.cli.option_classes import with_options
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
@@ -55,7 +56,7 @@ class RunOptions:
 
 
 @handle_user_errors
-@options.with_options(RunOptions)
+@with_options(RunOptions)
 def run(arguments: RunOptions) -> None:
     """Run a campaign, evaluate its requirements, and write its report."""
     from marsyard.campaigns.definition.loading import load_campaign
@@ -98,7 +99,7 @@ def run_shard(campaign: Campaign, shard_text: str, directory: Path, executor: Ex
     """Run a shard of a campaign in a folder, and print how to combine the shards."""
     from marsyard.campaigns.running.engine import run_campaign
     from marsyard.campaigns.running.shards import Shard
-    from marsyard.cli.progress import RunLog
+    from marsyard.cli.run_log import RunLog
 
     shard = Shard.parse(shard_text)
     with show_progress(directory) as progress, RunLog(directory, progress) as log:
@@ -148,7 +149,7 @@ def resume(
     from marsyard.campaigns.outcomes import RETRYABLE
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.cli.studies import contains_study, continue_study_and_exit
+    from marsyard.cli.study_results import contains_study, continue_study_and_exit
     from marsyard.cli.until_decided import continue_until_decided
 
     if trust:
@@ -191,7 +192,7 @@ def append(
     from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.record import stored_definition
     from marsyard.cli.estimate import print_limits
-    from marsyard.cli.studies import contains_study, continue_study_and_exit
+    from marsyard.cli.study_results import contains_study, continue_study_and_exit
 
     if trust:
         adopt(directory)

@@ -36,7 +36,7 @@ def make_executor(jobs: int | None, cluster: str | None) -> ExecutorConfig:
 def run_and_evaluate(directory: Path, work: Callable[[ProgressObserver], None]) -> None:
     """Run the campaign by the function `work`, evaluate it, and exit with the status of its verdict."""
     from marsyard.cli.outcome import evaluate_and_report
-    from marsyard.cli.progress import RunLog
+    from marsyard.cli.run_log import RunLog
 
     with show_progress(directory) as progress, RunLog(directory, progress) as log:
         work(log)

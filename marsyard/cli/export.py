@@ -1,4 +1,4 @@
-"""Commands `marsyard export`, `score`, `dataset`: export data of cases, and score answers computed elsewhere."""
+"""Commands `marsyard export` and `score`: export data of cases, and score answers computed elsewhere."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,7 +8,6 @@ import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
-from marsyard.cli.console import size_text
 from marsyard.cli.errors import Exit, handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
 
@@ -100,25 +99,3 @@ def score(
             )
 
     run_and_evaluate(target, run)
-
-
-@handle_user_errors
-def dataset(
-    campaign: options.CampaignArgument,
-    out: Annotated[Path, Option(metavar="DIR", help="Folder of the shards.")],
-    cases: options.CasesOption = None,
-    seed: options.SeedOption = None,
-    shard: Annotated[int, Option(metavar="N", min=1, help="Cases per shard.")] = 50,
-    jobs: Annotated[int, Option(metavar="J", min=1, help="Worker processes.")] = 1,
-    override: options.SetOption = None,
-) -> None:
-    """Write images with range, normals, rock masks, hazard maps and poses as WebDataset shards.
-
-    Landing campaigns have two images per case. Existing shards are not written again.
-    """
-    from marsyard.campaigns.definition.loading import load_campaign
-    from marsyard.dataset import write_dataset
-
-    shards = write_dataset(load_campaign(campaign, override or [], cases, seed), out, shard, jobs)
-    total = sum(path.stat().st_size for path in shards)
-    typer.echo(f"{len(shards)} shards, {size_text(total)}: {out}")

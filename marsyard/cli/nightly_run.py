@@ -19,9 +19,11 @@ from marsyard.campaigns.store.temporary_files import write_atomic
 from marsyard.cli.errors import Exit
 from marsyard.cli.nightly_plan import Plan, PlannedCampaign, PlannedCheck, hash_definition
 from marsyard.cli.outcome import evaluate_and_store
-from marsyard.reports.comparison import list_metrics
+from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.history import Change, History, NightCampaign, format_night_page, list_comparisons
+from marsyard.reports.history import History, NightCampaign, list_comparisons
+from marsyard.reports.history_changes import Change
+from marsyard.reports.night_page import format_night_page
 
 #: Files and folders in the output folder of `marsyard nightly`.
 HISTORY_FILE, PAGE_FILE, RUNS, SITE = "history.sqlite", "nightly.md", "runs", "site"

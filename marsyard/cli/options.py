@@ -1,9 +1,7 @@
 """Options and arguments of several commands of `marsyard`."""
 
-import inspect
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated
 
 from typer import Argument, Option
 
@@ -77,22 +75,3 @@ TrustOption = Annotated[
 
 OutOption = Annotated[Path | None, Option(metavar="DIR", help="Output folder; by default runs/<campaign>-<UTC time>.")]
 OverwriteOption = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
-
-Options = TypeVar("Options")
-
-
-def with_options(kind: type[Options]) -> Callable[[Callable[[Options], None]], Callable[..., None]]:
-    """Return a decorator that makes the fields of the dataclass `kind` options and passes the command an instance."""
-    hints = get_type_hints(kind, include_extras=True)
-    fields = [field.replace(annotation=hints[name]) for name, field in inspect.signature(kind).parameters.items()]
-
-    def decorate(command: Callable[[Options], None]) -> Callable[..., None]:
-        def call(**values: Any) -> None:
-            command(kind(**values))
-
-        call.__name__, call.__doc__ = command.__name__, command.__doc__
-        call.__annotations__ = hints
-        call.__signature__ = inspect.Signature(fields)  # type: ignore[attr-defined]
-        return call
-
-    return decorate

@@ -1,50 +1,33 @@
-"""Evaluation of a campaign for the commands: verdicts on the terminal, report, CSV and PDF, and images of cases."""
+"""Evaluation of a campaign for the commands: verdicts on the terminal, and report."""
 
 import math
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import pandas as pd
-import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
-import typer
 from rich.console import Console
 from rich.table import Table
 
-from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
-from marsyard.campaigns.execution.workers import LocalExecutor
-from marsyard.campaigns.running.replay import replay_in_executor
+from marsyard.campaigns.errors import StoreError, report_write_errors
 from marsyard.campaigns.running.shards import SHARD_KEY, SHARD_STATE
-from marsyard.campaigns.running.stored_campaign import load_stored_campaign
 from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked
-from marsyard.campaigns.store.packed_products import save_packed
-from marsyard.campaigns.store.products import case_directory
-from marsyard.campaigns.store.record import stored_definition
-from marsyard.campaigns.store.table import TABLE_FILE, refresh_table, stored_row
-from marsyard.campaigns.store.temporary_files import replace_file
+from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
 from marsyard.cli.errors import Exit
-from marsyard.cli.showing import grid_table
+from marsyard.cli.tables import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids
-from marsyard.reports.evaluation import Evaluation, evaluate_run, record_look
-from marsyard.reports.gallery import gallery_candidates
-from marsyard.reports.overall import multiplicity_text
-from marsyard.reports.robustness import robustness_text
-from marsyard.reports.stored import read_run
-from marsyard.reports.tables import verdict_table
+from marsyard.reports.evaluation import Evaluation, evaluate_run
+from marsyard.reports.looks import record_look
+from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.robustness_sentences import robustness_text
+from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Verdict
 from marsyard.reports.wording import count
 from marsyard.sim.files import report_damage
 
-#: Browsers that can print pages, in order of preference, and the time limit of printing.
-_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_PRINT_TIMEOUT_S = 600.0
 Requirements: TypeAlias = Sequence[Mapping[str, Any]]
 
 
@@ -124,52 +107,3 @@ def read_frame(directory: Path) -> pd.DataFrame:
         raise StoreError(f"{directory} has no {TABLE_FILE}: the campaign is not finished")
     with report_damage(path, StoreError, "is not a valid table of cases"):
         return pd.read_parquet(path)
-
-
-def write_csv(directory: Path) -> Path:
-    """Write all rows as CSV in batches, atomically."""
-    path = directory / "cases.csv"
-    with report_write_errors(path), replace_file(path) as partial_path:
-        table = pq.ParquetFile(directory / TABLE_FILE)
-        with pa_csv.CSVWriter(partial_path, table.schema_arrow) as writer:
-            for batch in table.iter_batches():
-                writer.write_batch(batch)
-    return path
-
-
-def print_page(directory: Path) -> Path:
-    """Print the report page `report.html` to `report.pdf` with a headless browser; return the path of the PDF."""
-    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
-    if browser is None:
-        raise CampaignError(f"--pdf requires a browser; install chromium ({', '.join(_BROWSERS)})")
-    target, page = ((directory / name).resolve() for name in ("report.pdf", "report.html"))
-    with tempfile.TemporaryDirectory() as profile:
-        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}"]
-        command += ["--no-pdf-header-footer", f"--print-to-pdf={target}", page.as_uri()]
-        try:
-            subprocess.run(command, check=True, capture_output=True, timeout=_PRINT_TIMEOUT_S)  # noqa: S603
-        except (subprocess.SubprocessError, OSError) as error:
-            raise CampaignError(f"{browser} failed to print {target}: {error}") from error
-    return target
-
-
-def rerun_gallery_cases(directory: Path) -> None:
-    """Rerun the candidates of the gallery without stored products and store their products; report rows that differ.
-
-    Raises CampaignError if the campaign's scenario or an algorithm cannot be imported.
-    """
-    run = read_run(directory)
-    missing = [case for case in gallery_candidates(run) if case not in run.stored_cases]
-    if not missing:
-        return
-    definition = stored_definition(directory)
-    load_stored_campaign(directory, definition)
-    with LocalExecutor(1) as workers:
-        for case in missing:
-            rerun = replay_in_executor(workers, definition, case, stored_row(directory, case))
-            if rerun.products is None or rerun.failed:
-                typer.echo(f"case {case}: rerun, but no images were produced")
-                continue
-            save_packed(case_directory(directory, case), rerun.products, rerun.row)
-            differences = f"; the new row differs in: {', '.join(rerun.differing)}" if rerun.differing else ""
-            typer.echo(f"case {case}: rerun for its images{differences}")

@@ -11,6 +11,7 @@ from typer import Option
 
 from marsyard.cli import options
 from marsyard.cli.errors import exit_with_error
+from marsyard.cli.option_classes import with_options
 
 #: Name of the kernels of `marsyard render` in `marsyard.sim.kernel_cache`, next to the names of scenarios.
 RENDER_KERNELS = "render"
@@ -58,7 +59,7 @@ class RenderOptions:
     max_holes: options.MaxHolesOption = None
 
 
-@options.with_options(RenderOptions)
+@with_options(RenderOptions)
 def render(arguments: RenderOptions) -> None:
     """Render an image of a site or DTM.
 
@@ -66,8 +67,10 @@ def render(arguments: RenderOptions) -> None:
 
     A stereo camera adds -left and -right to PREFIX.
     """
+    from marsyard.image_files import check_files, write_image
+    from marsyard.image_request import ImageRequest
     from marsyard.sim.kernel_cache import mark_ready
-    from marsyard.site_images import ImageRequest, check_files, render_images, write_image
+    from marsyard.site_images import render_images
 
     with report_image_errors(arguments.out):
         values = {"scale": arguments.scale, "seed": arguments.seed, "max_hole_fraction": arguments.max_holes}

@@ -1,21 +1,19 @@
-"""Command `marsyard replay`: run one case again, and export it in space and time."""
+"""Command `marsyard replay`: run one case again."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer import Argument, Option
 
 from marsyard.cli import options
 from marsyard.cli.errors import Exit, handle_user_errors
+from marsyard.cli.timeline_exports import list_exports, write_exports
 
 if TYPE_CHECKING:
-    from marsyard.scenarios.timeline import Timeline
+    pass
 
 
 @handle_user_errors
@@ -50,9 +48,9 @@ def replay(
     from marsyard.campaigns.store.packed_products import pack_products, replace_files, unpack_products, write_packed
     from marsyard.campaigns.store.products import case_directory
     from marsyard.campaigns.store.stages import write_stages
-    from marsyard.reports.presentation import write_case_figures
+    from marsyard.reports.case_views import write_case_figures
 
-    exports = _requested_exports(rerun, glb, rosbag)
+    exports = list_exports(rerun, glb, rosbag)
     if trust:
         adopt(directory)
     result = rerun_case(directory, case)
@@ -84,73 +82,6 @@ def replay(
     else:
         typer.echo("the row equals the stored one")
     if exports:
-        _write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
+        write_exports(exports, {} if result.products is None else unpack_products(result.products), case)
     if result.stored is not None and result.differing:
         raise typer.Exit(Exit.FAILED)
-
-
-@dataclass(frozen=True)
-class _Export:
-    """An export of a timeline: option, target, and function that writes it; `name` is the title of the recording."""
-
-    option: str
-    target: Path
-    write: Callable[[Path, Timeline, str], None]
-
-
-def _requested_exports(rerun: Path | None, glb: Path | None, rosbag: Path | None) -> list[_Export]:
-    """Check the options of exports before the case runs. Raises CampaignError for a missing package or a wrong path."""
-    from marsyard.campaigns.errors import CampaignError
-
-    exports = []
-    for option, target, package, suffix, write in (
-        ("--rerun", rerun, "rerun", ".rrd", _write_rerun),
-        ("--glb", glb, "trimesh", ".glb", _write_glb),
-        ("--rosbag", rosbag, "rosbags", "", _write_ros_bag),
-    ):
-        if target is None:
-            continue
-        if suffix and target.suffix != suffix:
-            raise CampaignError(f"{option} {target}: allowed: a file with the suffix {suffix}")
-        if not suffix and target.exists():
-            raise CampaignError(f"{option} {target} exists; allowed: a new folder")
-        if not target.parent.is_dir():
-            raise CampaignError(f"{option} {target}: the folder {target.parent} does not exist")
-        if find_spec(package) is None:
-            raise CampaignError(f"{option} needs the package {package}: pip install 'marsyard[view]'")
-        exports.append(_Export(option, target, write))
-    return exports
-
-
-def _write_exports(exports: list[_Export], products: Mapping[str, Any], case: int) -> None:
-    """Write the timeline of a case. Raises CampaignError without one, and StoreError if a file cannot be written."""
-    from marsyard.campaigns.errors import CampaignError, report_write_errors
-    from marsyard.scenarios.timeline import PRODUCT, Timeline
-
-    timeline = Timeline.from_products(products)
-    if timeline is None:
-        names = ", ".join(export.option for export in exports)
-        reason = products.get(PRODUCT, "its scenario records none, or the case did not finish")
-        raise CampaignError(f"{names}: case {case} has no timeline: {reason}")
-    for export in exports:
-        with report_write_errors(export.target):
-            export.write(export.target, timeline, f"case {case}")
-        typer.echo(f"{export.option.removeprefix('--')}: {export.target}")
-
-
-def _write_rerun(target: Path, timeline: Timeline, name: str) -> None:
-    from marsyard.reports.timeline.rerun_file import write_rerun
-
-    write_rerun(target, timeline, name)
-
-
-def _write_glb(target: Path, timeline: Timeline, _name: str) -> None:
-    from marsyard.reports.timeline.glb import write_glb
-
-    write_glb(target, timeline)
-
-
-def _write_ros_bag(target: Path, timeline: Timeline, _name: str) -> None:
-    from marsyard.reports.timeline.ros_bag import write_ros_bag
-
-    write_ros_bag(target, timeline)

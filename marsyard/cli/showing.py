@@ -18,11 +18,12 @@ from marsyard.campaigns.definition.parameter_paths import leaves, value_at
 from marsyard.campaigns.definition.toml_models import description_at
 from marsyard.campaigns.errors import CampaignError, report_write_errors
 from marsyard.campaigns.sampling.design import describe_design
-from marsyard.reports.wording import count, requirement_text
+from marsyard.reports.requirement_wording import requirement_text
+from marsyard.reports.wording import count
 from marsyard.scenarios.columns import split_unit
 
 if TYPE_CHECKING:
-    from marsyard.reports.section import Grid
+    pass
 
 #: Width of a column of drawn values including its margin, characters.
 _VALUE_WIDTH = 12
@@ -201,14 +202,4 @@ def _create_table(title: str, *headings: str) -> Table:
     table = Table(title=title or None, title_justify="left")
     for heading in headings:
         table.add_column(heading, overflow="fold")
-    return table
-
-
-def grid_table(title: str, grid: Grid) -> Table:
-    """Convert a table of a report to a terminal table: names left-aligned, numbers right-aligned."""
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left")
-    for index, heading in enumerate(grid.head):
-        table.add_column(heading, justify="right" if index else "left", overflow="fold")
-    for row in grid.rows:
-        table.add_row(*map(Text, row))
     return table

@@ -6,20 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
-import typer
 from typer import Option
 
 from marsyard.cli import options
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, show_progress
+from marsyard.cli.option_classes import with_options
+from marsyard.cli.study_results import finish_robust, finish_search, finish_study
 
 if TYPE_CHECKING:
     from marsyard.campaigns.definition.campaign import Campaign
     from marsyard.campaigns.execution.executors import ExecutorConfig
-    from marsyard.campaigns.studies.results import SearchResult
 
 MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
 
@@ -91,7 +90,7 @@ class RareOptions(StudyOptions):
 
 
 @handle_user_errors
-@options.with_options(RareOptions)
+@with_options(RareOptions)
 def rare(arguments: RareOptions) -> None:
     """Compare the probability of a rare violation of a requirement with a limit, by counting and by subset simulation.
 
@@ -101,14 +100,14 @@ def rare(arguments: RareOptions) -> None:
     from marsyard.campaigns.studies.results import RareParameters
 
     parameters = RareParameters(
-        arguments.requirement,
-        arguments.max_probability,
-        arguments.method,
-        arguments.samples,
-        (arguments.replicates,),
-        (arguments.random_cases,),
-        arguments.importance_cases,
-        arguments.confidence,
+        requirement=arguments.requirement,
+        max_probability=arguments.max_probability,
+        method=arguments.method,
+        samples=arguments.samples,
+        replicates=(arguments.replicates,),
+        random_cases=(arguments.random_cases,),
+        importance_cases=arguments.importance_cases,
+        confidence=arguments.confidence,
     )
     campaign, executor, directory = prepare_study(arguments, "rare")
     with show_progress(directory) as progress:
@@ -139,7 +138,7 @@ class SearchOptions(StudyOptions):
 
 
 @handle_user_errors
-@options.with_options(SearchOptions)
+@with_options(SearchOptions)
 def search(arguments: SearchOptions) -> None:
     """Search for violations of a requirement, and reduce each to the few parameters that cause it.
 
@@ -148,7 +147,12 @@ def search(arguments: SearchOptions) -> None:
     from marsyard.campaigns.studies.results import SearchParameters
     from marsyard.campaigns.studies.search import start_search
 
-    parameters = SearchParameters(arguments.requirement, arguments.cases, arguments.restarts, arguments.failures)
+    parameters = SearchParameters(
+        requirement=arguments.requirement,
+        cases=arguments.cases,
+        restarts=arguments.restarts,
+        max_failures=arguments.failures,
+    )
     campaign, executor, directory = prepare_study(arguments, "search")
     with show_progress(directory) as progress:
         result = start_search(campaign, parameters, arguments.max_cases, directory, executor, progress)
@@ -174,7 +178,7 @@ class BudgetOptions(StudyOptions):
 
 
 @handle_user_errors
-@options.with_options(BudgetOptions)
+@with_options(BudgetOptions)
 def budget(arguments: BudgetOptions) -> None:
     """Compute the error budget: run the same cases without each source of error, and with each one alone.
 
@@ -183,7 +187,9 @@ def budget(arguments: BudgetOptions) -> None:
     from marsyard.campaigns.studies.budget import start_budget
     from marsyard.campaigns.studies.results import BudgetParameters
 
-    parameters = BudgetParameters(arguments.requirement, arguments.cases, arguments.sobol, arguments.confidence)
+    parameters = BudgetParameters(
+        requirement=arguments.requirement, cases=arguments.cases, sobol=arguments.sobol, confidence=arguments.confidence
+    )
     campaign, executor, directory = prepare_study(arguments, "budget")
     with show_progress(directory) as progress:
         result = start_budget(campaign, parameters, directory, executor, progress)
@@ -214,7 +220,7 @@ class RobustOptions:
 
 
 @handle_user_errors
-@options.with_options(RobustOptions)
+@with_options(RobustOptions)
 def robust(arguments: RobustOptions) -> None:
     """Show which changes of the assumptions turn PASS into FAIL, from the stored cases of a campaign.
 
@@ -254,105 +260,3 @@ def _read_farthest(texts: Sequence[str]) -> dict[str, float]:
         if not separator or not math.isfinite(farthest[path.strip()]):
             raise CampaignError(f"--parameter {text}: allowed: PATH=NUMBER, such as imu.gyro_scale_ppm=300")
     return farthest
-
-
-def finish_robust(run: Path) -> NoReturn:
-    """Write the report of a run, print its robustness, and exit."""
-    from marsyard.cli.outcome import evaluate_and_store
-    from marsyard.cli.showing import grid_table
-    from marsyard.reports.robustness import robustness_text
-    from marsyard.reports.robustness_section import change_grid, variant_grid
-
-    evaluation, page = evaluate_and_store(run)
-    console = create_console()
-    lines = []
-    for verdict in evaluation.verdicts:
-        records = [item for item in evaluation.robustness if item.requirement == verdict.requirement_id]
-        if records:
-            console.print(grid_table(f"Change to FAIL: {verdict.requirement_id}", change_grid(records)))
-            lines.append(f"{verdict.requirement_id}: {robustness_text(verdict, records)}")
-        else:
-            lines.append(f"{verdict.requirement_id}: {verdict.status}, which no change is computed for")
-    if evaluation.variants:
-        grid, bands = variant_grid(evaluation.variants)
-        console.print(grid_table("Other models", grid))
-        lines.append(f"verdicts under other models: {bands}")
-    for line in (*lines, f"report: {page}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    raise typer.Exit
-
-
-def contains_study(directory: Path) -> bool:
-    """Whether the folder contains a study, not an ordinary campaign."""
-    from marsyard.campaigns.studies.study_record import read_study
-
-    return read_study(directory) is not None
-
-
-def continue_study_and_exit(
-    directory: Path, jobs: int | None, cluster: str | None, additional: int = 0, *, is_random: bool = False
-) -> NoReturn:
-    """Continue the study in a folder, and exit with the status of its verdict.
-
-    additional: number of replicates to add, or of random cases if `is_random`
-    """
-    from marsyard.campaigns.errors import CampaignError
-    from marsyard.campaigns.studies.budget import BudgetStudy
-    from marsyard.campaigns.studies.rare import continue_rare
-    from marsyard.campaigns.studies.results import BUDGET, ROBUST, SEARCH
-    from marsyard.campaigns.studies.robust import RobustCasesStudy
-    from marsyard.campaigns.studies.runner import StudySession, continue_study
-    from marsyard.campaigns.studies.search import SearchStudy
-    from marsyard.campaigns.studies.study_record import StudyKind, read_study
-
-    executor, name = make_executor(jobs, cluster), (read_study(directory) or {}).get("kind")
-    kinds: list[tuple[StudyKind[Any, Any], Any]]
-    kinds = [(SEARCH, SearchStudy), (BUDGET, BudgetStudy), (ROBUST, RobustCasesStudy)]
-    others = {kind.name: (kind, study) for kind, study in kinds}
-    with show_progress(directory) as progress:
-        if name not in others:
-            replicates, random_cases = (0, additional) if is_random else (additional, 0)
-            result: Any = continue_rare(directory, executor, progress, replicates, random_cases)
-        else:
-            kind, study = others[name]
-            if additional:
-                raise CampaignError(f"{directory} contains {kind.title}, which cannot be extended; start a new one")
-            session = StudySession(kind, kind.read_parameters(directory), study, executor, progress)
-            result = continue_study(directory, session)
-    if name == SEARCH.name:
-        finish_search(directory, result)
-    if name == ROBUST.name:
-        finish_robust(directory.resolve().parent.parent)
-    finish_study(directory, result.exit_code)
-
-
-def finish_search(directory: Path, result: SearchResult) -> NoReturn:
-    """Store files and images of the reduced violations, write the report, print the result, and exit."""
-    from marsyard.campaigns.running.replay import replay
-    from marsyard.campaigns.running.stored_campaign import load_stored_campaign
-    from marsyard.campaigns.store.packed_products import save_packed
-    from marsyard.campaigns.store.products import case_directory
-    from marsyard.campaigns.store.record import stored_definition
-    from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
-
-    campaign = load_stored_campaign(directory, stored_definition(directory))
-    files = write_regression_campaigns(campaign, result, directory)
-    for failure in result.failures:
-        rerun = replay(directory, failure.case)
-        if rerun.products is not None:
-            save_packed(case_directory(directory, failure.case), rerun.products, rerun.row)
-    finish_study(directory, result.exit_code, [f"campaign: {path}" for path in files])
-
-
-def finish_study(directory: Path, exit_code: int, files: Sequence[str] = ()) -> NoReturn:
-    """Write the report of a study, print its sentences, `files`, and the path of the report, and exit."""
-    from marsyard.campaigns.errors import report_write_errors
-    from marsyard.campaigns.store.record import read
-    from marsyard.reports.campaign import study_sentences, write_report
-
-    with report_write_errors("the report"):
-        page = write_report(directory)
-    console = create_console()
-    for line in (*study_sentences(read(directory)), *files, f"report: {page}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
-    raise typer.Exit(exit_code)

@@ -9,9 +9,10 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.engine import append_cases, run_campaign
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.store import record
-from marsyard.reports.evaluation import evaluate_run, next_look
+from marsyard.reports.evaluation import evaluate_run
+from marsyard.reports.looks import next_look
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.statistics.proportions import planned_looks
+from marsyard.reports.statistics.sequential import planned_looks
 from marsyard.reports.verdicts import ESTIMATE
 from marsyard.reports.wording import count
 

@@ -9,15 +9,15 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.reports.assurance.elements import Element, ElementKind, State, defeater, goal, number_elements
 from marsyard.reports.fits import Constant, read_constants
 from marsyard.reports.report_file import CampaignReport
 from marsyard.reports.stored import table
-from marsyard.reports.traceability import format_tested_algorithms
+from marsyard.reports.tested_algorithms import format_tested_algorithms
 from marsyard.reports.validation_rows import RowKind, ValidationRow, read_checks
 from marsyard.reports.verdicts import ESTIMATE, Status, Verdict
 from marsyard.reports.wording import count, format_fraction, percent
@@ -29,73 +29,6 @@ VALIDATION, REGISTER, CREDIBILITY = "evidence/validation.json", "evidence/fitted
 _ASSUMED = "assumed"
 #: Number of names in a text before the others are counted.
 _MAX_NAMES = 6
-
-
-class Kind(StrEnum):
-    """Kind of an element, with the prefix of its identifier."""
-
-    GOAL = "G"
-    STRATEGY = "S"
-    SOLUTION = "Sn"
-    CONTEXT = "C"
-    ASSUMPTION = "A"
-    DEFEATER = "D"
-
-
-class State(StrEnum):
-    """State of a goal, from the least to the most severe."""
-
-    SUPPORTED = "supported"
-    CHALLENGED = "supported, with open defeaters"
-    OPEN = "not shown"
-    REFUTED = "refuted"
-
-
-@dataclass(frozen=True)
-class Element:
-    """An element of the case with the elements that support it, are its context, or challenge it.
-
-    - evidence: file of the package, relative to its folder; empty without one
-    - own_state: state that the evidence of the element determines; the state of a goal is the worst below it
-    """
-
-    kind: Kind
-    text: str
-    children: tuple[Element, ...] = ()
-    evidence: str = ""
-    own_state: State = State.SUPPORTED
-
-    @property
-    def state(self) -> State:
-        """The worst state of this element and those below; an open defeater challenges all goals above it."""
-        order = list(State)
-        return max((self.own_state, *(child.state for child in self.children)), key=order.index)
-
-
-def goal(text: str, *children: Element | None) -> Element:
-    """Create a goal with the elements that exist."""
-    return Element(Kind.GOAL, text, tuple(child for child in children if child is not None))
-
-
-def defeater(text: str, evidence: str = "", state: State = State.CHALLENGED) -> Element:
-    """Create an open defeater."""
-    return Element(Kind.DEFEATER, text, evidence=evidence, own_state=state)
-
-
-def number_elements(root: Element) -> list[tuple[str, Element, str]]:
-    """List the elements in the order of the argument with their identifiers, and those of their parents."""
-    numbers = dict.fromkeys(Kind, 0)
-    listed: list[tuple[str, Element, str]] = []
-
-    def visit(element: Element, parent: str) -> None:
-        numbers[element.kind] += 1
-        name = f"{element.kind}{numbers[element.kind]}"
-        listed.append((name, element, parent))
-        for child in element.children:
-            visit(child, name)
-
-    visit(root, "")
-    return listed
 
 
 @dataclass(frozen=True)
@@ -169,13 +102,17 @@ class Case:
     @property
     def defeaters(self) -> list[tuple[str, Element, str]]:
         """Open defeaters with their identifiers, and those of the elements that they challenge."""
-        return [item for item in number_elements(self.root) if item[1].kind is Kind.DEFEATER]
+        return [item for item in number_elements(self.root) if item[1].kind is ElementKind.DEFEATER]
 
     def to_json(self) -> dict[str, Any]:
         """Convert to JSON: elements, and links in the words of GSN."""
         listed = number_elements(self.root)
-        links = {Kind.CONTEXT: "inContextOf", Kind.ASSUMPTION: "inContextOf", Kind.DEFEATER: "challenges"}
-        names = {kind: kind.name.lower() for kind in Kind}
+        links = {
+            ElementKind.CONTEXT: "inContextOf",
+            ElementKind.ASSUMPTION: "inContextOf",
+            ElementKind.DEFEATER: "challenges",
+        }
+        names = {kind: kind.name.lower() for kind in ElementKind}
         return {
             "notation": "GSN Community Standard, version 3",
             "elements": [
@@ -183,14 +120,14 @@ class Case:
                     "id": name,
                     "type": names[item.kind],
                     "statement": item.text,
-                    "state": item.state.value if item.kind is Kind.GOAL else "",
+                    "state": item.state.value if item.kind is ElementKind.GOAL else "",
                     "evidence": item.evidence,
                 }
                 for name, item, _ in listed
             ],
             "links": [
                 {"source": name, "target": parent, "type": "challenges"}
-                if item.kind is Kind.DEFEATER
+                if item.kind is ElementKind.DEFEATER
                 else {"source": parent, "target": name, "type": links.get(item.kind, "supportedBy")}
                 for name, item, parent in listed
                 if parent
@@ -213,9 +150,9 @@ def build_case(runs: Sequence[AssuredRun], folder: Path) -> Case:
     )
     root = goal(
         f"The algorithms under test meet the requirements of the campaigns {names}.",
-        Element(Kind.CONTEXT, scope),
+        Element(ElementKind.CONTEXT, scope),
         Element(
-            Kind.STRATEGY,
+            ElementKind.STRATEGY,
             "Argument over each campaign, and over the credibility of the simulation",
             (*(_argue_run(run, all_rows, constants) for run in runs), _argue_credibility(factors)),
         ),
@@ -232,12 +169,12 @@ def _argue_run(run: AssuredRun, rows: Sequence[ValidationRow], constants: Iterab
     crashed = f"{count(report.crashed, 'case')} crashed. Fix the cause before you use the verdict."
     return goal(
         f"{run.algorithm} meets the requirements of {report.campaign}: {report.verdict}.",
-        Element(Kind.CONTEXT, context, evidence=run.file("campaign.json")),
-        Element(Kind.ASSUMPTION, assumption, evidence=run.file("campaign.json")) if assumed else None,
+        Element(ElementKind.CONTEXT, context, evidence=run.file("campaign.json")),
+        Element(ElementKind.ASSUMPTION, assumption, evidence=run.file("campaign.json")) if assumed else None,
         defeater(crashed, run.file("report.html"), State.REFUTED) if report.crashed else None,
         defeater("The campaign has no requirement.", state=State.OPEN) if not report.verdicts else None,
         Element(
-            Kind.STRATEGY,
+            ElementKind.STRATEGY,
             "Argument over each requirement at its confidence",
             tuple(_argue_requirement(run, verdict) for verdict in report.verdicts),
         ),
@@ -258,7 +195,7 @@ def _argue_requirement(run: AssuredRun, verdict: Verdict) -> Element:
     is_assumed = verdict.kind == "ours" or _ASSUMED in verdict.source.lower()
     return goal(
         f"{verdict.requirement_id}: {verdict.statement} Required: {required}.",
-        Element(Kind.SOLUTION, numbers.strip(), evidence=run.file("report.html"), own_state=state),
+        Element(ElementKind.SOLUTION, numbers.strip(), evidence=run.file("report.html"), own_state=state),
         defeater(f"PASS needs a decision of a person: {verdict.status}.") if verdict.status.is_qualified else None,
         defeater("Evaluated by observed rate, not at a confidence.") if verdict.decide_by == ESTIMATE else None,
         defeater(f"The required rate or bound is assumed: {verdict.source or 'no source'}.") if is_assumed else None,
@@ -286,7 +223,7 @@ def _argue_robustness(run: AssuredRun, verdict: Verdict) -> Iterator[Element]:
     texts = [str(item["pass_text"]) for item in items if item.get("pass_text")]
     unknown = [str(item.get("parameter")) for item in items if not item.get("pass_text")]
     if texts:
-        yield Element(Kind.SOLUTION, f"PASS holds up to: {'; '.join(texts)}", evidence=run.file("report.json"))
+        yield Element(ElementKind.SOLUTION, f"PASS holds up to: {'; '.join(texts)}", evidence=run.file("report.json"))
     if unknown:
         names = _list_names(list(dict.fromkeys(unknown)))
         yield defeater(f"The cases do not show that PASS holds under a change of: {names}.", run.file("report.json"))
@@ -303,7 +240,7 @@ def _argue_evidence(run: AssuredRun) -> Element:
             for item in run.confirmations
         )
         text = f"Confirmations of claim {evidence.claim[:8]}: {entries}. Record with head {run.record_head[:12]}"
-        solution = Element(Kind.SOLUTION, text, evidence=run.file("confirmations.jsonl"))
+        solution = Element(ElementKind.SOLUTION, text, evidence=run.file("confirmations.jsonl"))
     qualifications = [] if run.confirmations else [evidence.text]
     qualifications += evidence.notes if run.confirmations else []
     runs = table(run.definition.get("calibration")).get("runs") or ()
@@ -311,7 +248,7 @@ def _argue_evidence(run: AssuredRun) -> Element:
     return goal(
         "The cases were drawn after the algorithm was frozen, and no earlier result is hidden.",
         solution,
-        Element(Kind.CONTEXT, f"Options set on declared calibration runs: {calibrated}") if calibrated else None,
+        Element(ElementKind.CONTEXT, f"Options set on declared calibration runs: {calibrated}") if calibrated else None,
         *(
             defeater(text, run.file("campaign.json"), State.CHALLENGED if solution else State.OPEN)
             for text in qualifications
@@ -328,9 +265,11 @@ def _argue_rows(run: AssuredRun) -> Element:
     rows = f"{count(run.report.cases, 'row')} in a chain of hashes with head {run.head[:12]}"
     return goal(
         "The rows are those of the stated program, in the stated environment.",
-        Element(Kind.SOLUTION, rows, evidence=run.file("cases.sqlite")),
+        Element(ElementKind.SOLUTION, rows, evidence=run.file("cases.sqlite")),
         Element(
-            Kind.CONTEXT, f"commit {commit or 'unknown'}; {version}; {environment}", evidence=run.file("campaign.json")
+            ElementKind.CONTEXT,
+            f"commit {commit or 'unknown'}; {version}; {environment}",
+            evidence=run.file("campaign.json"),
         ),
         defeater(f"The program had changes without a commit ({commit or 'unknown'}).")
         if "+" in commit or not commit
@@ -346,7 +285,7 @@ def _argue_validity(run: AssuredRun, rows: Sequence[ValidationRow], constants: I
         met = sum(bool(row.is_met) for row in decided)
         if decided:
             # a fit shows that constants were fitted, and is no evidence of validity
-            shape = Kind.CONTEXT if kind is RowKind.FIT else Kind.SOLUTION
+            shape = ElementKind.CONTEXT if kind is RowKind.FIT else ElementKind.SOLUTION
             text = f"{kind}: {met} of {count(len(decided), 'row')} meet their limit"
             solutions.append(Element(shape, text, evidence=VALIDATION))
     by_data: dict[str, list[str]] = {}
@@ -368,7 +307,7 @@ def _argue_credibility(factors: Sequence[Mapping[str, str]]) -> Element:
     weak = [item for item in factors if item["level"][0] in "01"]
     return goal(
         "The credibility of the simulation is rated by the factors of NASA-STD-7009B.",
-        Element(Kind.SOLUTION, f"{count(len(factors), 'factor')} rated by the developers", evidence=CREDIBILITY),
+        Element(ElementKind.SOLUTION, f"{count(len(factors), 'factor')} rated by the developers", evidence=CREDIBILITY),
         defeater("Nobody outside of the project has reviewed the levels.", CREDIBILITY),
         *(defeater(f"{item['name']}, level {item['level']}: {item['reasons']}.", CREDIBILITY) for item in weak),
     )

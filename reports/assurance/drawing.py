@@ -7,8 +7,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 
-from marsyard.reports.assurance.case import Element, Kind, State
+from marsyard.reports.assurance.elements import Element, ElementKind, State
 
+#: SVG dash pattern of the box of a defeater.
+_DASHES = 'stroke-dasharray="6 3"'
 #: Width of a box, gaps between columns and rows, height of a line of text, margin around the text, pixels.
 _WIDTH, _COLUMN_GAP, _ROW_GAP, _LINE, _PAD = 300.0, 56.0, 12.0, 15.0, 11.0
 _CHARACTERS = 44
@@ -56,7 +58,7 @@ class _Box:
 
 def draw_case(root: Element) -> str:
     """Draw the case as an SVG document."""
-    box = _place(root, 0, _PAD, dict.fromkeys(Kind, 0))
+    box = _place(root, 0, _PAD, dict.fromkeys(ElementKind, 0))
     boxes = list(box.walk())
     width = max(item.left for item in boxes) + _WIDTH + _PAD
     height = max(item.top + item.height for item in boxes) + _PAD
@@ -71,11 +73,11 @@ def draw_case(root: Element) -> str:
     )
 
 
-def _place(element: Element, column: int, top: float, numbers: dict[Kind, int]) -> _Box:
+def _place(element: Element, column: int, top: float, numbers: dict[ElementKind, int]) -> _Box:
     """Place an element below `top`, and its children in the next column; a parent is centred on its children."""
     numbers[element.kind] += 1
     name, children, next_top = f"{element.kind}{numbers[element.kind]}", [], top
-    lines = [f"{name} {element.kind.name.lower()}: {element.state}" if element.kind is Kind.GOAL else name]
+    lines = [f"{name} {element.kind.name.lower()}: {element.state}" if element.kind is ElementKind.GOAL else name]
     lines += textwrap.wrap(element.text, _CHARACTERS)
     for child in element.children:
         children.append(_place(child, column + 1, next_top, numbers))
@@ -94,9 +96,9 @@ def _draw_link(parent: _Box, child: _Box) -> str:
     path = (
         f"M{x:g} {parent.middle:g}C{x + 28:g} {parent.middle:g} {end - 28:g} {child.middle:g} {end:g} {child.middle:g}"
     )
-    if kind in (Kind.CONTEXT, Kind.ASSUMPTION):
+    if kind in (ElementKind.CONTEXT, ElementKind.ASSUMPTION):
         style = 'stroke="#5a6672" stroke-dasharray="4 3"'
-    elif kind is Kind.DEFEATER:
+    elif kind is ElementKind.DEFEATER:
         style = 'stroke="#b3261e" stroke-dasharray="2 2"'
     return f'<path d="{path}" fill="none" {style}/>'
 
@@ -107,10 +109,14 @@ def _draw_box(box: _Box) -> str:
     kind, colour = box.element.kind, _COLOURS[box.element.state]
     style = f'fill="#fff" stroke="{colour}" stroke-width="1.6"'
     shapes = {
-        Kind.STRATEGY: f'<path d="M{x + 14:g} {y:g}H{x + w:g}L{x + w - 14:g} {y + h:g}H{x:g}z" {style}/>',
-        Kind.DEFEATER: f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" {style} stroke-dasharray="6 3"/>',
+        ElementKind.STRATEGY: f'<path d="M{x + 14:g} {y:g}H{x + w:g}L{x + w - 14:g} {y + h:g}H{x:g}z" {style}/>',
+        ElementKind.DEFEATER: f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" {style} {_DASHES}/>',
     }
-    radius = {Kind.SOLUTION: 0.5 * min(h, 60.0), Kind.CONTEXT: 12.0, Kind.ASSUMPTION: 0.5 * min(h, 60.0)}.get(kind, 0.0)
+    radius = {
+        ElementKind.SOLUTION: 0.5 * min(h, 60.0),
+        ElementKind.CONTEXT: 12.0,
+        ElementKind.ASSUMPTION: 0.5 * min(h, 60.0),
+    }.get(kind, 0.0)
     rectangle = f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="{radius:g}" {style}/>'
     left = x + 20.0
     weights = [" font-weight='bold'", *[""] * (len(box.lines) - 1)]

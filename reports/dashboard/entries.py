@@ -1,26 +1,21 @@
-"""Contents of the dashboard: stored campaigns, read from their records and reports, and a row for each requirement."""
+"""Stored campaigns of the dashboard, read from their records and reports."""
 
 import hashlib
 import json
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.requirements import SharedRequirement
 from marsyard.campaigns.errors import CampaignError, StoreError
 from marsyard.campaigns.store.record import reject_links
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import REPORT_JSON, CampaignReport, read_report
-from marsyard.reports.robustness import Robustness, reach_text
 from marsyard.reports.signature import is_own_report
 from marsyard.reports.stored import RECORD_FILE, TABLE_FILE, table
-from marsyard.reports.traceability import format_tested_algorithms
-from marsyard.reports.verdicts import ESTIMATE, GIVEN_TRUTH, Status, Verdict
-from marsyard.reports.wording import NOTHING, percent
+from marsyard.reports.tested_algorithms import format_tested_algorithms
 from marsyard.scenarios.systems import find_system
 
 #: Maximum depth of the search for campaigns below a folder.
@@ -169,143 +164,3 @@ def _find_text(parameters: Mapping[str, Any], key: str) -> str:
         if nested_value:
             return nested_value
     return ""
-
-
-#: Maximum number of other campaigns next to a requirement's verdict.
-MAX_OTHER_VERDICTS = 7
-#: Maximum number of campaigns in a sparkline, and its width and height, pixels.
-_MAX_POINTS, _WIDTH_PX, _HEIGHT_PX = 24, 120.0, 26.0
-
-
-@dataclass(frozen=True)
-class Sparkline:
-    """Line of the observed rates over time, oldest first, in pixels of an SVG image.
-
-    - points: points of the line as SVG text ("x,y x,y"); last: the last point
-    - required_y: y of the line of the required rate; text: description of the line
-    """
-
-    points: str
-    last: tuple[float, float]
-    required_y: float
-    text: str
-
-
-@dataclass(frozen=True)
-class Cell:
-    """Verdict of a campaign on a requirement."""
-
-    entry: Entry
-    verdict: Verdict
-
-
-@dataclass(frozen=True)
-class RequirementRow:
-    """A requirement, its latest verdict for each campaign name, and the trend of the latest campaign.
-
-    - cells: latest verdict for each campaign name
-    - all_cells: verdicts of all campaigns, the latest first, unfinished campaigns last
-    - studies: latest study of each kind and campaign name
-    """
-
-    requirement: str
-    statement: str
-    kind: str
-    source: str
-    cells: Sequence[Cell]
-    all_cells: Sequence[Cell]
-    trend: Sparkline | None
-    studies: Sequence[Entry]
-
-    @property
-    def latest(self) -> Cell | None:
-        """Verdict of the latest campaign, preferably a finished campaign; None without a campaign."""
-        return self.cells[0] if self.cells else None
-
-
-def requirement_rows(entries: Sequence[Entry], shared: Mapping[str, SharedRequirement]) -> list[RequirementRow]:
-    """Create a row for each requirement of `shared` and of the campaigns, the most severe verdict first."""
-    cells: dict[str, list[Cell]] = {name: [] for name in shared}
-    for entry in entries:
-        for verdict in entry.report.verdicts:
-            cells.setdefault(verdict.requirement_id, []).append(Cell(entry, verdict))
-        if entry.report.study is not None:
-            cells.setdefault(entry.report.study.requirement, [])
-    rows = []
-    for name, unsorted_cells in cells.items():
-        sorted_cells = sorted(unsorted_cells, key=lambda cell: not cell.entry.is_finished)
-        latest_by_campaign: dict[str, Cell] = {}
-        for cell in sorted_cells:
-            latest_by_campaign.setdefault(cell.entry.name, cell)
-        latest = list(latest_by_campaign.values())
-        history = [
-            cell.verdict for cell in sorted_cells if cell.entry.name == latest[0].entry.name and cell.entry.is_finished
-        ]
-        requirement, kind, source = shared.get(name), "", ""
-        statement = latest[0].verdict.statement if latest else ""
-        if requirement:
-            statement = statement if statement.startswith(GIVEN_TRUTH) else requirement.statement
-            kind, source = requirement.kind or "", requirement.source
-        studies: dict[str, Entry] = {}
-        for entry in entries:
-            if entry.report.study is not None and entry.report.study.requirement == name:
-                studies.setdefault(entry.title, entry)
-        line = sparkline(history[::-1])
-        rows.append(RequirementRow(name, statement, kind, source, latest, sorted_cells, line, [*studies.values()]))
-    return sorted(rows, key=_severity)
-
-
-def _severity(row: RequirementRow) -> int:
-    """Return the rank of a row by its latest verdict: failed requirements first, those without a campaign last."""
-    return len(Status) if row.latest is None else [*Status].index(row.latest.verdict.status)
-
-
-def sparkline(verdicts: Sequence[Verdict]) -> Sparkline | None:
-    """Create the line of observed rates over time and of the required rate; None for fewer than two campaigns."""
-    finite = [verdict for verdict in verdicts if all(map(math.isfinite, (verdict.estimate, verdict.probability)))]
-    finite = finite[-_MAX_POINTS:]
-    if len(finite) < 2:
-        return None
-    rates = [verdict.estimate for verdict in finite]
-    low = min(*rates, *(verdict.probability for verdict in finite))
-    # margin below the lowest rate: 15 % of its distance from 100 %; positive also if all rates are 100 %
-    low -= 0.15 * (1.0 - low) + 1e-9
-    # margins of 4 pixels on the left and right, of 3 pixels at the top and bottom
-    step_px = (_WIDTH_PX - 8.0) / (len(finite) - 1)
-
-    def compute_y(rate: float) -> float:
-        return round(3.0 + (_HEIGHT_PX - 6.0) * (1.0 - rate) / (1.0 - low), 2)
-
-    points = [(round(4.0 + step_px * index, 2), compute_y(rate)) for index, rate in enumerate(rates)]
-    text = f"{len(finite)} campaigns, rates {percent(rates[0])} to {percent(rates[-1])}"
-    return Sparkline(" ".join(f"{x},{y}" for x, y in points), points[-1], compute_y(finite[-1].probability), text)
-
-
-def count_verdicts(rows: Sequence[RequirementRow]) -> list[tuple[str, int]]:
-    """Count the requirements per latest verdict; requirements without a campaign come last."""
-    statuses = [row.latest.verdict.status for row in rows if row.latest is not None]
-    counts = [(str(status), statuses.count(status)) for status in Status if status in statuses]
-    n_missing = sum(row.latest is None for row in rows)
-    return [*counts, ("NO CAMPAIGN", n_missing)] if n_missing else counts
-
-
-def evidence_text(verdict: Verdict) -> str:
-    """Describe the number of cases of a verdict."""
-    if not verdict.n:
-        return "no case yet"
-    text = f"{verdict.failures:,} of {verdict.n:,} failed"
-    all_cases = verdict.all_cases
-    if all_cases is None or all_cases.n == verdict.n:
-        return text
-    return f"{text}; over all cases {all_cases.failures:,} of {all_cases.n:,}"
-
-
-def basis_text(verdict: Verdict, robustness: Sequence[Robustness]) -> str:
-    """Describe that a verdict is based on the observed rate, and how far it reaches; may be empty."""
-    by_rate = "evaluated by observed rate" if verdict.decide_by == ESTIMATE else ""
-    return "; ".join(filter(None, (by_rate, reach_text(verdict, robustness))))
-
-
-def margin_text(verdict: Verdict) -> str:
-    """Format the margin of the deciding value relative to the required rate, in percentage points."""
-    return NOTHING if math.isnan(verdict.margin) else f"{100.0 * verdict.margin:+.2f} pp".replace("-", "−")

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
@@ -39,7 +39,7 @@ LARGE_DIFFERENCE_POINTS = 10.0
 def field_test_section(subject: Subject) -> Section | None:
     """Create the section that compares the field test with the paper's Figs. 10 and 11; None for other campaigns."""
     frame, bound = subject.frame, subject.bound
-    if not {"run", "category"}.issubset(frame.columns) or not rates.is_flag(frame, "answered"):
+    if not {"run", "category"}.issubset(frame.columns) or not populations.is_flag(frame, "answered"):
         return None
     cells = field_cells(subject)
     grid = build_grid(
@@ -79,7 +79,7 @@ def field_cells(subject: Subject) -> list[dict[str, Any]]:
     pairs = [(str(category), str(run)) for category, run in names.itertuples(index=False)]
     for category, run in [*(pair for pair in FIG_11 if pair in pairs), *(pair for pair in pairs if pair not in FIG_11)]:
         rows = frame[frame["category"].eq(category) & frame["run"].eq(run)]
-        answered = rates.population_mask(rows, "valid")
+        answered = populations.population_mask(rows, "valid")
         errors = np.abs(numbers(rows[answered], subject.metric)) if subject.metric else np.array([])
         errors = errors[np.isfinite(errors)]
         fraction, paper_percent = rates.fraction_of(answered, rows), FIG_11.get((category, run), {}).get("percent")

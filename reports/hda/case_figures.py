@@ -66,6 +66,13 @@ _LOST: dict[str, Any] = {
     "marker": "x", "linestyle": "", "markersize": 5.0, "color": LOST_COLOUR, "markeredgewidth": 1.2,
     "label": "not tracked",
 }  # fmt: skip
+_SITE_MARKERS: Mapping[str, Mapping[str, Any]] = {
+    "apriori": {"marker": "x", "color": BLACK, "markersize": 8, "markeredgewidth": 2.0, "linestyle": ""},
+    "site": {"marker": "+", "color": PURPLE, "markersize": 11, "markeredgewidth": 2.6, "linestyle": ""},
+}
+#: Names of the sites in legends.
+SITE_NAMES: Mapping[str, str] = {"apriori": "a-priori site", "site": "reported site"}
+_WHITE_OUTLINE = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
 
 
 def draw_tracks(products: Products) -> Figure:
@@ -337,15 +344,6 @@ def _draw_terrain(
         axis.label.set_size(7)
         axis.labelpad = -6
         axis.set_pane_color((0.0, 0.0, 0.0, 0.0))
-
-
-_SITE_MARKERS: Mapping[str, Mapping[str, Any]] = {
-    "apriori": {"marker": "x", "color": BLACK, "markersize": 8, "markeredgewidth": 2.0, "linestyle": ""},
-    "site": {"marker": "+", "color": PURPLE, "markersize": 11, "markeredgewidth": 2.6, "linestyle": ""},
-}
-#: Names of the sites in legends.
-SITE_NAMES: Mapping[str, str] = {"apriori": "a-priori site", "site": "reported site"}
-_WHITE_OUTLINE = [patheffects.Stroke(linewidth=3.6, foreground=WHITE), patheffects.Normal()]
 
 
 def _mark_site(axes: Axes, pixel: Float[np.ndarray, "2"], name: str) -> None:

@@ -9,11 +9,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.blocks import Quantity, collect_values, flag_rate, rate_block
 from marsyard.reports.column_values import numbers
+from marsyard.reports.empty_cells import drop_empty_columns
 from marsyard.reports.fits import fit_note
-from marsyard.reports.hda.sections import INTERVAL_NOTE, MIN_CURVE_VALUES, PAPER, drop_empty_columns, landing_rows
+from marsyard.reports.hda.answers import MIN_CURVE_VALUES
+from marsyard.reports.hda.landing_cases import INTERVAL_NOTE, PAPER, landing_rows
 from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
@@ -93,10 +95,10 @@ def _create_table_2_block(landings: pd.DataFrame) -> Block:
 def touchdown_section(subject: Subject) -> Section | None:
     """Compare the distance from touchdown to site with Table II; None without touchdown errors."""
     frame = landing_rows(subject)
-    landings = None if frame is None else frame[rates.flag_mask(frame, "landed")]
+    landings = None if frame is None else frame[populations.flag_mask(frame, "landed")]
     if landings is None or not has_values(landings, "touchdown_error_gps_m", "touchdown_error_m"):
         return None
-    at_apriori_site = landings[~rates.flag_mask(landings, "site_reported")]
+    at_apriori_site = landings[~populations.flag_mask(landings, "site_reported")]
     ground = {
         "true touchdown on safe ground, all landings": flag_rate("touchdown_safe")(landings),
         "true touchdown on safe ground, landings at a reported site": flag_rate("touchdown_safe", "site_reported")(

@@ -11,9 +11,13 @@ import numpy as np
 
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.blocks import rate_block
-from marsyard.reports.hda import sections
+from marsyard.reports.cell_values import is_true, to_float
+from marsyard.reports.hda import answers
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
-from marsyard.reports.hda.classes import create_class_blocks, limits_section
+from marsyard.reports.hda.classes import create_class_blocks
+from marsyard.reports.hda.faults_section import faults_section
+from marsyard.reports.hda.landing_cases import INTERVAL_NOTE, landing_rows
+from marsyard.reports.hda.map_section import map_section
 from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
 from marsyard.reports.hda.products import (
     is_hda_case,
@@ -23,9 +27,11 @@ from marsyard.reports.hda.products import (
     read_motion,
     read_tracked_features,
 )
+from marsyard.reports.hda.threshold_section import threshold_section
+from marsyard.reports.hda.tracking_limits import limits_section
 from marsyard.reports.images import draw_images
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
-from marsyard.reports.products import Products, is_true, to_float
+from marsyard.reports.products import Products
 from marsyard.reports.section import Section, Subject, create_section
 from marsyard.reports.wording import note_text, number
 
@@ -129,19 +135,19 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 def sites_section(subject: Subject) -> Section | None:
     """Compare sites and hazards with the ground truth; None if the rows are not those of landings."""
-    frame = sections.landing_rows(subject)
+    frame = landing_rows(subject)
     if frame is None:
         return None
     fractions = rate_block(
-        sections.site_fractions(frame), "Flights", "Fractions of correct answers", sections.INTERVAL_NOTE, "fractions"
+        answers.site_fractions(frame), "Flights", "Fractions of correct answers", INTERVAL_NOTE, "fractions"
     )
     return create_section(
         "sites",
         "Sites",
         "Sites and hazards compared with the ground truth",
-        sections.create_outcome_block(frame),
+        answers.create_outcome_block(frame),
         fractions,
-        sections.create_distance_block(frame),
+        answers.create_distance_block(frame),
         *create_class_blocks(frame),
     )
 
@@ -149,7 +155,7 @@ def sites_section(subject: Subject) -> Section | None:
 HDA = Presentation(
     cases=(CaseKind(is_hda_case, view, _LEGEND),),
     sections=(
-        sections.threshold_section, sections.faults_section, limits_section, sections.map_section, touchdown_section,
+        threshold_section, faults_section, limits_section, map_section, touchdown_section,
         sites_section, run_times_section,
     ),
     outcomes=(SiteOutcome,),

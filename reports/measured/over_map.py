@@ -42,14 +42,14 @@ def map_section(subject: section.Subject) -> section.Section | None:
     frame = subject.frame
     if "registration_inliers" not in frame:
         return None
-    is_posed = {prefix: np.isfinite(_column(frame, f"{prefix}height_m")) for prefix in ("", RENDERED)}
+    is_posed = {prefix: np.isfinite(numbers(frame, f"{prefix}height_m")) for prefix in ("", RENDERED)}
     columns = {
-        name: [_column(frame, prefix + name)[posed] for prefix, posed in is_posed.items()] for name in STATISTICS
+        name: [numbers(frame, prefix + name)[posed] for prefix, posed in is_posed.items()] for name in STATISTICS
     }
     counts = {
         "images": len(frame),
         "recorded_with_pose": int(is_posed[""].sum()),
-        "rendered": int(np.isfinite(_column(frame, f"{RENDERED}registration_inliers")).sum()),
+        "rendered": int(np.isfinite(numbers(frame, f"{RENDERED}registration_inliers")).sum()),
         "rendered_with_pose": int(is_posed[RENDERED].sum()),
     }
     rows = [
@@ -59,7 +59,7 @@ def map_section(subject: section.Subject) -> section.Section | None:
         [
             label(f"{RENDERED}pose_error_px"),
             _summarise(np.empty(0)),
-            _summarise(_column(frame, f"{RENDERED}pose_error_px")),
+            _summarise(numbers(frame, f"{RENDERED}pose_error_px")),
         ],
     ]
     figures = []
@@ -69,15 +69,11 @@ def map_section(subject: section.Subject) -> section.Section | None:
     data = {
         **counts,
         "medians": {name: [_median(values) for values in pair] for name, pair in columns.items()},
-        "pose_error_px": _median(_column(frame, f"{RENDERED}pose_error_px")),
+        "pose_error_px": _median(numbers(frame, f"{RENDERED}pose_error_px")),
     }
     grid = section.Grid(["Statistic", "Recorded", "Rendered"], rows)
     blocks = [section.Block(text=_TEXT, figures=figures, grid=grid, note=_NOTE)]
     return section.Section("over-map", "Map", "Recorded and rendered images over maps", blocks, data)
-
-
-def _column(frame: pd.DataFrame, name: str) -> Float[np.ndarray, " cases"]:
-    return numbers(frame, name) if name in frame else np.full(len(frame), np.nan)
 
 
 def _median(values: Float[np.ndarray, " n"]) -> float | None:
@@ -99,7 +95,7 @@ def yield_figure(frame: pd.DataFrame) -> Figure:
     figure = Figure(figsize=(9.0, 2.8), layout="constrained")
     for axes, name, index in zip(figure.subplots(1, len(MATCHERS), sharey=True), MATCHERS, range(4), strict=True):
         for prefix, filling in (("", figure_style.SERIES[index]), (RENDERED, "none")):
-            height, fraction = _column(frame, prefix + "height_m"), _column(frame, f"{prefix}{name}_yield")
+            height, fraction = numbers(frame, prefix + "height_m"), numbers(frame, f"{prefix}{name}_yield")
             style = {"color": figure_style.SERIES[index], "markerfacecolor": filling, "markersize": 5.0}
             axes.plot(height, fraction, figure_style.MARKERS[index], **style)
         axes.set(xlabel="height (m)", ylim=(0.0, 1.0))

@@ -1,6 +1,6 @@
-"""Comparison of two sets of cases that share terrains: rates by an exact test, errors by rank tests.
+"""Comparison of two sets of unpaired cases that share terrains: rates by an exact test, errors by rank tests.
 
-Unpaired cases: cases on one terrain are correlated. If both sets have cases on the same terrains, they are compared
+Cases on one terrain are correlated. If both sets have cases on the same terrains, they are compared
 within each terrain, where cases are independent. Rates are compared by the exact distribution of Mantel and Haenszel's
 sum of hypergeometrics (J. Nat. Cancer Inst. 22, 1959), errors by van Elteren's sum of rank tests (Bull. Inst. Int.
 Statist. 37, 1960). If they have few terrains in common, terrains are compared instead of cases: each terrain is
@@ -8,17 +8,6 @@ represented by the mean of the same number of its cases.
 
 Small p-values of ranks are computed by permutation. With many ties (rates of a few cases per terrain, for example), the
 rank sum is skewed. At 0.001 the p-value of its normal approximation is then too small by a factor of two to three.
-
-Paired cases: successes are compared by McNemar's test with the exact binomial distribution (Psychometrika 12, 1947). If
-cases share terrains, the sums of the differences on each terrain are ranked (Wilcoxon's signed ranks): under the null
-hypothesis these sums are symmetric about zero for any correlation within terrains.
-
-- Errors of two algorithms: the mean of their differences is tested by random changes of signs (Fisher), of the sums of
-  terrains if cases share terrains. Its interval contains the means that this test does not reject: their bounds are
-  quantiles of the means of random subsets (Hartigan, "Using subsample values as typical values", J. Amer. Statist.
-  Assoc. 64, 1969). Estimate, interval and p-value therefore refer to the same quantity. Both are exact if the two
-  algorithms are exchangeable, and accurate for the mean of many skewed differences.
-- Errors of two campaigns with the same draws: Wilcoxon's signed-rank test.
 """
 
 from __future__ import annotations
@@ -28,11 +17,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import stats
-
-from marsyard.reports.statistics.clusters import number_terrains
-from marsyard.reports.statistics.samples import Groups, is_shared
 
 #: Minimum fraction of the cases of each set on common terrains for a comparison within terrains.
 _MIN_COMMON_FRACTION = 0.5
@@ -46,8 +32,6 @@ _FULL_FRACTION = 0.8
 _PERMUTATION_LIMIT = 0.05
 #: Permutations per batch; number of exceedances at which sampling stops; maximum number of permuted values.
 _BATCH, _MAX_EXCEEDANCES, _MAX_PERMUTED = 500, 50, 2_000_000_000
-#: Maximum number of subsets of groups; maximum number of groups, above which a mean is normally distributed.
-_MAX_SUBSETS, _MAX_FLIPPED = 10_000, 2_000
 #: Fixed seed of the permutations, for reproducible reports.
 _SEED = 19370101
 
@@ -196,95 +180,3 @@ def _test_ranks(pairs: Pairs, permutations: int) -> float:
         n_permutations += _BATCH
     # the observed order counts as one of the permutations
     return (exceedances + 1.0) / (n_permutations + 1.0)
-
-
-def correct_holm(p_values: Sequence[float]) -> list[float]:
-    """Correct p-values for multiple tests (Holm 1979), which limits the family-wise error rate; NaN remains NaN."""
-    sorted_p = sorted((p, index) for index, p in enumerate(p_values) if not math.isnan(p))
-    corrected_p, max_p = [math.nan] * len(p_values), 0.0
-    for rank, (p, index) in enumerate(sorted_p):
-        max_p = max(max_p, min(1.0, p * (len(sorted_p) - rank)))
-        corrected_p[index] = max_p
-    return corrected_p
-
-
-def compare_successes(
-    first: Bool[np.ndarray, " n"], other: Bool[np.ndarray, " n"], groups: Groups = None
-) -> tuple[int, int, float]:
-    """Count the cases where only the first and only the other succeeds; also return the two-sided p-value."""
-    only_first, only_other = int((first & ~other).sum()), int((other & ~first).sum())
-    if groups is not None and is_shared(groups):
-        return only_first, only_other, _test_signed_ranks(_sum_groups(other.astype(np.float64) - first, groups))
-    total = only_first + only_other
-    p_value = 1.0 if total == 0 else float(stats.binomtest(only_first, total, 0.5).pvalue)
-    return only_first, only_other, p_value
-
-
-def compare_errors(
-    differences: Float[np.ndarray, " n"], groups: Groups, confidence: float
-) -> tuple[float, float, float, float]:
-    """Compute the mean of paired differences, its interval, and the two-sided p-value of a mean of zero.
-
-    Interval and p-value belong to one test: the interval contains zero if and only if the p-value is above
-    1 - confidence. NaN for no pairs; the interval is NaN for too few pairs (or terrains) for its confidence.
-    """
-    if differences.size == 0:
-        return math.nan, math.nan, math.nan, math.nan
-    sums, sizes = differences, np.ones(differences.size)
-    if groups is not None and is_shared(groups):
-        sums, sizes = _sum_groups(differences, groups), _sum_groups(np.ones(differences.size), groups)
-    mean = float(differences.mean())
-    if sums.size > _MAX_FLIPPED:
-        error = math.sqrt(sums.size / (sums.size - 1.0) * float(((sums - mean * sizes) ** 2).sum())) / differences.size
-        half_width = float(stats.norm.ppf(0.5 * (1.0 + confidence))) * error
-        p_value = 1.0 if mean == 0.0 else float(2.0 * stats.norm.sf(abs(mean) / error)) if error > 0.0 else 0.0
-        return mean, mean - half_width, mean + half_width, p_value
-    low, high = _subset_means(sums, sizes)
-    # the bounds are the first means that the test does not reject; the tolerance is for rounding errors
-    index = math.floor(0.5 * (1.0 - confidence) * low.size + 1e-9)
-    lower, upper = float(low[index]), float(high[high.size - 1 - index])
-    n_exceedances = min(int((low <= 0.0).sum()), int((high >= 0.0).sum()))
-    p_value = min(1.0, 2.0 * n_exceedances / low.size)
-    return (mean, lower, upper, p_value) if math.isfinite(upper - lower) else (mean, math.nan, math.nan, p_value)
-
-
-def _subset_means(
-    sums: Float[np.ndarray, " groups"], sizes: Float[np.ndarray, " groups"]
-) -> tuple[Float[np.ndarray, " subsets"], Float[np.ndarray, " subsets"]]:
-    """Compute the sorted means of random subsets of groups, for lower and for upper bounds.
-
-    The empty subset is the observed sample: its mean is minus infinity for lower bounds, and infinity for upper bounds.
-    All subsets are used if they are fewer than `_MAX_SUBSETS`.
-    """
-    n = sums.size
-    if 2**n <= _MAX_SUBSETS:
-        subsets = np.arange(1, 2**n)[:, None] >> np.arange(n) & 1
-        total, size = subsets @ sums, subsets @ sizes
-    else:
-        rng = np.random.default_rng(_SEED)
-        batches = [rng.integers(0, 2, (_BATCH, n), dtype=np.int8) for _ in range(_MAX_SUBSETS // _BATCH)]
-        total, size = (np.concatenate([batch @ values for batch in batches])[1:] for values in (sums, sizes))
-    is_empty = size == 0.0
-    means = np.divide(total, size, out=np.zeros(total.size), where=~is_empty)
-    return (
-        np.sort(np.append(np.where(is_empty, -math.inf, means), -math.inf)),
-        np.sort(np.append(np.where(is_empty, math.inf, means), math.inf)),
-    )
-
-
-def symmetry_p_value(differences: Float[np.ndarray, " n"], groups: Groups) -> float:
-    """Compute the two-sided p-value of paired differences that are symmetric about zero (signed ranks)."""
-    if groups is not None and is_shared(groups):
-        return _test_signed_ranks(_sum_groups(differences, groups))
-    return _test_signed_ranks(differences)
-
-
-def _sum_groups(differences: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"]) -> Float[np.ndarray, " terrains"]:
-    """Sum the differences on each terrain."""
-    return np.bincount(number_terrains(groups), weights=differences)
-
-
-def _test_signed_ranks(differences: Float[np.ndarray, " n"]) -> float:
-    """Compute the p-value of Wilcoxon's signed-rank test without the zero differences; 1 if all are zero."""
-    nonzero = differences[differences != 0.0]
-    return 1.0 if nonzero.size == 0 else float(stats.wilcoxon(nonzero).pvalue)

@@ -13,9 +13,6 @@ distribution). For a given distribution of all other terrains, P is linear in th
 two support points. The supremum is therefore searched among the G with two support points; the tests verify that other
 distributions do not exceed it. Without an event it is (1 - q)^terrains: each terrain counts as one case. With one case
 on each terrain it is the binomial distribution of Clopper and Pearson.
-
-Cases that do not belong to a population have neither the event nor its opposite. The rate in the population is the rate
-of events per case, divided by the rate of members per case. Both have a bound, and share the risk.
 """
 
 from __future__ import annotations
@@ -23,41 +20,24 @@ from __future__ import annotations
 import bisect
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Complex128, Float64, Int
+from jaxtyping import Bool, Float64, Int
 from scipy import ndimage, optimize, special, stats
 
-#: Numbers of terrains by their number of cases: pairs (cases on a terrain, terrains with this number).
-Sizes = tuple[tuple[int, int], ...]
+from marsyard.reports.statistics.tail_function import TailFunction
+from marsyard.reports.statistics.terrain_sizes import Sizes, count_sizes, event_scores, largest_statistic
+
 #: Relative positions of two support points: of the lower one between 0 and the mean, of the other between mean and 1.
 Pair = tuple[float, float]
 
-#: Fraction of the risk of a wrong bound that the bound of the rate of members uses.
-_MEMBER_RISK_FRACTION = 0.1
-#: Minimum rate of members for the number of additional cases, which would otherwise be infinite.
-_MIN_MEMBER_RATE = 0.01
 #: Maximum number of values of one batch of distributions, and limits of the number of support points per axis.
 _MAX_BATCH, _MIN_GRID, _MAX_GRID = 2**16, 8, 18
-#: Number of cases on a terrain up to which the squares of numbers of events are not rounded.
-_MAX_SQUARED = 16
-#: Factor of suppression of unresolved coefficients of a generating function; the rounding error is 1e-16 / this.
-_ALIASING = 1e-10
 #: Range of the logits of support points in the search, number of its refinements, and of refined local maxima.
 _MAX_LOGIT, _REFINEMENTS, _MAX_STARTS = 7.0, 4, 4
 #: Maximum number of searches for a bound, and its relative accuracy.
 _MAX_STEPS, _TOLERANCE = 20, 1e-4
-
-
-def number_terrains(terrain: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Number the terrains consecutively from 0, in the order of their original numbers."""
-    lowest, highest = int(terrain.min()), int(terrain.max())
-    if highest - lowest > 4 * terrain.size:
-        return np.unique(terrain, return_inverse=True)[1]
-    # for dense numbers: count instead of sorting, which is slow for a million cases
-    shifted = terrain - lowest
-    return np.asarray((np.cumsum(np.bincount(shifted) > 0) - 1)[shifted])
 
 
 @dataclass(frozen=True)
@@ -90,28 +70,10 @@ class TerrainCounts:
         return _max_rate(self.sizes, self.statistic, risk)
 
 
-def count_sizes(cases_on_terrain: Int[np.ndarray, " terrains"]) -> Sizes:
-    """Count the terrains with each number of cases."""
-    cases, terrains = np.unique(cases_on_terrain[cases_on_terrain > 0], return_counts=True)
-    return tuple(zip(cases.tolist(), terrains.tolist(), strict=True))
-
-
-def event_scores(sizes: Sizes) -> Int[np.ndarray, " _"]:
-    """Return the score of 0 to n events on a terrain, for the largest number of cases n.
-
-    It is k^2 for k events if n is at most 16, otherwise k^2 in units of (n / 16)^2, rounded up.
-    """
-    largest = max(cases for cases, _ in sizes)
-    events = np.arange(largest + 1, dtype=np.int64)
-    scale = max(largest, _MAX_SQUARED)
-    # integers: -(-a // b) rounds a / b up
-    return np.asarray(-(-(events**2) * _MAX_SQUARED**2 // scale**2))
-
-
 @lru_cache(maxsize=4096)
 def max_statistic(sizes: Sizes, rate: float, risk: float) -> int:
     """Find the largest statistic whose p-value at a rate is at most `risk`; -1 if there is none."""
-    largest = _largest_statistic(sizes)
+    largest = largest_statistic(sizes)
 
     def exceeds(statistic: int) -> bool:
         return _max_tail(sizes, statistic, rate, risk) > risk
@@ -133,7 +95,7 @@ def max_statistic(sizes: Sizes, rate: float, risk: float) -> int:
 def _max_rate(sizes: Sizes, statistic: int, risk: float) -> float:
     """See `TerrainCounts.max_rate`."""
     terrains = sum(count for _, count in sizes)
-    if statistic >= _largest_statistic(sizes):
+    if statistic >= largest_statistic(sizes):
         return 1.0
     # without an event, the p-value is (1 - rate)^terrains; events increase it
     lower = 1.0 - math.pow(risk, 1.0 / terrains)
@@ -175,7 +137,7 @@ def _max_tail(sizes: Sizes, statistic: int, rate: float, sufficient: float = 1.0
     terrains = sum(count for _, count in sizes)
     if statistic < 0:
         return 0.0
-    if statistic >= _largest_statistic(sizes):
+    if statistic >= largest_statistic(sizes):
         return 1.0
     if statistic == 0:
         return math.pow(1.0 - rate, terrains)
@@ -229,194 +191,7 @@ def _between_neighbours(axis: Float64[np.ndarray, " n"], index: int) -> Float64[
     return np.linspace(axis[max(index - 1, 0)], axis[min(index + 1, axis.size - 1)], 7)
 
 
-def _largest_statistic(sizes: Sizes) -> int:
-    """Return the statistic if all cases have the event."""
-    scores = event_scores(sizes)
-    return sum(terrains * int(scores[cases]) for cases, terrains in sizes)
-
-
-class TailFunction:
-    """P(S <= statistic) as a function of the distribution of the rate over terrains.
-
-    The generating function of S is the product of those of all terrains. It is evaluated at `nodes` on a circle in the
-    complex plane, and the sum of its first coefficients is a weighted sum of these values (discrete Fourier transform).
-    The radius of the circle is below 1, to suppress the coefficients that the number of nodes does not resolve.
-
-    If this needs fewer nodes, the missing scores are summed: P(S <= s) is 1 - P(S_max - S <= S_max - s - 1).
-    """
-
-    def __init__(self, sizes: Sizes, statistic: int) -> None:
-        complement = _largest_statistic(sizes) - statistic - 1
-        self._is_complement = complement < statistic
-        length = 1 + min(statistic, complement)
-        count = 2 * length
-        radius = _ALIASING ** (1.0 / count)
-        indices = np.arange(length + 1)
-        #: Nodes in the upper half plane; the values in the lower half plane are their complex conjugates.
-        self.nodes = radius * np.exp(2j * np.pi * indices / count)
-        # geometric series: sum of (radius^-1 exp(-2 pi i k / count))^power over the powers below `length`
-        ratios = 1.0 / self.nodes
-        self._weights = (1.0 - ratios**length) / (1.0 - ratios) / count
-        self._weights[1:-1] *= 2.0
-        self._sizes = sizes
-        # for each size: logarithms of the binomial coefficients, numbers of events at which the score changes, and
-        # node^score there
-        self._log_coefficients, self._starts, self._factors = [], [], []
-        for cases, _ in sizes:
-            events = np.arange(cases + 1)
-            self._log_coefficients.append(-special.betaln(events + 1, cases - events + 1) - math.log(cases + 1))
-            scores, starts = np.unique(event_scores(sizes)[: cases + 1], return_index=True)
-            scores = scores[-1] - scores if self._is_complement else scores
-            self._starts.append(starts)
-            self._factors.append(self.nodes ** scores[:, None])
-
-    def of_pairs(
-        self, low: Float64[np.ndarray, " rows"], high: Float64[np.ndarray, " columns"], mean: float
-    ) -> Float64[np.ndarray, "rows columns"]:
-        """Evaluate all distributions with one support point in `low`, one in `high`, and the given mean."""
-        weight = ((mean - low[:, None]) / (high - low[:, None]))[..., None]
-        product = np.ones((low.size, high.size, self.nodes.size), dtype=np.complex128)
-        rates = np.concatenate([low, high])
-        for index, (_, terrains) in enumerate(self._sizes):
-            at_low, at_high = np.split(self._terrain(index, rates), [low.size])
-            product *= _power((1.0 - weight) * at_low[:, None] + weight * at_high, terrains)
-        return self._sum(product)
-
-    def of_distribution(self, rates: Float64[np.ndarray, " points"], weights: Float64[np.ndarray, " points"]) -> float:
-        """Evaluate the distribution with the support points `rates` and their `weights`, which sum to 1."""
-        product = np.ones(self.nodes.size, dtype=np.complex128)
-        for index, (_, terrains) in enumerate(self._sizes):
-            product *= _power(weights @ self._terrain(index, rates), terrains)
-        return float(self._sum(product))
-
-    def _terrain(self, index: int, rates: Float64[np.ndarray, " m"]) -> Complex128[np.ndarray, "m nodes"]:
-        """Evaluate the generating function of the score of one terrain, for each rate."""
-        events, cases, p = np.arange(self._sizes[index][0] + 1), self._sizes[index][0], rates[:, None]
-        # the binomial distribution; SciPy's takes ten times longer for few values
-        logs = self._log_coefficients[index] + special.xlogy(events, p) + special.xlog1py(cases - events, -p)
-        probabilities = np.add.reduceat(np.exp(logs), self._starts[index], axis=1)
-        # without BLAS, whose threads cost more than such small products
-        return np.asarray(np.einsum("ij,jk->ik", probabilities, self._factors[index]))
-
-    def _sum(self, values: Complex128[np.ndarray, "*batch nodes"]) -> Float64[np.ndarray, "*batch"]:
-        """Sum the first coefficients of the generating function."""
-        probability = np.einsum("...k,k->...", values, self._weights).real
-        return np.asarray(1.0 - probability if self._is_complement else probability)
-
-
-def _power(values: Complex128[np.ndarray, "*batch"], exponent: int) -> Complex128[np.ndarray, "*batch"]:
-    """Raise to a positive power by repeated squaring, which is much faster than the power of complex numbers."""
-    result = values
-    for digit in bin(exponent)[3:]:
-        result = result * result * values if digit == "1" else result * result
-    return np.asarray(result)
-
-
 @lru_cache(maxsize=1024)
 def attainable_risk(sizes: Sizes, rate: float, risk: float) -> float:
     """Compute the largest p-value of a rate that is at most `risk`; 0 if there is none."""
     return _max_tail(sizes, max_statistic(sizes, rate, risk), rate, risk)
-
-
-@dataclass(frozen=True)
-class TerrainEvidence:
-    """Numbers of terrains with a case of the population, with a failure, and with a success.
-
-    failure_pairs: number of pairs of failures on one terrain
-    """
-
-    terrains: int
-    failed_terrains: int
-    successful_terrains: int
-    failure_pairs: int
-
-
-@dataclass(frozen=True)
-class ClusteredCases:
-    """Cases that share terrains.
-
-    All cases of the design are included, because the number of cases of a population on a terrain can depend on the
-    terrain. `index` numbers the terrains from 0 (`number_terrains`).
-
-    - member: whether each case belongs to the population
-    - success: whether each case is a success; ignored outside the population
-    """
-
-    success: Bool[np.ndarray, " n"]
-    member: Bool[np.ndarray, " n"]
-    index: Int[np.ndarray, " n"]
-
-    @classmethod
-    def of(cls, success: Bool[np.ndarray, " n"], index: Int[np.ndarray, " n"]) -> ClusteredCases:
-        """Create cases that all belong to the population."""
-        return cls(success, np.ones(success.size, dtype=np.bool_), index)
-
-    @cached_property
-    def failures(self) -> TerrainCounts:
-        """Failures of the population."""
-        return TerrainCounts.of(self.member & ~self.success, self.index)
-
-    @cached_property
-    def is_first_on_terrain(self) -> Bool[np.ndarray, " n"]:
-        """Whether each case is the first one on its terrain."""
-        is_first = np.zeros(self.index.size, dtype=np.bool_)
-        is_first[np.unique(self.index, return_index=True)[1]] = True
-        return is_first
-
-    def count_terrains(self) -> TerrainEvidence:
-        """Count the terrains by the outcomes of their cases."""
-        members = np.bincount(self.index, weights=self.member)
-        failures = np.bincount(self.index, weights=self.member & ~self.success)
-        return TerrainEvidence(
-            terrains=int((members > 0).sum()),
-            failed_terrains=int((failures > 0).sum()),
-            successful_terrains=int((members > failures).sum()),
-            failure_pairs=int((failures * (failures - 1.0) / 2.0).sum()),
-        )
-
-    def max_failure_rate(self, risk: float) -> float:
-        """Compute the upper bound of the failure rate in the population."""
-        min_member_rate, other_risk = self._min_member_rate(risk)
-        return min(1.0, self.failures.max_rate(other_risk) / min_member_rate) if min_member_rate > 0.0 else 1.0
-
-    def consumer_risk(self, max_failure_rate: float, risk: float) -> float:
-        """Compute the probability of this result or a better one if the failure rate is `max_failure_rate`.
-
-        risk: permitted risk; its part for the rate of members is included. The result is at most `risk` if and only if
-        the upper bound of the failure rate at this risk is at most `max_failure_rate`.
-        """
-        min_member_rate, other_risk = self._min_member_rate(risk)
-        return min(1.0, self.failures.p_value(max_failure_rate * min_member_rate) + risk - other_risk)
-
-    def additional_cases_needed(self, max_failure_rate: float, risk: float) -> int:
-        """Find the minimum number of additional cases, each on a new terrain and without a failure, for a failure rate.
-
-        The upper bound of the failure rate is then at most `max_failure_rate`. The rate of members is not increased, so
-        slightly fewer cases can be sufficient.
-        """
-        min_member_rate, other_risk = self._min_member_rate(risk)
-        rate = max_failure_rate * max(min_member_rate, _MIN_MEMBER_RATE)
-
-        def is_sufficient(cases: int) -> bool:
-            return self.failures.with_single_cases(cases).p_value(rate) <= other_risk
-
-        upper = 1
-        while not is_sufficient(upper):
-            upper *= 2
-        return bisect.bisect_left(range(upper), True, key=is_sufficient)
-
-    def _min_member_rate(self, risk: float) -> tuple[float, float]:
-        """Return the lower bound of the rate of members, and the part of the risk that it does not use."""
-        if self.member.all():
-            return 1.0, risk
-        max_other_rate = TerrainCounts.of(~self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
-        return 1.0 - max_other_rate, (1.0 - _MEMBER_RISK_FRACTION) * risk
-
-    def min_failure_rate(self, risk: float) -> float:
-        """Compute the lower bound of the failure rate in the population."""
-        max_member_rate, other_risk = 1.0, risk
-        if not self.member.all():
-            max_member_rate = TerrainCounts.of(self.member, self.index).max_rate(_MEMBER_RISK_FRACTION * risk)
-            other_risk = (1.0 - _MEMBER_RISK_FRACTION) * risk
-        no_failure = TerrainCounts.of(~self.member | self.success, self.index)
-        return (1.0 - no_failure.max_rate(other_risk)) / max_member_rate

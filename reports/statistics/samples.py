@@ -1,4 +1,4 @@
-"""Statistics of samples: quantiles, mean, standard deviation, each with bounds; prediction ellipses of errors in 2-D.
+"""Bounds of the mean, the standard deviation and the quantiles of a sample.
 
 The bounds of quantiles are order statistics, for any distribution (Wilks, "Determination of sample sizes for setting
 tolerance limits", Ann. Math. Statist. 12, 1941; used by Hanson & Beard for a specified consumer risk,
@@ -20,7 +20,6 @@ larger values has its bound (`marsyard.reports.statistics.clusters`).
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -29,9 +28,9 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy import stats
 
-from marsyard.campaigns.json_numbers import Number
-from marsyard.reports.statistics.clusters import count_sizes, event_scores, max_statistic, number_terrains
+from marsyard.reports.statistics.clusters import max_statistic
 from marsyard.reports.statistics.proportions import Interval, check_confidence
+from marsyard.reports.statistics.terrain_sizes import count_sizes, event_scores, number_terrains
 
 #: Maximum number of values (or terrains) of a bootstrap; above it, the large-sample interval is equal as printed.
 _MAX_BOOTSTRAP = 2000
@@ -41,8 +40,6 @@ _SEED = 19340401
 #: Minimum number of terrains, and of independent values, for intervals of a mean and of a standard deviation. The
 #: bootstrap of fewer values has too few distinct samples: of two values, its interval ends at these values.
 MIN_TERRAINS, _MIN_FOR_MEAN, _MIN_FOR_DEVIATION = 5, 5, 8
-#: Minimum number of points of an ellipse.
-_MIN_FOR_ELLIPSE = 5
 #: Terrain number of each value; None if all are independent.
 Groups = Int[np.ndarray, " n"] | None
 
@@ -225,153 +222,3 @@ def _bound_quantile(values: Float[np.ndarray, " n"], groups: Groups, quantile: f
     statistic = np.append(np.cumsum(np.diff(event_scores(sizes))[larger])[::-1], 0)
     is_bound = statistic[1:] <= limit
     return float(ordered[np.argmax(is_bound)]) if is_bound.any() else math.inf
-
-
-@dataclass(frozen=True)
-class Quantile:
-    """Quantile of a sample: probability, estimate and one-sided bounds (infinite where n is too small)."""
-
-    probability: Number
-    estimate: Number
-    lower: Number
-    upper: Number
-
-
-@dataclass(frozen=True)
-class ErrorSummary:
-    """Summary of a sample of errors; NaN for too few values.
-
-    - n, missing: number of finite values, and of missing values (no answer was reported)
-    - mean, mean_lower, mean_upper: mean and its two-sided interval at `confidence`
-    - sd, sd_lower, sd_upper: standard deviation (n - 1) and its two-sided interval at `confidence`
-    - rms, median: root mean square about zero, median
-    - robust_sd: median absolute deviation about the median times 1.4826 (standard deviation for normal values)
-    - largest: largest magnitude; quantiles: quantiles with order-statistic bounds at `confidence`
-    """
-
-    n: int
-    missing: int
-    mean: Number
-    mean_lower: Number
-    mean_upper: Number
-    sd: Number
-    sd_lower: Number
-    sd_upper: Number
-    rms: Number
-    median: Number
-    robust_sd: Number
-    largest: Number
-    quantiles: tuple[Quantile, ...]
-    confidence: Number
-
-
-def summarize(
-    sample: Float[np.ndarray, " n"],
-    quantiles: tuple[float, ...] = (0.5, 0.95, 0.99),
-    confidence: float = 0.95,
-    groups: Groups = None,
-) -> ErrorSummary:
-    """Summarize a sample of errors; values that are not finite are counted as missing and ignored.
-
-    For radial errors the quantiles 0.5 and 0.95 are the circular error probable and the 95 % radius about the truth.
-    """
-    values = np.asarray(sample, dtype=np.float64)
-    finite, finite_groups = values[np.isfinite(values)], None if groups is None else groups[np.isfinite(values)]
-    n, missing = finite.size, values.size - finite.size
-    median = float(np.median(finite)) if n else math.nan
-    mean_lower, mean_upper = mean_interval(finite, confidence, finite_groups)
-    sd_lower, sd_upper = standard_deviation_interval(finite, confidence, finite_groups)
-    quantile_results = []
-    for probability in quantiles:
-        estimate = float(np.quantile(finite, probability)) if is_interpolated(n, probability) else math.nan
-        bounds = quantile_bounds(finite, probability, confidence, finite_groups)
-        quantile_results.append(Quantile(probability, estimate, *bounds))
-    return ErrorSummary(
-        n=n,
-        missing=missing,
-        mean=float(finite.mean()) if n else math.nan,
-        mean_lower=mean_lower,
-        mean_upper=mean_upper,
-        sd=float(finite.std(ddof=1)) if n > 1 else math.nan,
-        sd_lower=sd_lower,
-        sd_upper=sd_upper,
-        rms=float(np.sqrt(np.mean(finite**2))) if n else math.nan,
-        median=median,
-        robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
-        largest=float(np.abs(finite).max()) if n else math.nan,
-        quantiles=tuple(quantile_results),
-        confidence=confidence,
-    )
-
-
-@dataclass(frozen=True)
-class ErrorEllipse:
-    """Ellipse that contains the next error with a specified probability, for normally distributed errors.
-
-    - centre: mean error; semi_major, semi_minor: semi-axes, in the errors' unit
-    - angle_deg: angle of the major axis from the first component towards the second, -90 (excluded) to 90 degrees
-    - probability: probability that the next error lies inside
-    - inside: fraction of the sample inside; it differs from the probability if the errors are not normal
-    """
-
-    centre: tuple[float, float]
-    semi_major: float
-    semi_minor: float
-    angle_deg: float
-    probability: float
-    inside: float
-
-    @property
-    def half_extent(self) -> float:
-        """Half the side of the smallest square centred on zero error that contains the ellipse."""
-        angle = math.radians(self.angle_deg)
-        x = math.hypot(self.semi_major * math.cos(angle), self.semi_minor * math.sin(angle))
-        y = math.hypot(self.semi_major * math.sin(angle), self.semi_minor * math.cos(angle))
-        return max(abs(self.centre[0]) + x, abs(self.centre[1]) + y)
-
-
-def error_ellipse(errors: Float[np.ndarray, "n 2"], probability: float) -> ErrorEllipse | None:
-    """Compute the prediction ellipse of two-dimensional errors; None for fewer than five errors or if all are equal.
-
-    The sample has the mean m and the covariance S. For a new error e of the same normal distribution,
-    (e - m)' S^-1 (e - m) is distributed as 2 (n - 1) (n + 1) / (n (n - 2)) times F(2, n - 2) (Hotelling; Chew,
-    "Confidence, prediction and tolerance regions for the multivariate normal distribution", J. Amer. Statist. Assoc.
-    61, 1966). On average, the fraction of future errors inside equals the probability, also for small n.
-    """
-    finite = errors[np.isfinite(errors).all(axis=1)]
-    n = len(finite)
-    if n < _MIN_FOR_ELLIPSE:
-        return None
-    centre = finite.mean(axis=0)
-    eigenvalues, axes = np.linalg.eigh(np.cov(finite.T))
-    if eigenvalues[1] <= 0.0:
-        return None
-    factor = 2.0 * (n - 1.0) * (n + 1.0) / (n * (n - 2.0)) * float(stats.f.ppf(probability, 2, n - 2))
-    variances = np.maximum(eigenvalues, 0.0)
-    principal = (finite - centre) @ axes
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squared_distances = np.where(variances > 0.0, principal**2 / variances, 0.0).sum(axis=1)
-    # `eigh` sorts the eigenvalues in ascending order; the second axis is the major axis
-    angle = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
-    return ErrorEllipse(
-        centre=(float(centre[0]), float(centre[1])),
-        semi_major=math.sqrt(factor * variances[1]),
-        semi_minor=math.sqrt(factor * variances[0]),
-        angle_deg=angle - 180.0 * math.ceil((angle - 90.0) / 180.0),
-        probability=probability,
-        inside=float((squared_distances <= factor).mean()),
-    )
-
-
-def circular_error(
-    errors: Float[np.ndarray, "n 2"], probability: float, confidence: float, groups: Groups = None
-) -> Quantile:
-    """Compute the radius about zero error that contains a fraction of the errors (0.5: circular error probable).
-
-    The bounds are one-sided order statistics, each at the confidence, for any distribution.
-    """
-    finite = np.isfinite(errors).all(axis=1)
-    radii = np.hypot(*errors[finite].T)
-    estimate = float(np.quantile(radii, probability)) if is_interpolated(radii.size, probability) else math.nan
-    bounds = quantile_bounds(radii, probability, confidence, None if groups is None else groups[finite])
-    return Quantile(probability, estimate, *bounds)

@@ -1,41 +1,27 @@
-"""Selection of rows of tracking campaigns, and sections on the target's position error: at the goal, and Table I.
+"""Section on the position error of the target at the goal.
 
 Sections, equations and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from marsyard.algorithms.interface import TargetLoss
-from marsyard.algorithms.vtt.accuracy import (
-    GOAL_M,
-    NAVCAM,
-    NAVIGATION_ERROR,
-    PANCAM,
-    START_M,
-    AccuracyRow,
-    drift_error_m,
-    stereo_range_error_m,
-    table_1,
-    tracked_approach_error_m,
-)
+from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
 from marsyard.reports.blocks import Rows, distribution_block
 from marsyard.reports.column_values import numbers
-from marsyard.reports.papers import read_paper
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, create_section, has_values
+from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.wording import NOTHING, format_fraction
+from marsyard.reports.vtt.losses import losses_grid, losses_note
+from marsyard.reports.vtt.run_selection import is_closed_loop, selectable_targets
+from marsyard.reports.wording import format_fraction
 from marsyard.scenarios.rover.stops import RunOutcome
 
-#: Columns of all rows of tracking cases.
-_TRACKING_COLUMNS = ("tracked", "drift_px", "position_error_m", "losses")
 #: Maximum position error for the instrument placement (section 4.2), metres, and required quantile of the runs.
 MAX_ERROR_M, QUANTILE = 0.03, 0.99
 #: Names of the rates of a camera's runs at selectable targets, and their keys in `summarize_cameras`.
@@ -61,28 +47,6 @@ _RATES_NOTE = (
     "projection of the designated point. The intervals are two-sided Clopper-Pearson intervals for independent cases; "
     "the section Verdict gives one-sided bounds."
 )
-
-
-def is_tracking(frame: pd.DataFrame) -> bool:
-    """Whether the rows are those of tracking cases."""
-    return {*_TRACKING_COLUMNS} <= {*frame}
-
-
-def is_closed_loop(frame: pd.DataFrame) -> bool:
-    """Whether the tracker guides the rover; in other campaigns, many targets are tracked in the same images."""
-    return is_tracking(frame) and "step" not in frame
-
-
-def selectable_targets(frame: pd.DataFrame, face: bool = True) -> pd.DataFrame:
-    """Select rows with selectable targets: sunlit, in both images to the end, not on the rock's edge.
-
-    In shared drives, whose path does not depend on the tracker, the rover's shadow is never on the target. With `face`,
-    the target is also on the rock's face, where the campaign defines it.
-    """
-    names = ["selectable", "in_view", *(["on_face"] if face else [])]
-    if "step" in frame:
-        names.append("no_rover_shadow_on_target")
-    return frame[rates.all_flags(frame, *names)]
 
 
 def _group_by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -182,39 +146,6 @@ def _describe_errors(cameras: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def losses_grid(frame: Rows) -> Grid:
-    """Count runs that ended without a tracked target, by outcome and loss criteria."""
-    failed_runs = frame[~rates.flag_mask(frame, "tracked")]
-    has_clouds = "clear_sky" in failed_runs and rates.flag_fraction(failed_runs, "clear_sky", value=False).hits > 0
-    rows = []
-    for (outcome, losses), runs in failed_runs.groupby([failed_runs["outcome"], failed_runs["losses"].fillna(NOTHING)]):
-        azimuth = rates.finite_values(runs, "azimuth_change_max_deg")
-        azimuth_text = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
-        distance_text = rates.median_text(rates.finite_values(runs, "lost_range_m"), 1)
-        loss_text = str(losses).replace("_", " ").lower()
-        row = [str(outcome), loss_text, f"{len(runs):,}", distance_text, azimuth_text]
-        n_cloudy = rates.flag_fraction(runs, "clear_sky", value=False).hits if has_clouds else 0
-        rows.append([*row, f"{n_cloudy:,}"] if has_clouds else row)
-    rows.sort(key=lambda row: -int(row[2].replace(",", "")))
-    head = ["Outcome", "Lost by", "Runs", "Lost at a range of (m)", "Maximum azimuth change (deg)"]
-    return Grid([*head, "With clouds"] if has_clouds else head, rows)
-
-
-def losses_note(frame: Rows) -> str:
-    """Describe the table of `losses_grid`, with the meaning of the loss criteria that occur."""
-    occurring = ", ".join(frame.loc[~rates.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)).split(", ")
-    meanings = [
-        f"{loss.name.replace('_', ' ').capitalize()}: {loss.value}." for loss in TargetLoss if loss.name in occurring
-    ]
-    text = (
-        'The runs ended without the target within 5 px of its true projection at the goal. "Lost by" gives the '
-        "criteria (section 4.6 of the paper) of the first update that lost the target. Ranges are medians, with "
-        "minimum to maximum in brackets. The azimuth change is that of the line of sight in the world between two "
-        "updates with a match."
-    )
-    return " ".join([text, *meanings])
-
-
 def goal_section(subject: Subject) -> Section | None:
     """Create the section on the position error at the goal; None unless the tracker guides the rover to a goal."""
     if not is_closed_loop(subject.frame):
@@ -238,113 +169,3 @@ def goal_section(subject: Subject) -> Section | None:
     return create_section(
         "goal", "Goal", "Target position error at the goal", distribution, *_create_camera_blocks(runs)
     )
-
-
-#: Table I as printed.
-PRINTED = {
-    name: AccuracyRow(name, **row)
-    for name, row in read_paper(Path(__file__).with_name("paper.toml"))["table_1"].items()
-}
-#: Maximum relative deviation of the start and goal distances of a run from those of Table I.
-_MAX_DEVIATION = 0.1
-_COMPUTED_NOTE = (
-    "The table is Table I of the paper (Kim, Nesnas and Bajracharya, visual target tracking), section 4.2. It gives "
-    f"3-sigma errors of a target's position. The target is designated at {START_M:g} m; the goal is at {GOAL_M:g} m. "
-    "N is the drift: the distance in the last image from the tracked to the designated point. The paper assumes a "
-    f"3-sigma disparity error of 1 px, and an odometry error of {100.0 * NAVIGATION_ERROR:g} % of the distance driven. "
-    'Rows "computed": Eqs. 1 to 5 of the paper with the manufacturer\'s pixel pitch of 4.65 µm. As in the paper, each '
-    "result is rounded before the next one is computed."
-)
-_MEASURED_NOTE = (
-    "Measured values are three times the root mean square (rms) of the runs. They are rough for few runs: the relative "
-    "standard error is 22 % with 10 runs. The runs are completed runs at selectable targets. Runs whose first or last "
-    f"range differs by more than {100.0 * _MAX_DEVIATION:g} % from {START_M:g} m or {GOAL_M:g} m are left out, so the "
-    "section Goal can contain more runs. Designation: error of the target's position at the first stop, in the rover "
-    "frame. Without tracking: root sum square of the designation error and the error of the rover's pose at the goal "
-    "(Eq. 3). The runs use the odometry of this campaign, the paper uses visual odometry. With tracking: error of the "
-    "reported position at the goal, in the rover frame. The paper's formula is evaluated with the measured drift. The "
-    "paper counts errors of stereo matching along the line of sight, and of drift across it. The measured errors also "
-    "contain errors of the camera calibration and of the mast's pointing. A pointing error of 0.1 deg is "
-    f"{pointing_error_cm(START_M):.1f} cm at {START_M:g} m and {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
-)
-
-
-def table_1_section(subject: Subject) -> Section | None:
-    """Create the section on Table I: computed, printed and measured; None without completed runs from 10 m to 2 m."""
-    accuracy = measured_accuracy(subject.frame)
-    if not accuracy:
-        return None
-    computed_rows = {row.name: row for row in table_1()}
-    pairs = [
-        (source, row[name]) for name in PRINTED for source, row in (("paper", PRINTED), ("computed", computed_rows))
-    ]
-    grid = build_grid(
-        pairs,
-        {
-            "Camera": lambda pair: pair[1].name,
-            "Source": lambda pair: pair[0],
-            "3 sigma at the designation (cm)": lambda pair: f"{pair[1].designation_cm:g}",
-            "3 sigma at the goal without tracking (cm)": lambda pair: f"{pair[1].untracked_cm:.1f}",
-            "3 sigma at the goal with tracking, drift of N px (cm)": lambda pair: pair[1].tracked_formula,
-        },
-    )
-    blocks = [
-        Block(heading="Computed", grid=grid, note=_COMPUTED_NOTE),
-        Block(heading="Measured in this campaign", grid=_measured_grid(accuracy), note=_MEASURED_NOTE),
-    ]
-    data = {"computed": computed_rows, "printed": PRINTED, "measured": accuracy}
-    return Section(
-        "table-1", "Position accuracy", "Accuracy of a target's position (Table I of the paper)", blocks, data
-    )
-
-
-def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
-    """Compute the 3-sigma errors (three times the root mean square) of the completed runs of each camera.
-
-    untracked_cm: error without tracking, computed by Eq. 3 from the errors of designation and pose
-
-    The disparity error cannot be computed from the designation error by Eq. 1, because most of the designation error
-    is caused by the mast and lies across the line of sight.
-    """
-    if not is_closed_loop(frame) or "designation_error_m" not in frame or "camera" not in frame:
-        return []
-    distances = {"range_start_m": START_M, "range_end_m": GOAL_M}
-    is_near = [np.abs(numbers(frame, name) / value - 1.0) < _MAX_DEVIATION for name, value in distances.items()]
-    completed_runs = selectable_targets(
-        frame[is_near[0] & is_near[1] & np.isfinite(numbers(frame, "position_error_m"))]
-    )
-    # factor 300: 3 sigma in centimetres
-    rows = []
-    for camera in sorted(completed_runs["camera"].unique()):
-        runs = completed_runs[completed_runs["camera"].eq(camera)]
-        designation, pose = numbers(runs, "designation_error_m"), numbers(runs, "pose_error_m")
-        rows.append(
-            {
-                "camera": str(camera),
-                "runs": len(runs),
-                "designation_cm": 300.0 * rates.rms(designation),
-                "untracked_cm": 300.0 * rates.rms(np.hypot(designation, pose)),
-                "tracked_cm": 300.0 * rates.rms(numbers(runs, "position_error_m")),
-                "drift_px": rates.rms(numbers(runs, "drift_px")),
-            }
-        )
-    return rows
-
-
-def _measured_grid(accuracy: Sequence[Mapping[str, Any]]) -> Grid:
-    quantities = ("Designation", "Without tracking", "With tracking")
-    pairs = [(f"{name} (cm)", f"Paper: {name.lower()} (cm)") for name in quantities[:2]]
-    pairs.append((f"{quantities[2]} (cm)", "Paper's formula: with tracking (cm)"))
-    rows = []
-    for row in accuracy:
-        printed_row = next(
-            (row_of_paper for name, row_of_paper in PRINTED.items() if row["camera"].endswith(name.lower())), None
-        )
-        paper = [NOTHING] * 3
-        if printed_row is not None:
-            paper_cm = tracked_approach_error_m(printed_row.stereo_cm, printed_row.drift_cm_px * row["drift_px"])
-            paper = [f"{printed_row.designation_cm:g}", f"{printed_row.untracked_cm:.1f}", f"{paper_cm:.1f}"]
-        measured = [f"{row[name]:.1f}" for name in ("designation_cm", "untracked_cm", "tracked_cm")]
-        texts = [text for pair in zip(measured, paper, strict=True) for text in pair]
-        rows.append([row["camera"], f"{row['runs']:,}", *texts, f"{row['drift_px']:.1f}"])
-    return Grid(["Camera", "Runs", *(heading for pair in pairs for heading in pair), "Drift, rms (px)"], rows)

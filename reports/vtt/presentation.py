@@ -5,11 +5,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from marsyard.algorithms.vtt.arm_target import HandOffOutcome
+from marsyard.reports.cell_values import is_true, to_float
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
-from marsyard.reports.products import Products, is_true, to_float
-from marsyard.reports.vtt import sections
-from marsyard.reports.vtt.case_figures import draw_path, draw_stops, is_vtt_case, read_rover_path, read_stops
+from marsyard.reports.products import Products
+from marsyard.reports.vtt.case_figures import draw_path, draw_stops
+from marsyard.reports.vtt.case_products import is_vtt_case, read_rover_path, read_stops
 from marsyard.reports.vtt.goal import goal_section
+from marsyard.reports.vtt.sections import SECTIONS
+from marsyard.reports.vtt.updates_section import DEFINITIONS
 from marsyard.reports.wording import NOTHING, label, number, percent
 from marsyard.scenarios.rover.stops import RunOutcome
 
@@ -44,7 +47,7 @@ _PATH_CAPTION = (
 _LEGEND = (
     "The layout follows Figs. 15, 17 and 16b of the paper (Kim, Nesnas and Bajracharya, visual target tracking). Mast "
     "azimuth (positive to the right) and elevation are the pointing angles of the mast relative to the rover. "
-    f"{sections.DEFINITIONS} Position error: distance of the reported from the true position of the designated point, "
+    f"{DEFINITIONS} Position error: distance of the reported from the true position of the designated point, "
     "both in the rover frame. It contains errors of stereo, calibration and mast pointing."
 )
 
@@ -107,7 +110,7 @@ def explain(row: Mapping[str, Any], metric: str) -> Cause | None:
 
 VTT = Presentation(
     cases=(CaseKind(is_vtt_case, view, _LEGEND),),
-    first=(*sections.SECTIONS, goal_section),
+    first=(*SECTIONS, goal_section),
     outcomes=(RunOutcome, HandOffOutcome),
     explain=explain,
 )

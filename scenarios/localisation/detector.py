@@ -6,7 +6,8 @@ import numpy as np
 
 from marsyard.scenarios.localisation.camera import LanderCameraParameters
 from marsyard.sim.sensor import DetectorParameters
-from marsyard.sim.sensor.optics import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath, OpticsParameters
+from marsyard.sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.radiometry import BRIGHT_FILL, BRIGHT_RADIANCE_FACTOR, LightPath
 
 #: Distance of Mars from the sun at the landing on 2021-02-18: heliocentric longitude Ls = 5 deg on the orbit of Mars.
 LANDING_AU = 1.57

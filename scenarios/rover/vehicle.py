@@ -11,8 +11,9 @@ from scipy.spatial.transform import RigidTransform
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.world import RunWorld
+from marsyard.sim.dynamics.driven_ground import DrivenGround
 from marsyard.sim.dynamics.driving import Drive, Soil, drive
-from marsyard.sim.dynamics.rover import MER, ROCKY_8, DrivenGround, RoverParameters, Stance, settle
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, Stance, settle
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand
 from marsyard.sim.sensor.odometry import Odometer, PoseEstimate

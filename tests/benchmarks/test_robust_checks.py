@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.validation import robust_checks
 from benchmarks.validation.robust_checks import _STATES
-from marsyard.reports.dispersion_changes import Kind
+from marsyard.reports.dispersion_changes import ChangeKind
 
 
 @pytest.mark.parametrize("state", _STATES, ids=lambda state: state.name)
@@ -14,10 +14,10 @@ def test_rates_are_those_of_drawn_cases(state: robust_checks._State) -> None:
     rng = np.random.default_rng(5)
     for change, rate in ((0.0, state.rate(0.0)), (state.exact, state.permitted)):
         z = rng.standard_normal((400_000, 2))
-        if state.kind is Kind.MEAN_UP:
+        if state.kind is ChangeKind.MEAN_UP:
             z[:, 0] += change
         else:
-            z[:, 0] *= 1.0 + change if state.kind is Kind.WIDER else 1.0 - change
+            z[:, 0] *= 1.0 + change if state.kind is ChangeKind.WIDER else 1.0 - change
         member = state.belongs(z)
         drawn = (member & state.fails(z)).sum() / member.sum()
         assert drawn == pytest.approx(rate, abs=5.0 * np.sqrt(rate * (1.0 - rate) / member.sum()))

@@ -140,7 +140,7 @@ def test_command_in_the_report_repeats_the_campaign(folder: Path, tmp_path: Path
 
 
 def test_appended_blocks_are_in_the_command(folder: Path) -> None:
-    from marsyard.reports.page import rerun_commands
+    from marsyard.reports.provenance import rerun_commands
     from marsyard.reports.stored import read_run
 
     run = read_run(folder / "run")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from marsyard import site_gallery as gallery_command
+from marsyard.image_request import ImageRequest
 from marsyard.sim.sensor import PRESETS
 from marsyard.sim.terrain import sites
 from marsyard.site_gallery import (
@@ -21,7 +22,6 @@ from marsyard.site_gallery import (
     map_to_grey,
     write_gallery,
 )
-from marsyard.site_images import ImageRequest
 from tests.command import marsyard
 
 

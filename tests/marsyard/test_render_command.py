@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial.transform import RigidTransform
 
 from marsyard import site_images
+from marsyard.image_files import SUFFIXES
 from marsyard.sim.camera import read_cahvor
 from marsyard.sim.kernel_cache import mark_ready
 from marsyard.sim.render import Objects, Sun, scene
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.casters import Casters
 from marsyard.sim.render.scene import casters_towards
-from marsyard.site_images import SUFFIXES
 from tests.command import marsyard
 
 

@@ -81,7 +81,7 @@ def test_wrong_target_is_reported_before_the_case_runs(
 
 
 def test_missing_package_is_reported(stored_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("marsyard.cli.replay.find_spec", lambda _name: None)
+    monkeypatch.setattr("marsyard.cli.timeline_exports.find_spec", lambda _name: None)
     status, output = run_command("replay", stored_run, 0, "--rerun", tmp_path / "case.rrd")
     assert status == 2
     assert "pip install 'marsyard[view]'" in " ".join(output.split())

@@ -123,13 +123,17 @@ def test_campaign_has_a_view_for_notebooks() -> None:
     assert "<td>V</td>" in text
 
 
-def test_arguments_of_a_file_are_rejected_for_a_campaign(tmp_path: Path) -> None:
-    with pytest.raises(CampaignError, match="given by its name or file"):
-        marsyard.run(_create_campaign(), cases=3, directory=tmp_path / "run")
-    with pytest.raises(CampaignError, match="compare needs an algorithm under test"):
-        marsyard.run(_create_campaign(), compare=["dimes"], directory=tmp_path / "run")
-    with pytest.raises(CampaignError, match=r"unknown algorithm 'dimse' \(did you mean"):
-        marsyard.run(_create_campaign(), "dimse", directory=tmp_path / "run")
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"cases": 3}, "given by its name or file"),
+        ({"compare": ["dimes"]}, "compare needs an algorithm under test"),
+        ({"algorithm": "dimse"}, r"unknown algorithm 'dimse' \(did you mean"),
+    ],
+)
+def test_invalid_arguments_are_rejected_for_a_campaign(tmp_path: Path, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(CampaignError, match=message):
+        marsyard.run(_create_campaign(), directory=tmp_path / "run", **arguments)
 
 
 @pytest.fixture

@@ -18,9 +18,9 @@ from marsyard.reports.blocks import (
     flag_rate,
     quantile_block,
     rate_block,
-    scatter_block,
 )
 from marsyard.reports.campaign import section_makers, write_report
+from marsyard.reports.effects import scatter_block
 from marsyard.reports.papers import paper_section
 from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.presentation import Presentation, presentations

@@ -8,14 +8,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from marsyard.reports.comparison import (
-    MetricComparison,
-    campaign_diff_grid,
-    compare_algorithms,
-    compare_campaigns,
-    list_metrics,
-    select_algorithm,
-)
+from marsyard.reports.campaign_diff import MetricComparison, campaign_diff_grid, compare_campaigns, list_metrics
+from marsyard.reports.comparison import compare_algorithms, select_algorithm
 from marsyard.reports.consistency import evaluate_consistencies, evaluate_consistency
 from marsyard.reports.statistics.changes import difference_p_value
 from marsyard.reports.stored import read_run

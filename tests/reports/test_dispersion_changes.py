@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import norm, truncnorm
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.reports.dispersion_changes import Change, Kind, Quantity
+from marsyard.reports.dispersion_changes import Change, ChangeKind, DispersedQuantity
 
 DISPERSION = """
 name = "changes"
@@ -22,14 +22,14 @@ seed = 3
 """
 
 
-def quantity_of(folder: Path, distribution: str, others: str = "") -> Quantity:
+def quantity_of(folder: Path, distribution: str, others: str = "") -> DispersedQuantity:
     """Return the quantity of a dispersion."""
     path = folder / "campaign.toml"
     path.write_text(DISPERSION.format(distribution=distribution, others=others))
-    return Quantity.of(load_campaign(str(path)), "loads.0", 0)
+    return DispersedQuantity.of(load_campaign(str(path)), "loads.0", 0)
 
 
-def sizes_of(quantity: Quantity, kind: Kind, change: float) -> float:
+def sizes_of(quantity: DispersedQuantity, kind: ChangeKind, change: float) -> float:
     """Return the size of a shift of z, or of a change of its standard deviation."""
     sizes = quantity.sizes(Change(kind, np.array([0.0, change]), np.ones((2, 1)), np.ones(2)))
     assert sizes is not None
@@ -44,9 +44,9 @@ def test_sizes_of_a_bounded_dispersion_are_those_of_its_mean_and_spread(tmp_path
     uniform = quantity_of(tmp_path, '{ distribution = "uniform", low = -3.0, high = 7.0 }')
     assert uniform.declared == pytest.approx((2.0, 10.0 / math.sqrt(12.0)), rel=1e-5)
     mean = (norm.cdf(2.0 / math.sqrt(2.0)) - 0.5) * math.sqrt(12.0)
-    assert sizes_of(uniform, Kind.MEAN_UP, 2.0) == pytest.approx(mean, rel=1e-4)
-    assert sizes_of(uniform, Kind.MEAN_DOWN, 2.0) == pytest.approx(mean, rel=1e-4)
-    for kind, scale in ((Kind.WIDER, 1.3), (Kind.NARROWER, 0.6)):
+    assert sizes_of(uniform, ChangeKind.MEAN_UP, 2.0) == pytest.approx(mean, rel=1e-4)
+    assert sizes_of(uniform, ChangeKind.MEAN_DOWN, 2.0) == pytest.approx(mean, rel=1e-4)
+    for kind, scale in ((ChangeKind.WIDER, 1.3), (ChangeKind.NARROWER, 0.6)):
         deviation = math.sqrt(12.0 * math.asin(scale**2 / (1.0 + scale**2)) / (2.0 * math.pi))
         assert sizes_of(uniform, kind, abs(scale - 1.0)) == pytest.approx(abs(deviation - 1.0), rel=1e-4)
 
@@ -54,7 +54,12 @@ def test_sizes_of_a_bounded_dispersion_are_those_of_its_mean_and_spread(tmp_path
 def test_sizes_of_a_normal_dispersion_are_those_of_z(tmp_path: Path) -> None:
     normal = quantity_of(tmp_path, '{ distribution = "normal", mean = 4.0, sd = 0.1 }')
     assert normal.declared == pytest.approx((4.0, 0.1), rel=1e-6)
-    for kind, size in ((Kind.MEAN_UP, 1.3), (Kind.MEAN_DOWN, 0.2), (Kind.WIDER, 0.4), (Kind.NARROWER, 0.9)):
+    for kind, size in (
+        (ChangeKind.MEAN_UP, 1.3),
+        (ChangeKind.MEAN_DOWN, 0.2),
+        (ChangeKind.WIDER, 0.4),
+        (ChangeKind.NARROWER, 0.9),
+    ):
         assert sizes_of(normal, kind, size) == pytest.approx(size, rel=1e-5)
 
 
@@ -69,13 +74,15 @@ def test_sizes_of_truncated_discrete_and_heavy_tailed_dispersions(tmp_path: Path
     lognormal = quantity_of(tmp_path, '{ distribution = "lognorm", s = 1.0 }')
     assert lognormal.declared == pytest.approx((math.exp(0.5), math.exp(0.5) * math.sqrt(math.e - 1.0)), rel=1e-4)
     # exp(z + d) has the mean exp(d + 1 / 2)
-    assert sizes_of(lognormal, Kind.MEAN_UP, 0.5) == pytest.approx(math.expm1(0.5) / math.sqrt(math.e - 1.0), rel=1e-4)
+    assert sizes_of(lognormal, ChangeKind.MEAN_UP, 0.5) == pytest.approx(
+        math.expm1(0.5) / math.sqrt(math.e - 1.0), rel=1e-4
+    )
     cauchy = quantity_of(tmp_path, '{ distribution = "cauchy" }')
     assert np.isnan(cauchy.declared).all()
-    assert sizes_of(cauchy, Kind.MEAN_UP, 0.7) == 0.7
+    assert sizes_of(cauchy, ChangeKind.MEAN_UP, 0.7) == 0.7
     # scaling z does not change two values with equal probabilities
     coin = quantity_of(tmp_path, '{ distribution = "bernoulli", p = 0.5 }')
-    assert coin.sizes(Change(Kind.WIDER, np.array([0.0, 0.2]), np.ones((2, 1)), np.ones(2))) is None
+    assert coin.sizes(Change(ChangeKind.WIDER, np.array([0.0, 0.2]), np.ones((2, 1)), np.ones(2))) is None
 
 
 def test_sizes_of_a_formula_are_those_of_one_case(tmp_path: Path) -> None:
@@ -85,4 +92,4 @@ def test_sizes_of_a_formula_are_those_of_one_case(tmp_path: Path) -> None:
     quantity = quantity_of(tmp_path, formula, other)
     assert not quantity.is_absolute
     mean = (norm.cdf(2.0 / math.sqrt(2.0)) - 0.5) * math.sqrt(12.0)
-    assert sizes_of(quantity, Kind.MEAN_UP, 2.0) == pytest.approx(mean, rel=1e-4)
+    assert sizes_of(quantity, ChangeKind.MEAN_UP, 2.0) == pytest.approx(mean, rel=1e-4)

@@ -7,18 +7,9 @@ import numpy as np
 import pytest
 
 from marsyard.campaigns.errors import StoreError
-from marsyard.reports.history import (
-    FINISHED,
-    INTERRUPTED,
-    RUNNING,
-    Change,
-    Comparison,
-    History,
-    NightCampaign,
-    find_changes,
-    format_night_page,
-    list_comparisons,
-)
+from marsyard.reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, list_comparisons
+from marsyard.reports.history_changes import Change, Comparison, find_changes
+from marsyard.reports.night_page import format_night_page
 from marsyard.reports.statistics.changes import Metric, Sample
 
 N_CASES, N_TERRAINS = 100, 12

@@ -13,6 +13,7 @@ import pytest
 
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin
+from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dimes.presentation import DIMES
 from marsyard.reports.evaluation import evaluate_run
@@ -20,8 +21,8 @@ from marsyard.reports.gallery import gallery_cases
 from marsyard.reports.hda.presentation import HDA
 from marsyard.reports.localisation.presentation import LOCALISATION
 from marsyard.reports.presentation import Cause, Presentation
-from marsyard.reports.products import thumbnail
-from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder, compute_margins
+from marsyard.reports.requirement_cases import MAX_NEAREST, MAX_VIOLATIONS, CaseFinder
+from marsyard.reports.thumbnails import thumbnail
 from marsyard.reports.vtt.presentation import VTT
 from marsyard.reports.wording import label
 from tests.reports.hda import synthetic_landing

@@ -21,19 +21,13 @@ from scipy.stats import norm
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
-from marsyard.reports.dispersion_changes import Kind, list_changes
-from marsyard.reports.robustness import (
-    ALL_DISPERSIONS,
-    Outcome,
-    Robustness,
-    binary_divergence,
-    evaluate_robustness,
-    population_divergence,
-    reach_text,
-    robustness_text,
-)
+from marsyard.reports.dispersion_changes import ChangeKind, list_changes
+from marsyard.reports.robustness import ALL_DISPERSIONS, Outcome, Robustness, evaluate_robustness
+from marsyard.reports.robustness_sentences import reach_text, robustness_text
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.statistics.weighted import Crossing, find_crossing, weighted_rates
+from marsyard.reports.statistics.crossing import Crossing, find_crossing
+from marsyard.reports.statistics.divergence import binary_divergence, population_divergence
+from marsyard.reports.statistics.weighted import weighted_rates
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import number
@@ -62,7 +56,7 @@ Fails = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 def evaluate(
     folder: Path, cases: int, probability: float, fails: Fails, population: str = "all", **changes: Any
-) -> tuple[list[Verdict], dict[tuple[str, Kind], Robustness], tuple[Robustness, ...]]:
+) -> tuple[list[Verdict], dict[tuple[str, ChangeKind], Robustness], tuple[Robustness, ...]]:
     """Evaluate cases of a limit state; `fails` are functions of both loads as standard normal numbers, and of kind."""
     path = folder / "campaign.toml"
     path.write_text(CAMPAIGN.format(cases=cases, probability=probability, population=population))
@@ -82,17 +76,17 @@ def evaluate(
 
 #: Limit states with 2 % of failures, which have 5 % after a known change: failures, and the change in assumed spreads.
 TAIL, HALF, CORE = norm.isf(0.02), norm.isf(0.01), norm.ppf(0.51)
-LIMIT_STATES: dict[Kind, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
+LIMIT_STATES: dict[ChangeKind, tuple[Callable[[np.ndarray], np.ndarray], float]] = {
     # the rate is 1 - Phi(TAIL - d) for a mean of d
-    Kind.MEAN_UP: (lambda z: z > TAIL, TAIL - norm.isf(0.05)),
-    Kind.MEAN_DOWN: (lambda z: z < -TAIL, TAIL - norm.isf(0.05)),
+    ChangeKind.MEAN_UP: (lambda z: z > TAIL, TAIL - norm.isf(0.05)),
+    ChangeKind.MEAN_DOWN: (lambda z: z < -TAIL, TAIL - norm.isf(0.05)),
     # it is 2 - 2 Phi(HALF / s), or 2 Phi(CORE / s) - 1, for a standard deviation of s
-    Kind.WIDER: (lambda z: np.abs(z) > HALF, HALF / norm.isf(0.025) - 1.0),
-    Kind.NARROWER: (lambda z: np.abs(z) < CORE, 1.0 - CORE / norm.ppf(0.525)),
+    ChangeKind.WIDER: (lambda z: np.abs(z) > HALF, HALF / norm.isf(0.025) - 1.0),
+    ChangeKind.NARROWER: (lambda z: np.abs(z) < CORE, 1.0 - CORE / norm.ppf(0.525)),
 }
 
 
-def find_crossings(z: np.ndarray) -> dict[Kind, Crossing]:
+def find_crossings(z: np.ndarray) -> dict[ChangeKind, Crossing]:
     """Find the changes to FAIL, of more than 5 % of failures, of the limit states."""
     crossings = {}
     for change in list_changes(None, z):
@@ -118,7 +112,7 @@ def test_interval_covers_the_change_to_fail(cases: int) -> None:
     """
     rng = np.random.default_rng(4)
     covered = {kind: np.zeros(2) for kind in LIMIT_STATES}
-    errors: dict[Kind, list[float]] = {kind: [] for kind in LIMIT_STATES}
+    errors: dict[ChangeKind, list[float]] = {kind: [] for kind in LIMIT_STATES}
     for _ in range(200):
         for kind, crossing in find_crossings(rng.standard_normal(cases)).items():
             exact = LIMIT_STATES[kind][1]
@@ -134,17 +128,17 @@ def test_changes_have_the_units_of_the_parameters(tmp_path: Path) -> None:
     """The cases fail if z0 > 2 or z1 < -2.2 for a normal load 0 (10, 2) and a uniform load 1 (20 to 40)."""
     fails = lambda first, second, kind: (first > 2.0) | (second < -2.2)  # noqa: E731
     _, records, _ = evaluate(tmp_path, 3000, 0.9, fails)
-    up, wider = records["loads.0", Kind.MEAN_UP], records["loads.0", Kind.WIDER]
+    up, wider = records["loads.0", ChangeKind.MEAN_UP], records["loads.0", ChangeKind.WIDER]
     assert (up.assumed, up.spread, wider.assumed) == pytest.approx((10.0, 2.0, 2.0), abs=1e-6)
     assert up.fails_at == pytest.approx(10.0 + 2.0 * up.change)
     assert up.passes_at == pytest.approx(10.0 + 2.0 * up.lower)
     assert wider.passes_at == pytest.approx(2.0 * (1.0 + wider.lower))
-    down = records["loads.1", Kind.MEAN_DOWN]
+    down = records["loads.1", ChangeKind.MEAN_DOWN]
     assert down.spread == pytest.approx(20.0 / math.sqrt(12.0), rel=1e-3)
     assert down.passes_at == pytest.approx(30.0 - down.spread * down.lower, rel=1e-3)
     assert up.outcome is down.outcome is Outcome.FOUND
     # the other direction does not lead to FAIL within the reach of the cases
-    other = records["loads.0", Kind.MEAN_DOWN]
+    other = records["loads.0", ChangeKind.MEAN_DOWN]
     assert other.outcome is Outcome.REFUSED
     assert math.isnan(other.change)
 
@@ -155,7 +149,7 @@ def test_probability_of_a_value(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     fails = lambda first, second, kind: (kind == "rough") & (rng.random(kind.size) < 0.2)  # noqa: E731
     _, records, _ = evaluate(tmp_path, 4000, 0.95, fails)
-    rough, plain = records["kindrough", Kind.MORE_FREQUENT], records["kindplain", Kind.MORE_FREQUENT]
+    rough, plain = records["kindrough", ChangeKind.MORE_FREQUENT], records["kindplain", ChangeKind.MORE_FREQUENT]
     assert rough.assumed == pytest.approx(0.1)
     # 80 failures: the standard deviation of their fraction is 0.02
     assert rough.fails_at == pytest.approx(0.25, rel=0.2)
@@ -224,31 +218,31 @@ def test_divergence_of_a_population_is_that_of_all_cases(tmp_path: Path) -> None
     answered = np.arange(900) % 3 == 0
     fails = lambda first, second, kind: first > 2.3  # noqa: E731
     verdicts, records, _ = evaluate(tmp_path, 900, 0.95, fails, population="valid", answered=answered)
-    item = records[ALL_DISPERSIONS, Kind.DIVERGENCE]
+    item = records[ALL_DISPERSIONS, ChangeKind.DIVERGENCE]
     assert verdicts[0].n == 300
     assert 0.0 < item.passes_at < 0.34 * binary_divergence(0.05, 1.0 - verdicts[0].lower)
 
 
 def test_divergence_follows_from_the_bounds_of_the_verdict(tmp_path: Path) -> None:
     verdicts, records, _ = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
-    item = records[ALL_DISPERSIONS, Kind.DIVERGENCE]
+    item = records[ALL_DISPERSIONS, ChangeKind.DIVERGENCE]
     assert verdicts[0].status is Status.PASS
     assert item.passes_at == pytest.approx(binary_divergence(0.05, 1.0 - verdicts[0].lower))
     # a shift of one normal dispersion by d has the divergence d^2 / 2: PASS then holds for any direction
-    assert item.lower <= records["loads.0", Kind.MEAN_UP].lower
+    assert item.lower <= records["loads.0", ChangeKind.MEAN_UP].lower
 
 
 def test_few_cases_are_refused(tmp_path: Path) -> None:
     """Of 29 cases, nothing is said about any change, except about those of bounded divergence."""
     _, _, records = evaluate(tmp_path, 29, 0.9, lambda first, second, kind: first > 9.0)
-    assert [item.kind for item in records] == [Kind.DIVERGENCE]
+    assert [item.kind for item in records] == [ChangeKind.DIVERGENCE]
     assert records[0].outcome is Outcome.REFUSED
 
 
 def test_change_is_refused_below_30_effective_cases(tmp_path: Path) -> None:
     """Of 200 cases, a shift d leaves 200 exp(-d^2) effective cases: at most d = 1.377."""
     _, records, _ = evaluate(tmp_path, 200, 0.9, lambda first, second, kind: first > 9.0)
-    item = records["loads.0", Kind.MEAN_UP]
+    item = records["loads.0", ChangeKind.MEAN_UP]
     assert item.outcome is Outcome.REFUSED
     assert 0.0 < item.lower < item.reach <= math.sqrt(math.log(200.0 / 30.0)) + 1e-9
     assert item.effective_cases >= 30.0 * (1.0 - 1e-6)
@@ -291,36 +285,36 @@ def test_shared_terrains_are_the_units(tmp_path: Path, failures: int) -> None:
         terrain=np.arange(600) // 3,
     )  # fmt: skip
     assert verdicts[0].status is Status.PASS
-    item = records["loads.0", Kind.MEAN_UP]
+    item = records["loads.0", ChangeKind.MEAN_UP]
     independent = evaluate(tmp_path, 600, 0.9, lambda first, second, kind: np.argsort(np.argsort(-first)) < failures)[
         1
-    ]["loads.0", Kind.MEAN_UP]
+    ]["loads.0", ChangeKind.MEAN_UP]
     assert 0.0 < item.lower < independent.lower
     assert item.effective_cases <= 200.0
 
 
 def test_unfinished_cases_are_failures(tmp_path: Path) -> None:
     """Crashed cases with large z0 count as failures at their weights, although their metric is unknown."""
-    first = evaluate(tmp_path, 400, 0.9, lambda first, second, kind: first > 9.0)[1]["loads.0", Kind.MEAN_UP]
+    first = evaluate(tmp_path, 400, 0.9, lambda first, second, kind: first > 9.0)[1]["loads.0", ChangeKind.MEAN_UP]
     frame_outcomes = ["CRASHED" if case % 40 == 0 else "VALID" for case in range(400)]
     crashed = evaluate(tmp_path, 400, 0.9, lambda first, second, kind: first > 9.0, outcome=frame_outcomes)[1]
-    assert crashed["loads.0", Kind.MEAN_UP].lower < first.lower
+    assert crashed["loads.0", ChangeKind.MEAN_UP].lower < first.lower
 
 
 def test_rows_with_other_draws_are_not_weighted(tmp_path: Path) -> None:
     """If the rows do not contain the values that the definition draws, only the divergence remains."""
     draws: dict[str, Any] = {"loads.0": np.linspace(0.0, 20.0, 300)}
     _, _, records = evaluate(tmp_path, 300, 0.9, lambda first, second, kind: first > 9.0, **draws)
-    assert [item.kind for item in records] == [Kind.DIVERGENCE]
+    assert [item.kind for item in records] == [ChangeKind.DIVERGENCE]
 
 
 def test_sentence_states_the_reach_of_the_pass(tmp_path: Path) -> None:
     verdicts, records, all_records = evaluate(tmp_path, 2000, 0.95, lambda first, second, kind: first > 2.0)
     text = robustness_text(verdicts[0], all_records)
-    means = [item.lower for key, item in records.items() if key[1] in (Kind.MEAN_UP, Kind.MEAN_DOWN)]
+    means = [item.lower for key, item in records.items() if key[1] in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN)]
     assert f"(90 % confidence, one change at a time) for a shift of any mean by {min(means):.4f}"[:-1] in text
     assert "any change of all dispersions up to a divergence of 0.0" in text
-    wider, up = records["loads.0", Kind.WIDER], records["loads.0", Kind.MEAN_UP]
+    wider, up = records["loads.0", ChangeKind.WIDER], records["loads.0", ChangeKind.MEAN_UP]
     nearest = wider if wider.change < up.change else up
     assert f"by chance on average): {nearest.fail_text}" in text
     assert " assumed; PASS up to " in nearest.fail_text
@@ -338,9 +332,9 @@ def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:
     verdicts, records, all_records = evaluate(
         tmp_path, 1000, 0.98, lambda first, second, kind: np.argsort(np.argsort(-first)) < 3
     )
-    assert records["loads.0", Kind.MEAN_UP].outcome is Outcome.FOUND
-    assert records["loads.0", Kind.MEAN_UP].effective_cases >= 30.0
-    assert math.isnan(records["loads.0", Kind.WIDER].upper)
+    assert records["loads.0", ChangeKind.MEAN_UP].outcome is Outcome.FOUND
+    assert records["loads.0", ChangeKind.MEAN_UP].effective_cases >= 30.0
+    assert math.isnan(records["loads.0", ChangeKind.WIDER].upper)
     assert "standard deviation of loads 0" not in robustness_text(verdicts[0], all_records)
 
 
@@ -353,12 +347,12 @@ def test_rate_has_no_confidence(tmp_path: Path) -> None:
 
 def test_reach_is_the_smallest_change_that_loses_the_verdict(tmp_path: Path) -> None:
     verdicts, records, all_records = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
-    distributions = {key: item.lower for key, item in records.items() if key[1] is not Kind.DIVERGENCE}
+    distributions = {key: item.lower for key, item in records.items() if key[1] is not ChangeKind.DIVERGENCE}
     key = min(distributions, key=lambda name: distributions[name])
     text = reach_text(verdicts[0], all_records)
     assert text == f"holds up to {number(distributions[key])} spreads ({records[key].name}, {key[1]})"
     assert "loads 0" in text
-    assert reach_text(verdicts[0], [item for item in all_records if item.kind is Kind.DIVERGENCE]) == ""
+    assert reach_text(verdicts[0], [item for item in all_records if item.kind is ChangeKind.DIVERGENCE]) == ""
     assert reach_text(replace(verdicts[0], status=Status.INSUFFICIENT), all_records) == ""
 
 
@@ -368,7 +362,7 @@ def test_too_few_terrains_for_any_change_are_stated(tmp_path: Path) -> None:
         tmp_path, 60, 0.8, lambda first, second, kind: first > 9.0, terrain=np.arange(60) // 3
     )
     assert verdicts[0].status is Status.PASS
-    (ball,) = [item for item in records if item.kind is Kind.DIVERGENCE]
+    (ball,) = [item for item in records if item.kind is ChangeKind.DIVERGENCE]
     refused = [item for item in records if item is not ball] + [replace(ball, lower=math.nan)]
     text = robustness_text(verdicts[0], refused)
     assert text.startswith("The cases are too few to state how far PASS reaches (effective number: 20).")

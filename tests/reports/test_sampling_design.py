@@ -13,7 +13,7 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.overall import combine_verdicts, compute_exit_code
 from marsyard.reports.sampling_design import INDEPENDENT, SamplingDesign, read_sampling_design
-from marsyard.reports.tables import verdict_table
+from marsyard.reports.terminal_tables import verdict_table
 from marsyard.reports.verdicts import Status
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 

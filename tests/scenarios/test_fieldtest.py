@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.scenarios import fieldtest
 from marsyard.scenarios.cameras import camera_optics
+from marsyard.scenarios.fieldtest import imaging
 from marsyard.scenarios.fieldtest import run as run_module
 from marsyard.scenarios.fieldtest.case_order import case_order
 from marsyard.scenarios.fieldtest.elevation_model import simulate_elevation_model
@@ -201,7 +202,7 @@ def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatc
         return take_image(*arguments)
 
     monkeypatch.setattr(run_module, "detect_targets", record_detection)
-    monkeypatch.setattr(run_module, "take_image", record_state)
+    monkeypatch.setattr(imaging, "take_image", record_state)
     parameters = make_parameters(drift={"change_k": 0.0}, targets={"images": 3})
     key = RunKey(parameters, run_index, 6, "test")
     run = simulate_run(key)

@@ -19,7 +19,7 @@ from marsyard.campaigns.errors import CampaignError
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.replay import replay
 from marsyard.campaigns.store import record
-from marsyard.campaigns.studies import budget, runner
+from marsyard.campaigns.studies import budget, point_runner
 from marsyard.campaigns.studies.budget import STREAMS, active_sources, start_budget
 from marsyard.campaigns.studies.contributions import compute_budget
 from marsyard.campaigns.studies.results import BudgetParameters, BudgetResult
@@ -241,7 +241,7 @@ def test_sources_of_all_scenarios_have_valid_values() -> None:
 @pytest.mark.slow
 def test_study_ends_if_first_cases_crash(campaign_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(budget, "_BATCH", 1)
-    monkeypatch.setattr(runner, "_MAX_FIRST_CRASHES", 5)
+    monkeypatch.setattr(point_runner, "_MAX_FIRST_CRASHES", 5)
     with pytest.raises(CampaignError, match=r"none of the first \d+ cases finished: ValueError: math domain error"):
         run_budget(campaign_path, tmp_path / "run", BudgetParameters("ERROR", 20), "refused_fraction=-1.0")
     assert record.read(tmp_path / "run")["state"] == "interrupted"

@@ -30,10 +30,11 @@ from marsyard.campaigns.studies.results import RobustVariant
 from marsyard.campaigns.studies.robust import choose_cases, start_robust
 from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.dispersion_changes import Kind
+from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.robustness import Outcome, reach_text
-from marsyard.reports.statistics.clusters import ClusteredCases
+from marsyard.reports.robustness import Outcome
+from marsyard.reports.robustness_sentences import reach_text
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.scenarios.systems import catalogue
@@ -80,7 +81,7 @@ def test_change_of_a_fixed_parameter(run: Path) -> None:
     assert replay(directory, 4).differing == ()
 
     evaluation = evaluate_run(run)
-    item = next(item for item in evaluation.robustness if item.kind is Kind.VALUE and item.requirement == "LOAD")
+    item = next(item for item in evaluation.robustness if item.kind is ChangeKind.VALUE and item.requirement == "LOAD")
     loads = np.sort([row["load"] for row in base])[::-1]
     exact = 100.0 - loads[10]  # decrease of beta at which 11 of 200 cases fail, more than 5 %
     assert item.outcome is Outcome.FOUND
@@ -242,7 +243,7 @@ def test_interrupted_study_resumes_with_the_same_rows(run: Path, tmp_path: Path)
     shutil.rmtree(partial)
     with pytest.raises(KeyboardInterrupt):
         start_robust(run, {"beta": 1.0}, (), 60, whole, ExecutorConfig(1), Interruption())
-    assert not any(item.kind is Kind.VALUE for item in evaluate_run(run).robustness)
+    assert not any(item.kind is ChangeKind.VALUE for item in evaluate_run(run).robustness)
     result = CliRunner().invoke(app, ["resume", str(whole), "--jobs", "1"])
     assert result.exit_code == 0, result.output
     times = ("wall_time_s", "cpu_time_s")

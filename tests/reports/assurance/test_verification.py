@@ -13,7 +13,8 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.assurance.case import Case, Kind, State, build_case, number_elements
+from marsyard.reports.assurance.case import Case, build_case
+from marsyard.reports.assurance.elements import ElementKind, State, number_elements
 from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
@@ -229,7 +230,7 @@ def test_failed_requirement_refutes_the_claim(tmp_path: Path) -> None:
     (tmp_path / "package").mkdir()
     case = write_package([run], tmp_path / "package")
     assert case.root.state is State.REFUTED
-    solution = next(item for _, item, _ in number_elements(case.root) if item.kind is Kind.SOLUTION)
+    solution = next(item for _, item, _ in number_elements(case.root) if item.kind is ElementKind.SOLUTION)
     assert solution.text.startswith("FAIL: ")
 
 

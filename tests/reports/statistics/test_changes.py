@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.changes import Sample, correct_holm, difference_p_value
+from marsyard.reports.statistics.changes import Sample, difference_p_value
+from marsyard.reports.statistics.multiple_tests import correct_holm
 
 
 def _make_sample(values: np.ndarray, terrains: np.ndarray | None = None) -> Sample:

@@ -9,17 +9,11 @@ import pytest
 from scipy import stats
 
 from marsyard.reports.statistics import clusters
-from marsyard.reports.statistics.clusters import (
-    ClusteredCases,
-    Sizes,
-    TailFunction,
-    TerrainCounts,
-    count_sizes,
-    event_scores,
-    max_statistic,
-    number_terrains,
-)
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
+from marsyard.reports.statistics.clusters import TerrainCounts, max_statistic
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.tail_function import TailFunction
+from marsyard.reports.statistics.terrain_sizes import Sizes, count_sizes, event_scores, number_terrains
 
 #: Designs: 8 terrains of 3 cases, 250 of 4, and unequal numbers of cases.
 DESIGNS: dict[str, Sizes] = {
@@ -189,13 +183,13 @@ def test_more_cases_do_not_make_the_verdict_worse() -> None:
 
 def test_search_for_a_statistic_ends_at_a_sufficient_probability(monkeypatch: pytest.MonkeyPatch) -> None:
     sizes, rate, risk, calls = ((1, 4), (3, 12)), 0.21, 0.1, [0]
-    evaluate = clusters.TailFunction.of_pairs
+    evaluate = TailFunction.of_pairs
 
     def count(*arguments: Any) -> Any:
         calls[0] += 1
         return evaluate(*arguments)
 
-    monkeypatch.setattr(clusters.TailFunction, "of_pairs", count)
+    monkeypatch.setattr(TailFunction, "of_pairs", count)
     p_values = [TerrainCounts(sizes, statistic).p_value(rate) for statistic in range(12)]
     assert clusters.max_statistic(sizes, rate, risk) == sum(value <= risk for value in p_values) - 1
     calls[0] = 0

@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marsyard.reports.statistics.samples import ErrorEllipse, circular_error, error_ellipse
+from marsyard.reports.statistics.ellipse import ErrorEllipse, error_ellipse
+from marsyard.reports.statistics.error_summary import circular_error
 
 
 def _draw_errors(rng: np.random.Generator, n: int) -> np.ndarray:

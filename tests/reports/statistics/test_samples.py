@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, standard_deviation_interval, summarize
+from marsyard.reports.statistics.error_summary import summarize
+from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, standard_deviation_interval
 
 
 @pytest.mark.parametrize(("quantile", "confidence", "n"), [(0.95, 0.95, 59), (0.99, 0.9, 230), (0.99, 0.95, 299)])

@@ -11,14 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from marsyard.reports.statistics.proportions import (
-    SequentialTest,
-    confidence_at,
-    planned_looks,
-    proportion_lower,
-    proportion_upper,
-    risk_fraction_at,
-)
+from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
+from marsyard.reports.statistics.sequential import SequentialTest, confidence_at, planned_looks, risk_fraction_at
 
 
 def test_planned_looks_halve_the_number_of_cases() -> None:

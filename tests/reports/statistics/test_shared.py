@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from marsyard.reports.statistics.error_summary import summarize
 from marsyard.reports.statistics.samples import (
     MIN_TERRAINS,
     mean_interval,
     quantile_bounds,
     standard_deviation_interval,
-    summarize,
 )
 
 

@@ -7,7 +7,7 @@ import pytest
 from jaxtyping import Bool
 from scipy import stats
 
-from marsyard.reports.statistics.clusters import ClusteredCases
+from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
 from marsyard.reports.statistics.weighted import weighted_rates
 
