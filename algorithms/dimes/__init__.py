@@ -9,15 +9,6 @@ from marsyard.algorithms.dimes.tilt import GroundFit
 from marsyard.algorithms.dimes.validity import Combination, TrackMetrics, ValidityCheck
 
 __all__ = [
-    "Combination",
-    "DimesDetails",
-    "DimesEstimator",
-    "DimesOptions",
-    "DimesTrack",
-    "GroundFit",
-    "PairDetails",
-    "TrackMetrics",
-    "ValidityCheck",
-    "dimes_products",
-    "propagate_velocity",
-]
+    "Combination", "DimesDetails", "DimesEstimator", "DimesOptions", "DimesTrack", "GroundFit", "PairDetails",
+    "TrackMetrics", "ValidityCheck", "dimes_products", "propagate_velocity",
+]  # fmt: skip

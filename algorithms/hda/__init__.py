@@ -11,21 +11,7 @@ from marsyard.algorithms.hda.structure import Matches, MatchStatus
 from marsyard.algorithms.hda.tracking import Tracks
 
 __all__ = [
-    "STAGES",
-    "CameraMotion",
-    "ElevationMap",
-    "HazardMaps",
-    "HdaDetails",
-    "HdaEstimator",
-    "HdaOptions",
-    "MappedGround",
-    "MatchStatus",
-    "Matches",
-    "Safety",
-    "SurfaceFrame",
-    "TrackSeed",
-    "Tracks",
-    "hazard_maps",
-    "hda_products",
+    "STAGES", "CameraMotion", "ElevationMap", "HazardMaps", "HdaDetails", "HdaEstimator", "HdaOptions", "MappedGround",
+    "MatchStatus", "Matches", "Safety", "SurfaceFrame", "TrackSeed", "Tracks", "hazard_maps", "hda_products",
     "safe_site",
-]
+]  # fmt: skip

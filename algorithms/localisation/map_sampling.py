@@ -28,21 +28,21 @@ def sample_raster(
 
 
 def sample_averages(
-    raster: Float32[np.ndarray, "rows columns"], pixels: Float[np.ndarray, "patches n n 2"]
-) -> Float32[np.ndarray, "patches n n"]:
+    raster: Float32[np.ndarray, "rows columns"], pixels: Float[np.ndarray, "patches n m 2"]
+) -> Float32[np.ndarray, "patches n m"]:
     """Average a raster over the cells of lattices of positions (column, row): four samples in each cell.
 
     The cell of a lattice position extends halfway to its neighbours. Four bilinear samples average over cells of up to
     about three raster pixels without gaps.
     """
-    patches, side = pixels.shape[0], pixels.shape[1]
+    patches, rows, columns = pixels.shape[:3]
     along_rows, along_columns = np.gradient(pixels, axis=1), np.gradient(pixels, axis=2)
-    total = np.zeros((patches * side, side), np.float32)
+    total = np.zeros((patches * rows, columns), np.float32)
     for row_sign in (-0.25, 0.25):
         for column_sign in (-0.25, 0.25):
             shifted = pixels + row_sign * along_rows + column_sign * along_columns
-            total += sample_raster(raster, shifted.reshape(patches * side, side, 2))
-    return np.asarray((0.25 * total).reshape(patches, side, side))
+            total += sample_raster(raster, shifted.reshape(patches * rows, columns, 2))
+    return np.asarray((0.25 * total).reshape(patches, rows, columns))
 
 
 def inside_map(map_product: MapProduct, points: Float[np.ndarray, "*shape 2"]) -> Bool[np.ndarray, "*shape"]:

@@ -94,20 +94,8 @@ def rectify_to_plane(view: GroundView, grid: MapProduct, max_off_nadir_rad: floa
     # a pixel is valid if all nodes around it are
     valid = sample_raster(usable.astype(np.float32), lattice) > 0.999
     fine = np.where(valid[..., np.newaxis], fine, 0.0).astype(np.float32)
-    values = _average_cells(view.image.radiance, fine)
+    values = sample_averages(view.image.radiance, fine[np.newaxis])[0]
     return RectifiedImage(values, valid, (int(corner[0]), int(corner[1])))
-
-
-def _average_cells(
-    radiance: Float32[np.ndarray, "rows columns"], positions: Float32[np.ndarray, "n m 2"]
-) -> Float32[np.ndarray, "n m"]:
-    """Average an image over the cells of one lattice of positions, by four samples in each cell."""
-    along_rows, along_columns = np.gradient(positions, axis=0), np.gradient(positions, axis=1)
-    total = np.zeros(positions.shape[:2], np.float32)
-    for row_sign in (-0.25, 0.25):
-        for column_sign in (-0.25, 0.25):
-            total += sample_raster(radiance, positions + row_sign * along_rows + column_sign * along_columns)
-    return np.asarray(0.25 * total)
 
 
 def rectify_patches(

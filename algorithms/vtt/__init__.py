@@ -6,14 +6,6 @@ from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
 from marsyard.algorithms.vtt.tracker import VisualTargetTracker, VttDetails
 
 __all__ = [
-    "PURE_NCC",
-    "ArmTarget",
-    "GoalCriterion",
-    "HandOff",
-    "HandOffOutcome",
-    "VisualTargetTracker",
-    "VttDetails",
-    "VttOptions",
-    "hand_off",
-    "lucas_kanade_tracker",
-]
+    "PURE_NCC", "ArmTarget", "GoalCriterion", "HandOff", "HandOffOutcome", "VisualTargetTracker", "VttDetails",
+    "VttOptions", "hand_off", "lucas_kanade_tracker",
+]  # fmt: skip

@@ -35,19 +35,7 @@ from marsyard.sim.dynamics.rotorcraft.parameters import (
 from marsyard.sim.dynamics.rotorcraft.path import SimulatedPath, Vibration
 
 __all__ = [
-    "TAIL_S",
-    "Air",
-    "AirParameters",
-    "AltimeterErrors",
-    "GroundPatch",
-    "LandingGuidance",
-    "Phase",
-    "RotorcraftFlight",
-    "RotorcraftParameters",
-    "SimulatedPath",
-    "TransitParameters",
-    "Vibration",
-    "VibrationParameters",
-    "simulate_landing",
-    "simulate_transit",
-]
+    "TAIL_S", "Air", "AirParameters", "AltimeterErrors", "GroundPatch", "LandingGuidance", "Phase", "RotorcraftFlight",
+    "RotorcraftParameters", "SimulatedPath", "TransitParameters", "Vibration", "VibrationParameters",
+    "simulate_landing", "simulate_transit",
+]  # fmt: skip
