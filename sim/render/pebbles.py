@@ -29,8 +29,8 @@ CELL_DIAMETERS = 2.0
 #: Maximum length of a shadow, in diameters.
 _MAX_SHADOW = 1.0
 #: Range of the ratio of the axes of the outline, half the relative range of the height, depth of the three corners of
-#: the outline, and slope of the random tilt of a pebble (all assumed).
-_MIN_AXIS_RATIO, _HEIGHT_SPREAD, _CORNERS, _TILT = 0.5, 0.5, 0.3, 0.35
+#: the outline, and maximum slope of the random tilt of a pebble, divided by that of its side (all assumed).
+_MIN_AXIS_RATIO, _HEIGHT_SPREAD, _CORNERS, _TILT = 0.5, 0.5, 0.3, 0.4
 _MEAN_AXIS_RATIO = 0.5 * (1.0 + _MIN_AXIS_RATIO)
 #: Diameter in footprints at which an octave vanishes.
 _MIN_FOOTPRINTS = 0.5
@@ -51,7 +51,7 @@ class PebbleField:
     - largest: largest diameter of the coarsest octave, metres; halved with each octave
     - octaves: number of octaves
     - probability: mean probability that a cell of the coarsest octave contains a pebble
-    - exponent: of the cumulative number of pebbles, positive
+    - ratio, growth, root: with the exponent q of the cumulative number of pebbles, 2**q - 1, 2**(q - 2) and -1 / q
     - cell_coverage: fraction of a cell that its pebble covers in the mean
     - height_ratio, log_albedo, log_albedo_sd: of a pebble
     - ground_mean, ground_sd: mean and standard deviation of the logarithm of the ground's albedo
@@ -60,7 +60,9 @@ class PebbleField:
     largest: Values
     octaves: Values
     probability: Values
-    exponent: Values
+    ratio: Values
+    growth: Values
+    root: Values
     cell_coverage: Values
     height_ratio: Values
     log_albedo: Values
@@ -79,8 +81,9 @@ class PebbleField:
         cell_coverage = 0.25 * math.pi * mean_square * _MEAN_AXIS_RATIO / CELL_DIAMETERS**2
         # the coverage of successive octaves, largest pebbles first, increases by 2**excess
         probability = p.coverage / cell_coverage / sum(2.0 ** (excess * octave) for octave in range(octaves))
-        numbers = map(Float, (probability, q, cell_coverage, p.height_ratio, p.log_albedo, p.log_albedo_sd))
-        return cls(Float64(p.largest_m), UInt32(octaves), *numbers, *map(Float, ground.log_albedo_moments))
+        numbers = (probability, 2.0**q - 1.0, 2.0**excess, -1.0 / q, cell_coverage)
+        properties = (p.height_ratio, p.log_albedo, p.log_albedo_sd, *ground.log_albedo_moments)
+        return cls(Float64(p.largest_m), UInt32(octaves), *map(Float, numbers), *map(Float, properties))
 
     def density_at(self, albedo: Values) -> Values:
         """Density of pebbles on ground of an albedo divided by the mean density: log-normal, with the mean 1."""
@@ -141,7 +144,7 @@ def _evaluate_cell(
     second, third = mix_bits(first + UInt32(0x9E3779B1)), mix_bits(first + UInt32(0x7F4A7C15))
     # the pebble's rank among those of its octave, by diameter: where the density changes, pebbles grow or shrink
     rank = (Float(first >> 8) + 0.5) * 2.0**-24 / probability
-    size = diameter * dr.power(1.0 + rank * (dr.power(2.0, pebbles.exponent) - 1.0), -1.0 / pebbles.exponent)
+    size = diameter * dr.power(1.0 + rank * pebbles.ratio, pebbles.root)
     # offset from the centre in radii, along the axes of the outline
     axis_y, axis_x = dr.sincos(2.0 * math.pi * _uniform(second, 16))
     stretch = 1.0 / (_MIN_AXIS_RATIO + (1.0 - _MIN_AXIS_RATIO) * _uniform(second, 24))
@@ -160,7 +163,7 @@ def _evaluate_cell(
     # half spheroid, tilted: its normal is in proportion to (x / r, y / r, z / h**2)
     height = 2.0 * pebbles.height_ratio * (1.0 - _HEIGHT_SPREAD + 2.0 * _HEIGHT_SPREAD * _uniform(third, 8))
     upwards = dr.sqrt(larger(1.0 - outline, 0.04))
-    tilt_y, tilt_x = dr.sincos(2.0 * math.pi * _uniform(third, 16))
+    tilt_x, tilt_y = (2.0 * _uniform(bits, shift) - 1.0 for bits, shift in ((first, 0), (third, 16)))
     # mean over the covered part of the footprint (fitted, see the test)
     slope = height / (1.0 + 0.25 * edge * edge)
     normal_x, normal_y = ((component + _TILT * tilt) * slope for component, tilt in ((x, tilt_x), (y, tilt_y)))
@@ -228,7 +231,7 @@ def pebble_surface(
         shaded = dr.lerp(total.shadow, 1.0, fade * shadow * (1.0 - total.covered))
         loss = total.loss + fade * lost * pebbles.cell_coverage * local
         total = PebbleSurface(normal, log_albedo, covered, shaded, loss)
-        return octave + 1, 0.5 * diameter, probability * dr.power(2.0, pebbles.exponent - 2.0), total
+        return octave + 1, 0.5 * diameter, probability * pebbles.growth, total
 
     state = (UInt32(0), Float64(pebbles.largest), Float(pebbles.probability), PebbleSurface.bare())
     return dr.while_loop(
