@@ -18,12 +18,12 @@ from marsyard.sim.render.texture import MIN_SLOPE_CELLS, SLOPE_FADING, fade_octa
 
 #: Cells of the coarsest octave of the grain and of the albedo texture as fractions of a rock's size, and number of
 #: octaves of the grain; slope of each octave of the grain, for a noise of one unit per cell (assumed).
-GRAIN_CELL, TEXTURE_CELL, OCTAVES, GRAIN_SLOPE = 0.2, 0.3, 6, 0.18
+GRAIN_CELL, TEXTURE_CELL, OCTAVES, GRAIN_SLOPE = 0.2, 0.3, 6, 0.12
 #: Fraction of bedded rocks, and maximum ratio of the length of their grain along the beds to that across (assumed).
 BEDDED_FRACTION, MAX_BED_RATIO = 0.5, 3.5
 #: Cells of the network of fractures as a fraction of a rock's size, half width of a fracture in cells, and logarithm of
 #: the albedo of its middle (assumed).
-FRACTURE_CELL, FRACTURE_WIDTH, FRACTURE_LOG_ALBEDO = 0.6, 0.016, -0.6
+FRACTURE_CELL, FRACTURE_WIDTH, FRACTURE_LOG_ALBEDO = 0.6, 0.016, -0.4
 #: Cells of the noise in the margin of the dust as a fraction of a rock's size, and its effect on the vertical component
 #: of the normal (assumed): dust reaches further down in some directions.
 MARGIN_CELL, MARGIN = 0.25, 0.8
@@ -100,7 +100,8 @@ def rock_surface(grain: Values, position: Values, normal: Values, footprint: Val
         lambda octave, cell, total: (octave < OCTAVES) & (cell > min_cell),
         add_octave,
     )
-    slope = _stretch(grain, slope)
+    # across the beds the slope is that of a rock without beds
+    slope = _stretch(grain, slope) / (1.0 + grain.x**2 + grain.y**2 + grain.z**2)
     cell = Float64(FRACTURE_CELL * size)
     depth = noise_in_space(list(stretched), cell, UInt32(7)) + 0.3 * noise_in_space(
         list(stretched), 0.3 * cell, UInt32(8)

@@ -118,16 +118,10 @@ def _build_deck(rover: RoverParameters, outline: Float64[np.ndarray, "corners 2"
     """Build the deck, which is star-shaped, with its equipment."""
     size = np.array([0.5 * rover.body_length_m, 0.5 * rover.body_width_m, 1.0])
     above = np.array([0.0, 0.0, rover.deck_m])
-    equipment = [
-        (start * size + above, end * size + above, radius) for start, end, radius in map(_as_points, _EQUIPMENT)
-    ]
+    equipment = [(size * start + above, size * end + above, radius) for start, end, radius in _EQUIPMENT]
     half = 0.5 * _DECK_M
     profile = [(rover.deck_m + z, factor) for z, factor in ((-half, 0.0), (-half, 1.0), (half, 1.0), (half, 0.0))]
     return np.concatenate([_shade_flat(_stack_rings(profile, outline)), _make_cylinders(equipment)])
-
-
-def _as_points(cylinder: tuple[tuple[float, ...], tuple[float, ...], float]) -> Cylinder:
-    return np.array(cylinder[0]), np.array(cylinder[1]), cylinder[2]
 
 
 def _build_body(rover: RoverParameters, stance: Stance) -> Solid:
@@ -162,13 +156,8 @@ def _build_leg(rover: RoverParameters, pivot: Point, centre: Point, *, steers: b
     motor = hub + np.array([0.0, 0.0, _STEERING_HEIGHT * rover.wheel_radius_m])
     down = np.array([0.0, 0.0, 0.5 * rover.wheel_radius_m])
     cable = _hang_cable(pivot, motor, np.array([0.0, 0.0, -0.03]))
-    return [
-        (pivot, motor, radius),
-        (motor, hub, 0.7 * radius),
-        (hub, centre, radius),
-        (motor, motor - down, _LEG_M),
-        *cable,
-    ]
+    bracket = [(motor, hub, 0.7 * radius), (hub, centre, radius)]
+    return [(pivot, motor, radius), *bracket, (motor, motor - down, _LEG_M), *cable]
 
 
 def _hang_cable(start: Point, end: Point, sag: Point) -> list[Cylinder]:
@@ -209,13 +198,16 @@ def rover_sphere(
     front, middle, rear = compute_wheel_centres(rover, 0.0, (0.0, 0.0))[:3]
     bogie = compute_bogie_pivots(rover, 0.0)[0]
     rocker = np.array([rover.rocker_pivot_x_m, bogie[1], rover.rocker_pivot_z_m])
-    wheel = rover.wheel_radius_m + 0.5 * rover.wheel_width_m + _LEG_M
+    motor = _length(_STEERING_HEIGHT * rover.wheel_radius_m, 0.5 * rover.wheel_width_m + _BRACKET_GAP_M)
+    wheel = max(rover.wheel_radius_m + 0.5 * rover.wheel_width_m, motor) + _LEG_M
     rear_chain = _length(bogie - rocker) + max(_length(middle - bogie), _length(rear - bogie))
     legs = _length(rocker) + max(_length(front - rocker), rear_chain) + wheel
     depth, height, extra_width = _HEAD_M
     head = _length(_BEHIND_M + depth, 0.5 * (baseline_m + extra_width), 0.5 * height)
     top = _length(mast.base_m) + _length(mast.elbow_m) + _length(mast.head_m) + head + _MAST_RADIUS_M
-    body = _length(0.5 * rover.body_length_m, 0.5 * rover.body_width_m, rover.deck_m + _DECK_M)
+    body = _length(
+        0.5 * rover.body_length_m, 0.5 * rover.body_width_m, rover.deck_m + max(end[2] for _, end, _ in _EQUIPMENT)
+    )
     return np.array([[*stance.world_from_rover.translation, max(legs, top, body)]])
 
 

@@ -16,17 +16,18 @@ _SIZES, _HEIGHTS = (1.0, 0.37), (1.0, 0.4)
 #: boundary into a patch, in heights per standard deviation of the field (assumed).
 _HEIGHT_RANGE, _JOINT_DEPTH, _RISE = 0.6, 1.3, 4.0
 #: Amplitude of undulations of the sand in heights of the slabs, and their length in sizes of the slabs; displacement of
-#: the joints in sizes; height above the sand over which dust covers a slab, in heights (assumed).
-_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _DUSTY_EDGE = 0.5, 2.5, 0.22, 0.35
+#: the joints in sizes; height above the sand over which dust covers a slab, in heights; fraction of the large slabs
+#: that the second generation divides (assumed).
+_SAND_HEIGHT, _SAND_LENGTH, _DISPLACEMENT, _DUSTY_EDGE, _FRACTURED = 0.5, 2.5, 0.22, 0.35, 0.6
 
 
 class Outcrop(Parameters):
     """Patches of bedrock, divided by joints into polygonal slabs with rounded edges, partly below sand.
 
     The bedrock is above the sand inside the level set of a smooth random field, and dips below it at the boundary.
-    Slabs are cells of a Voronoi diagram with curved borders. Each has its own height, tilt and albedo, and is divided
-    by a second, finer generation of joints. Joints differ in width and depth. Sand, with undulations, fills them where
-    it is higher than their floor.
+    Slabs are cells of a Voronoi diagram with curved borders. Each has its own height, tilt and albedo. A second, finer
+    generation of joints divides most of them. Joints differ in width and depth. Sand, with undulations, fills them
+    where it is higher than their floor.
     """
 
     fraction: Annotated[Fraction, Field(description="fraction of the ground in patches of bedrock")] = 0.3
@@ -61,9 +62,10 @@ class Outcrop(Parameters):
             self._draw_slabs(ground.period_m, size, height, layer.spacing_m, rng)
             for size, height in zip(_SIZES, _HEIGHTS, strict=True)
         ]
+        generations[0].slabs[..., 3] += self.log_albedo
         fields = np.stack([bedrock, sand_tone, bend_x, bend_y], axis=-1).astype(np.float32)
         edge = max(_DUSTY_EDGE * self.height_m, 1e-6)
-        add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, edge)
+        add_slabs(layer.height, layer.log_albedo, layer.spacing_m, fields, *generations, _FRACTURED, edge)
         ground.add(layer)
 
     def _draw_slabs(self, period_m: float, size: float, height: float, spacing_m: float, rng: Generator) -> Slabs:
@@ -74,7 +76,7 @@ class Outcrop(Parameters):
             [
                 rise * rng.uniform(-1.0, 1.0, (cells, cells)),
                 *(height * np.tan(np.radians(self.tilt_deg)) * rng.standard_normal((2, cells, cells))),
-                (self.log_albedo + self.log_albedo_sd * rng.standard_normal((cells, cells))) * height / sum(_HEIGHTS),
+                height * self.log_albedo_sd * rng.standard_normal((cells, cells)),
                 rng.random((cells, cells)),
             ],
             axis=-1,

@@ -39,7 +39,7 @@ def test_grain_scales_with_the_rock_and_fades_with_the_footprint() -> None:
     large = to_host(_surface((0.0, 0.0, 0.0, 2.0), 10.0 * _line(2.0), 1e-3).slope)
     # noise of equal offsets from the lattice, in single precision
     assert np.max(np.abs(small - large)) < 1e-3
-    assert 0.1 < small.std(axis=0).mean() < 0.6
+    assert 0.05 < small.std(axis=0).mean() < 0.4
     # the coarsest cells, 4 cm, are smaller than pixels of 10 cm
     assert not to_host(_surface((0.0, 0.0, 0.0, 0.2), _line(2.0), 0.1).slope).any()
 
@@ -57,7 +57,7 @@ def test_bedded_grain_is_longer_along_the_beds() -> None:
 def test_dust_has_a_patchy_margin_and_fractures_are_dark_and_rare() -> None:
     surface = _surface((0.0, 0.0, 0.0, 0.3), _line(3.0), 1e-4)
     fractures = to_host(surface.log_albedo)
-    assert fractures.min() < -0.5
+    assert fractures.min() < -0.35
     assert np.mean(fractures < -0.1) < 0.15
     steep = rock_surface(Array4f(0.0, 0.0, 0.0, 0.3), Array3f64(*_line(3.0).T), Array3f(0.8, 0.0, 0.6), Float(1e-4))
     assert np.ptp(to_host(steep.dust)) > 0.3

@@ -59,7 +59,7 @@ def _add_one_slab(slope_x: float, joint_m: float = 0.1) -> Float32[np.ndarray, "
     slabs[0, 0, :2] = (0.2, slope_x)
     coarse = Slabs(positions, np.pad(slabs, ((1, 1), (1, 1), (0, 0)), mode="wrap"), 1.6, joint_m, 0.5, 0.5)
     fine = Slabs(positions, np.zeros((4, 4, 5)), 1.6, joint_m, 0.0, 0.0)
-    add_slabs(height, log_albedo, 0.05, np.zeros((16, 16, 4), dtype=np.float32), coarse, fine, 0.02)
+    add_slabs(height, log_albedo, 0.05, np.zeros((16, 16, 4), dtype=np.float32), coarse, fine, 1.0, 0.02)
     return height
 
 

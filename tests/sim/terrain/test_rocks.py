@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from jaxtyping import Float64
 from pydantic import ValidationError
 from scipy.integrate import quad
 from scipy.spatial import cKDTree
@@ -22,6 +23,7 @@ from marsyard.sim.terrain.rocks.shapes import (
     SHAPES_OF_FORM,
     UNIT_HEIGHT,
     ShapeSet,
+    _all_shapes,
     max_pixels,
     rock_shapes,
 )
@@ -311,3 +313,22 @@ def test_stored_shapes_equal_the_built_ones(tmp_path: Path, monkeypatch: pytest.
     for first, second in zip(*results, strict=True):
         np.testing.assert_array_equal(first, second)
     assert not any(array.flags.writeable for array in results[1][:2])
+
+
+def _edge_radii(number: int) -> Float64[np.ndarray, "n"]:
+    """Radii of curvature along a circle around a shape's vertical at 45 deg, in radii of the rock."""
+    shape = _all_shapes()[number]
+    azimuth = np.radians(np.arange(0.0, 360.0, 0.05))
+    directions = np.sqrt(0.5) * np.stack([np.cos(azimuth), np.sin(azimuth), np.ones(azimuth.size)], axis=1)
+    points = shape.to_unit_shape(directions * shape.radius(directions)[:, None])
+    normals = shape.normals(directions)
+    turns = np.arccos(np.clip(np.sum(normals[1:] * normals[:-1], axis=1), -1.0, 1.0))
+    return np.asarray(np.linalg.norm(np.diff(points, axis=0), axis=1) / np.maximum(turns, 1e-9) / 0.5)
+
+
+def test_abrasion_rounds_the_edges_of_rocks_by_different_radii() -> None:
+    # vesicles and the ridges of clinker have edges. A circle crosses all but the shortest edges of a shape
+    blocks, ventifacts = ([_edge_radii(first + k).min() for k in range(16)] for first in (0, 64))
+    assert min(blocks) > 0.02
+    assert max(blocks) > 8.0 * min(blocks)
+    assert np.median(ventifacts) > 0.03

@@ -99,8 +99,8 @@ class Slabs(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float]:
-    """Compute height and logarithm of albedo of the slab at x, y (metres), and subtract the joint around it.
+def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float, float]:
+    """Compute height, logarithm of albedo and number of the slab at x, y (metres), and subtract the joint around it.
 
     The edge is rounded: over the width of the joint, the height rises as a parabola. Joints have 0 to 2 times the mean
     width; narrow ones are also shallow, so that slabs of several cells are common.
@@ -119,17 +119,25 @@ def _cut_slab(generation: Slabs, x: float, y: float) -> tuple[float, float]:
     cut = (1.0 - t) ** 2 if t < 1.0 else 0.0
     tilt = -cell * (slabs[row, column, 1] * offset_x + slabs[row, column, 2] * offset_y)
     top = slabs[row, column, 0] + min(max(tilt, -rise), rise) - min(1.5 * opening, 1.0) * depth * cut
-    return top, slabs[row, column, 3]
+    return top, slabs[row, column, 3], slabs[row, column, 4]
 
 
 @njit(cache=True, error_model="numpy")
 def add_slabs(
-    height: Grid, log_albedo: Grid, spacing: float, fields: NDArray[np.float32], coarse: Slabs, fine: Slabs, edge: float
+    height: Grid,
+    log_albedo: Grid,
+    spacing: float,
+    fields: NDArray[np.float32],
+    coarse: Slabs,
+    fine: Slabs,
+    fractured: float,
+    edge: float,
 ) -> None:
     """Add the slabs of two generations of joints where they rise above the sand.
 
     - fields: on a coarser grid of the same extent, shape (rows, rows, 4): mean height of the bedrock above the sand,
       metres; logarithm of albedo of sand between slabs; displacements of the joints along x and y, metres
+    - fractured: fraction of the slabs of the coarse generation that are divided by the fine one
     - edge: height above the sand over which the albedo changes from that of sand to that of a slab, metres
     """
     rows = fields.shape[0]
@@ -154,17 +162,17 @@ def add_slabs(
                     sand = wa * a[1] + wb * b[1] + wc * c[1] + wd * d[1]
                     x = (column * step + j) * spacing + wa * a[2] + wb * b[2] + wc * c[2] + wd * d[2]
                     y = (row * step + i) * spacing + wa * a[3] + wb * b[3] + wc * c[3] + wd * d[3]
-                    top, contrast = _cut_slab(coarse, x, y)
+                    top, contrast, number = _cut_slab(coarse, x, y)
                     top += bedrock
                     exposed = 0.0
-                    if top + max_fine > 0.0:
-                        fine_top, fine_contrast = _cut_slab(fine, x, y)
+                    if number < fractured and top + max_fine > 0.0:
+                        fine_top, fine_contrast, _ = _cut_slab(fine, x, y)
                         top += fine_top
-                        if top > 0.0:
-                            rise = min(top / edge, 1.0)
-                            exposed = rise * rise * (3.0 - 2.0 * rise)
-                            height[row * step + i, column * step + j] += top
-                            contrast += fine_contrast
+                        contrast += fine_contrast
+                    if top > 0.0:
+                        rise = min(top / edge, 1.0)
+                        exposed = rise * rise * (3.0 - 2.0 * rise)
+                        height[row * step + i, column * step + j] += top
                     sand *= (1.0 - exposed) * min((bedrock + max_slab) / max_slab, 1.0)
                     log_albedo[row * step + i, column * step + j] += exposed * contrast + sand
 
