@@ -42,4 +42,4 @@ def test_keys_of_commands_exist() -> None:
         if not key.startswith(EXAMPLE_KEYS)
     }
     assert len(named) > 15
-    assert named - set.union(*map(read_keys, scenario_names())) == set()
+    assert named - {key for name in scenario_names() for key in read_keys(name)} == set()
