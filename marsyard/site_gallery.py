@@ -72,7 +72,7 @@ class GalleryImage:
         )
 
 
-def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path] = ()) -> Path:
+def render_gallery(folder: Path, overwrite: bool, terrain_files: Sequence[Path]) -> Path:
     """Render all `VIEWS` and DTM files; write the gallery and return the path of the page.
 
     Raises ValueError if a file is no DTM file, or if the gallery cannot be written or already exists.

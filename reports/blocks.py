@@ -50,14 +50,14 @@ def collect_values(frame: Rows, quantities: Sequence[Quantity]) -> dict[str, Flo
     return {quantity.title: finite_values(frame, quantity.column, quantity.scale) for quantity in quantities}
 
 
-def flag_rate(name: str, *conditions: str, value: bool = True) -> RateFunction:
-    """Return a function that computes how often flag `name` equals `value`, in the rows with all flags `conditions`."""
+def flag_rate(name: str, *conditions: str) -> RateFunction:
+    """Return a function that computes how often flag `name` is true, in the rows with all flags `conditions`."""
 
     def compute_rate(frame: Rows) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
         masks = (populations.flag_mask(frame, condition) for condition in conditions)
         selected_rows = frame[np.logical_and.reduce([all_rows, *masks])]
-        return rates.fraction_of(populations.flag_mask(selected_rows, name) == value, selected_rows)
+        return rates.fraction_of(populations.flag_mask(selected_rows, name), selected_rows)
 
     return compute_rate
 

@@ -15,9 +15,7 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.verdicts import Verdict
 
 
-def compute_margins(
-    frame: pd.DataFrame, verdict: Verdict, margin_column: str | None = None
-) -> Float[np.ndarray, " n"] | None:
+def compute_margins(frame: pd.DataFrame, verdict: Verdict, margin_column: str | None) -> Float[np.ndarray, " n"] | None:
     """Compute the margin of each row; None if the rows lack a column of the requirement.
 
     The result equals `marsyard.campaigns.definition.margins.compute_margin` of each row.

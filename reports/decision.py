@@ -115,7 +115,7 @@ def collect_evidence(
 
 
 def _case_evidence(
-    verdict: Verdict, member: Mask, sampling: SamplingDesign, frame: pd.DataFrame, *, has_own_terrains: bool = True
+    verdict: Verdict, member: Mask, sampling: SamplingDesign, frame: pd.DataFrame, *, has_own_terrains: bool
 ) -> CaseEvidence:
     """Collect the results of all cases (`frame`) with regard to a population (`member`)."""
     _, has_unknown_flag = populations.population_and_unknown_masks(frame, verdict.population.split(" and "))

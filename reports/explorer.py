@@ -46,7 +46,7 @@ class ExploredRequirement:
 
 
 def explorer_data(
-    run: StoredRun, metric: str, requirements: Sequence[ExploredRequirement] = (), with_images: Collection[str] = ()
+    run: StoredRun, metric: str, requirements: Sequence[ExploredRequirement], with_images: Collection[str]
 ) -> dict[str, Any]:
     """Create the data of the explorer: numeric columns of the points with labels, initial axes, and requirements.
 

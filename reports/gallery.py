@@ -36,7 +36,7 @@ class GalleryView:
     figures: Sequence[SvgFigure]
 
 
-def gallery_views(run: StoredRun, violations: Sequence[int] = ()) -> list[GalleryView]:
+def gallery_views(run: StoredRun, violations: Sequence[int]) -> list[GalleryView]:
     """Create the views of the gallery's cases; cases that no system can draw are omitted."""
     return [view for case in gallery_cases(run, violations) if (view := gallery_view(run, case)) is not None]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.record import utc_now
-from marsyard.reports.history_changes import Change, Comparison
+from marsyard.reports.history_changes import MetricChange, NightComparison
 from marsyard.reports.statistics.changes import Metric, Sample
 
 #: Version of the tables, as `PRAGMA user_version`.
@@ -105,7 +105,7 @@ class History:
             )
             self._connection.executemany("INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
-    def finish(self, night: int, state: str, changes: Sequence[Change] = ()) -> None:
+    def finish(self, night: int, state: str, changes: Sequence[MetricChange] = ()) -> None:
         """End a night with its changes."""
         with self._transaction():
             self._connection.executemany(
@@ -172,10 +172,10 @@ def _unpack(values: bytes, terrains: bytes) -> Sample:
     return Sample(np.frombuffer(values, "<f4").astype(np.float64), np.frombuffer(terrains, "<i8").astype(np.int64))
 
 
-def list_comparisons(history: History, night: int) -> list[Comparison]:
+def list_comparisons(history: History, night: int) -> list[NightComparison]:
     """List every metric of a night with its samples in earlier nights."""
     return [
-        Comparison(campaign.name, metric, history.earlier_samples(night, campaign, metric.name))
+        NightComparison(campaign.name, metric, history.earlier_samples(night, campaign, metric.name))
         for campaign in history.campaigns(night)
         for metric in history.metrics(night, campaign.name)
     ]

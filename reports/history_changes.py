@@ -21,7 +21,7 @@ _MIN_EXCEEDANCES = 10
 
 
 @dataclass(frozen=True)
-class Change:
+class MetricChange:
     """A changed metric.
 
     - is_rate: whether the metric is a success rate (larger is better), not an error
@@ -45,7 +45,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class NightComparison:
     """A metric of one night, and its samples in earlier nights (`before`)."""
 
     campaign: str
@@ -53,7 +53,7 @@ class Comparison:
     before: Sequence[Sample]
 
 
-def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
+def find_changes(comparisons: Sequence[NightComparison]) -> list[MetricChange]:
     """Find the changed metrics of a night; a false alarm has at most the probability `MAX_FALSE_ALARM_PROBABILITY`."""
     earlier_samples: list[Sample | None] = []
     for comparison in comparisons:
@@ -68,7 +68,7 @@ def find_changes(comparisons: Sequence[Comparison]) -> list[Change]:
         ]
     )
     return [
-        Change(
+        MetricChange(
             campaign=comparison.campaign,
             metric=comparison.metric.name,
             is_rate=comparison.metric.is_rate,

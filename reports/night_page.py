@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from itertools import takewhile
 
 from marsyard.reports.history import FINISHED, Night, NightCampaign
-from marsyard.reports.history_changes import MAX_FALSE_ALARM_PROBABILITY, Change
+from marsyard.reports.history_changes import MAX_FALSE_ALARM_PROBABILITY, MetricChange
 from marsyard.reports.wording import count, format_fraction, number, percent
 
 
 def format_night_page(
-    night: Night, earlier: Sequence[Night], campaigns: Sequence[NightCampaign], changes: Sequence[Change], compared: int
+    night: Night,
+    earlier: Sequence[Night],
+    campaigns: Sequence[NightCampaign],
+    changes: Sequence[MetricChange],
+    compared: int,
 ) -> str:
     """Format the night's page in Markdown.
 

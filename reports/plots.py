@@ -144,7 +144,7 @@ Points = tuple[Sequence[float] | Values, Sequence[float] | Values]
 
 
 @in_page_style
-def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool = False) -> Figure:
+def scatter_panels(panels: Mapping[tuple[str, str], tuple[Points, Points]], *, logarithmic: bool) -> Figure:
     """Draw panels with cases and medians of bins, by x and y labels: a row for each y, a column for each x."""
     columns, rows = (list(dict.fromkeys(pair[index] for pair in panels)) for index in (0, 1))
     size = (5.0, 3.4) if len(panels) == 1 else (11.0, 0.4 + 2.0 * len(rows))

@@ -194,7 +194,7 @@ def rate_text(rate: PooledRate) -> str:
     return text if math.isnan(rate.lower) else f"{text} ({range_text(rate.lower, rate.upper)})"
 
 
-def median_text(values: Float[np.ndarray, " n"], digits: int | None = None) -> str:
+def median_text(values: Float[np.ndarray, " n"], digits: int | None) -> str:
     """Format the median, and minimum to maximum in brackets; one number for equal values, a dash for no values."""
     if values.size == 0:
         return NOTHING

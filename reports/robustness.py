@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 ALL_DISPERSIONS = "all dispersions"
 
 
-class Outcome(StrEnum):
+class ChangeOutcome(StrEnum):
     """What the cases say about a change to FAIL."""
 
     FOUND = "found"
@@ -65,7 +65,7 @@ class Outcome(StrEnum):
     NONE = "none"
 
     @classmethod
-    def of(cls, crossing: Crossing, *, is_complete: bool) -> Outcome:
+    def of(cls, crossing: Crossing, *, is_complete: bool) -> ChangeOutcome:
         """Return the outcome of a change; `is_complete`: whether the cases cover all changes of this kind."""
         if not math.isnan(crossing.change):
             return cls.FOUND
@@ -103,7 +103,7 @@ class Robustness:
     reach: Number
     effective_cases: Number
     confidence: Number
-    outcome: Outcome
+    outcome: ChangeOutcome
     value: str = ""
 
     @property
@@ -134,7 +134,7 @@ class Robustness:
 
         Empty if no change shows FAIL: the estimate can then be due to chance.
         """
-        if self.outcome is not Outcome.FOUND or math.isnan(self.upper):
+        if self.outcome is not ChangeOutcome.FOUND or math.isnan(self.upper):
             return ""
         passes = "not shown" if math.isnan(self.lower) else f"up to {self.format_value(self.passes_at, self.lower)}"
         return self._describe(self.fails_at, self.change, f"PASS {passes}")
@@ -260,7 +260,7 @@ def _find_change(
         passes_at=assumed + step * crossing.lower,
         fails_at=assumed + step * crossing.change,
         confidence=verdict.confidence,
-        outcome=Outcome.of(crossing, is_complete=is_complete),
+        outcome=ChangeOutcome.of(crossing, is_complete=is_complete),
         value=str(dispersion.values[change.value]) if is_choice else "",
         **asdict(crossing),
     )
@@ -281,7 +281,7 @@ def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:
     change, lower, upper = (math.sqrt(2.0 * radius) if math.isfinite(radius) else math.nan for radius in radii)
     lower = change if verdict.decide_by == ESTIMATE else lower or math.nan  # 0 without PASS
     crossing = Crossing(change, lower, upper, math.nan, float(rates.effective_units[0]))
-    outcome = Outcome.of(crossing, is_complete=False)
+    outcome = ChangeOutcome.of(crossing, is_complete=False)
     return Robustness(
         verdict.requirement_id, ALL_DISPERSIONS, ChangeKind.DIVERGENCE, "nat", assumed=0.0, spread=1.0,
         passes_at=0.5 * lower**2, fails_at=0.5 * change**2, confidence=verdict.confidence, outcome=outcome,

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from marsyard.campaigns.studies.results import ROBUST
 from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.figure_style import MARKERS, MUTED, SERIES, in_page_style, new_axes
-from marsyard.reports.robustness import ALL_DISPERSIONS, Outcome, Robustness, sort_key
+from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness, sort_key
 from marsyard.reports.section import Block, Grid, Section, svg_figure
 from marsyard.reports.variants import VariantVerdict
 from marsyard.reports.verdicts import Status
@@ -27,7 +27,11 @@ _DIRECTIONS = {
     ChangeKind.WIDER: ", up",
     ChangeKind.NARROWER: ", down",
 }
-_OUTCOMES: Mapping[Outcome, str] = {Outcome.FOUND: "", Outcome.REFUSED: "unknown beyond", Outcome.NONE: "none up to"}
+_OUTCOMES: Mapping[ChangeOutcome, str] = {
+    ChangeOutcome.FOUND: "",
+    ChangeOutcome.REFUSED: "unknown beyond",
+    ChangeOutcome.NONE: "none up to",
+}
 
 
 def robustness_section(records: Sequence[Robustness], variants: Sequence[VariantVerdict]) -> Section | None:
@@ -53,8 +57,10 @@ def change_grid(records: Sequence[Robustness]) -> Grid:
             f"{item.name}{_DIRECTIONS.get(item.kind, '')}",
             NOTHING if item.kind is ChangeKind.DIVERGENCE else item.format_value(item.assumed, 0.0),
             NOTHING if math.isnan(item.lower) else item.format_value(item.passes_at, item.lower),
-            item.format_value(item.fails_at, item.change) if item.outcome is Outcome.FOUND else _OUTCOMES[item.outcome],
-            number(item.change) if item.outcome is Outcome.FOUND else f"> {number(item.reach)}",
+            item.format_value(item.fails_at, item.change)
+            if item.outcome is ChangeOutcome.FOUND
+            else _OUTCOMES[item.outcome],
+            number(item.change) if item.outcome is ChangeOutcome.FOUND else f"> {number(item.reach)}",
             f"{number(item.lower)} to {number(item.upper)}",
             f"{item.effective_cases:,.0f}",
         ]

@@ -12,6 +12,8 @@ from marsyard.reports.wording import format_fraction, number, percent
 
 #: Statements hold for each change, but not for several at once.
 _ONE = "one change at a time"
+#: Maximum number of listed changes to FAIL.
+_MAX_CHANGES = 3
 
 
 def reach_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
@@ -29,7 +31,7 @@ def reach_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
     return f"holds up to {number(nearest.lower)} spreads ({nearest.name}, {nearest.kind})"
 
 
-def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes: int = 3) -> str:
+def robustness_text(verdict: Verdict, records: Sequence[Robustness]) -> str:
     """Describe how far the PASS of a requirement reaches, and the nearest changes to FAIL; empty without records."""
     own = [item for item in records if item.requirement == verdict.requirement_id]
     if not own:
@@ -47,7 +49,7 @@ def robustness_text(verdict: Verdict, records: Sequence[Robustness], max_changes
     for item in sorted(own, key=sort_key):
         if item.fail_text and item is not ball:
             nearest.setdefault(item.parameter, item)
-    changes = "; ".join(item.fail_text for item in [*nearest.values()][:max_changes])
+    changes = "; ".join(item.fail_text for item in [*nearest.values()][:_MAX_CHANGES])
     by_rate = verdict.decide_by == ESTIMATE
     # a calibration excludes PASS
     word = "PASS holds" if verdict.status.is_met else "PASS would hold for another kind of evidence"

@@ -21,7 +21,7 @@ from marsyard.reports import rates
 from marsyard.reports.case_margins import compute_margins
 from marsyard.reports.decision import collect_evidence
 from marsyard.reports.dispersion_changes import ChangeKind
-from marsyard.reports.robustness import Outcome, Robustness, select_met
+from marsyard.reports.robustness import ChangeOutcome, Robustness, select_met
 from marsyard.reports.sampling_design import INDEPENDENT
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.statistics.crossing import find_crossing
@@ -203,5 +203,5 @@ def _find_step(
     return Robustness(
         verdict.requirement_id, path, ChangeKind.VALUE, split_unit(path)[1], assumed=assumed, spread=spread,
         passes_at=assumed + step * crossing.lower, fails_at=assumed + step * crossing.change,
-        confidence=verdict.confidence, outcome=Outcome.of(crossing, is_complete=False), **asdict(crossing),
+        confidence=verdict.confidence, outcome=ChangeOutcome.of(crossing, is_complete=False), **asdict(crossing),
     )  # fmt: skip

@@ -22,7 +22,7 @@ _UNITS = {
 }  # fmt: skip
 
 
-class Kind(StrEnum):
+class ColumnKind(StrEnum):
     """What a column describes.
 
     - CONDITION: world, motion and images of the case, which do not depend on the algorithm
@@ -73,7 +73,7 @@ class Column:
     """
 
     name: str
-    kind: Kind
+    kind: ColumnKind
     meaning: str
     label: str = ""
     population: str = ""
@@ -107,47 +107,51 @@ class Column:
 
 def condition(name: str, meaning: str, label: str = "") -> Column:
     """Declare a number that describes the conditions of a case."""
-    return Column(name, Kind.CONDITION, meaning, label)
+    return Column(name, ColumnKind.CONDITION, meaning, label)
 
 
 def instrument_error(name: str, meaning: str, label: str = "") -> Column:
     """Declare the error of a measurement."""
-    return Column(name, Kind.INSTRUMENT_ERROR, meaning, label)
+    return Column(name, ColumnKind.INSTRUMENT_ERROR, meaning, label)
 
 
 def outcome(name: str, meaning: str, label: str = "") -> Column:
     """Declare a number of an algorithm's answer or computation."""
-    return Column(name, Kind.OUTCOME, meaning, label)
+    return Column(name, ColumnKind.OUTCOME, meaning, label)
 
 
 def error(name: str, meaning: str, label: str = "") -> Column:
     """Declare an error or a score of an algorithm's answer."""
-    return Column(name, Kind.ERROR, meaning, label)
+    return Column(name, ColumnKind.ERROR, meaning, label)
 
 
-def flag(name: str, clause: str, population: str = "", kind: Kind = Kind.OUTCOME) -> Column:
+def flag(name: str, clause: str, population: str = "", kind: ColumnKind = ColumnKind.OUTCOME) -> Column:
     """Declare a column of true and false."""
     return Column(name, kind, clause, population=population, type=bool)
 
 
-def text(name: str, meaning: str, kind: Kind = Kind.CONDITION) -> Column:
+def text(name: str, meaning: str, kind: ColumnKind = ColumnKind.CONDITION) -> Column:
     """Declare a column of texts."""
     return Column(name, kind, meaning, type=str)
 
 
 #: Columns of the engine: the first ones of a row, and the last ones.
 LEADING = (
-    Column("case", Kind.PROVENANCE, "number of the case"),
-    text("outcome", "outcome of the answer, or reason of the failure", Kind.OUTCOME),
+    Column("case", ColumnKind.PROVENANCE, "number of the case"),
+    text("outcome", "outcome of the answer, or reason of the failure", ColumnKind.OUTCOME),
     flag("answered", "an answer is given", "with an answer"),
 )
 TRAILING = (
-    Column("wall_time_s", Kind.PROVENANCE, "wall-clock time of the case"),
-    Column("cpu_time_s", Kind.PROVENANCE, "processor time of the case"),
-    text("error", "message of a failure", Kind.OUTCOME),
-    text("traceback", "traceback of a failure", Kind.OUTCOME),
+    Column("wall_time_s", ColumnKind.PROVENANCE, "wall-clock time of the case"),
+    Column("cpu_time_s", ColumnKind.PROVENANCE, "processor time of the case"),
+    text("error", "message of a failure", ColumnKind.OUTCOME),
+    text("traceback", "traceback of a failure", ColumnKind.OUTCOME),
 )
-ENGINE = (*LEADING, *TRAILING, text("standard_point", "point of a study at which the case was run", Kind.PROVENANCE))
+ENGINE = (
+    *LEADING,
+    *TRAILING,
+    text("standard_point", "point of a study at which the case was run", ColumnKind.PROVENANCE),
+)
 
 
 @dataclass(frozen=True)
@@ -180,17 +184,17 @@ class Columns:
     @property
     def from_truth(self) -> dict[str, str]:
         """Clauses of the flags from the truth, by name."""
-        return {item.name: item.meaning for item in self.columns if item.kind is Kind.TRUTH}
+        return {item.name: item.meaning for item in self.columns if item.kind is ColumnKind.TRUTH}
 
     @property
     def configured(self) -> tuple[str, ...]:
         """Names and patterns of the configured columns."""
-        return tuple(item.name for item in self.columns if item.kind is Kind.CONFIGURED)
+        return tuple(item.name for item in self.columns if item.kind is ColumnKind.CONFIGURED)
 
     def is_condition(self, name: str) -> bool:
         """Return whether a column describes the conditions of a case."""
         found = self.find(name)
-        return found is not None and found.kind in (Kind.CONDITION, Kind.INSTRUMENT_ERROR)
+        return found is not None and found.kind in (ColumnKind.CONDITION, ColumnKind.INSTRUMENT_ERROR)
 
     @cached_property
     def _by_name(self) -> dict[str, Column]:

@@ -1,8 +1,11 @@
 """Declarations of columns that several scenarios compute: world, faults, images, algorithms and velocities."""
 
-from marsyard.scenarios.columns import Column, Kind, condition, error, flag, instrument_error, outcome, text
+from marsyard.scenarios.columns import Column, ColumnKind, condition, error, flag, instrument_error, outcome, text
 
-SITE = (text("site", "site of the terrain"), Column("terrain", Kind.PROVENANCE, "number of the terrain in the bank"))
+SITE = (
+    text("site", "site of the terrain"),
+    Column("terrain", ColumnKind.PROVENANCE, "number of the terrain in the bank"),
+)
 
 SUN = (
     condition("sun_azimuth_deg", "azimuth of the sun, clockwise from north"),
@@ -10,9 +13,9 @@ SUN = (
 )
 
 FAULTS = (
-    text("fault", "name of the injected fault", Kind.CONFIGURED),
-    Column("fault_size", Kind.CONFIGURED, "size of the injected fault, in its unit"),
-    flag("fault_free", "no fault is injected", "without a fault", Kind.TRUTH),
+    text("fault", "name of the injected fault", ColumnKind.CONFIGURED),
+    Column("fault_size", ColumnKind.CONFIGURED, "size of the injected fault, in its unit"),
+    flag("fault_free", "no fault is injected", "without a fault", ColumnKind.TRUTH),
 )
 
 CONTRAST = (
@@ -30,15 +33,15 @@ CONTRAST = (
 )
 
 IMAGES = (
-    text("image_hash", "hash of the counts of all images", Kind.PROVENANCE),
-    text("gl_backend", "OpenGL backend of the renderer", Kind.PROVENANCE),
-    text("gl_version", "OpenGL implementation and compiler of the renderer", Kind.PROVENANCE),
-    text("processor_features", "hash of the processor's features that compiled code uses", Kind.PROVENANCE),
+    text("image_hash", "hash of the counts of all images", ColumnKind.PROVENANCE),
+    text("gl_backend", "OpenGL backend of the renderer", ColumnKind.PROVENANCE),
+    text("gl_version", "OpenGL implementation and compiler of the renderer", ColumnKind.PROVENANCE),
+    text("processor_features", "hash of the processor's features that compiled code uses", ColumnKind.PROVENANCE),
 )
 
 ALGORITHM = (
-    text("algorithm", "label of the algorithm under test", Kind.PROVENANCE),
-    text("stderr", "standard error of an external program", Kind.PROVENANCE),
+    text("algorithm", "label of the algorithm under test", ColumnKind.PROVENANCE),
+    text("stderr", "standard error of an external program", ColumnKind.PROVENANCE),
     outcome("estimation_time_s", "processor time of the algorithm; wall-clock time of an external program"),
 )
 

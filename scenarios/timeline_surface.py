@@ -25,7 +25,6 @@ def surface_from_above(
     centre_m: tuple[float, float],
     half_width_m: float,
     backend: Backend,
-    time_s: float = 0.0,
 ) -> SurfacePatch:
     """Render the world from above; return the visible points, rocks included, with their brightness.
 
@@ -42,7 +41,7 @@ def surface_from_above(
         right=np.array([1.0, 0.0, 0.0]),
     )
     pose = rigid(Rotation.identity(), np.array([*centre_m, ground_m + height_m]))
-    frame = process_renderer(backend).render(scene, PixelRays.from_camera(camera), pose, time_s)
+    frame = process_renderer(backend).render(scene, PixelRays.from_camera(camera), pose)
     return SurfacePatch(frame.points_world().astype(np.float32), grey_values(frame.radiance))
 
 

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from marsyard.reports.history import FINISHED, History, NightCampaign, list_comparisons
-from marsyard.reports.history_changes import Comparison, find_changes
+from marsyard.reports.history_changes import NightComparison, find_changes
 from marsyard.reports.statistics.changes import Metric, Sample
 
 #: Assignments of cases to terrains.
@@ -88,7 +88,7 @@ def count_detections(changed_kind: str, nights: int, seed: int) -> int:
         for kind in KINDS:
             earlier_runs = [simulator.draw_metrics(kind) for _ in range(EARLIER_NIGHTS)]
             for index, metric in enumerate(simulator.draw_metrics(kind, ERROR_FACTOR if kind == changed_kind else 1.0)):
-                comparisons.append(Comparison(kind, metric, [run[index].sample for run in earlier_runs]))
+                comparisons.append(NightComparison(kind, metric, [run[index].sample for run in earlier_runs]))
         changes = {(change.campaign, change.metric) for change in find_changes(comparisons)}
         detection_count += (changed_kind, "error (m)") in changes
     return detection_count

@@ -16,7 +16,7 @@ from marsyard.campaigns.errors import unknown_name_message
 from marsyard.campaigns.sampling.design import ADAPTIVE
 from marsyard.campaigns.sampling.dispersions import Choice, Fixed, GridDispersion
 from marsyard.scenarios.algorithm_labels import labels
-from marsyard.scenarios.columns import ENGINE, Column, Columns, Kind, flag
+from marsyard.scenarios.columns import ENGINE, Column, ColumnKind, Columns, flag
 from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.interface import HasParts
 from marsyard.scenarios.parts.named import SCORE
@@ -223,8 +223,8 @@ def _collect_columns(campaign: Campaign) -> Columns | None:
         if path in definition.dispersions:
             return None
         for label in labels(find_value(definition.parameters, path)):
-            scores += [Column(f"{label}_*", Kind.ERROR, "custom score", type=kind) for kind in (float, bool)]
-    draws = [Column(path, Kind.CONDITION, "sampled value") for path in definition.dispersions]
+            scores += [Column(f"{label}_*", ColumnKind.ERROR, "custom score", type=kind) for kind in (float, bool)]
+    draws = [Column(path, ColumnKind.CONDITION, "sampled value") for path in definition.dispersions]
     declared = list(columns)
     if columns.named_flags:  # flags that the campaign file names
         declared = [column for column in columns if column.type is not bool or "*" not in column.name]

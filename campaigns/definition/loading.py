@@ -69,7 +69,7 @@ def load_campaign(
     return replace(_validate(str(path), tables, options_by_key), command=tuple(command))
 
 
-def create_campaign(tables: Mapping[str, Any], source: str = "the campaign") -> Campaign:
+def create_campaign(tables: Mapping[str, Any], source: str) -> Campaign:
     """Create a campaign from tables of the form of a campaign file.
 
     source: name of the tables in messages

@@ -30,7 +30,7 @@ _SOBOL_BITS = 52
 #: Number of designs that a process caches, since successive cases use the same design.
 _CACHED_DESIGNS = 4
 #: Kinds of sampling designs, see above.
-Kind = Literal["random", "latin-hypercube", "sobol", "adaptive"]
+DesignKind = Literal["random", "latin-hypercube", "sobol", "adaptive"]
 #: Kind of a study: it chooses its cases, whose points are stored with their rows.
 ADAPTIVE: Final = "adaptive"
 
@@ -41,7 +41,7 @@ class Design(Parameters):
     With `nominal`, the first case has the campaign's parameters without sampling.
     """
 
-    kind: Kind = "random"
+    kind: DesignKind = "random"
     nominal: Annotated[bool, Field(strict=True)] = False
 
     def find_invalid_block(self, blocks: Sequence[int], grid_size: int) -> tuple[int, str] | None:
@@ -93,7 +93,7 @@ def locate_case(design: Design, blocks: Sequence[int], grid_size: int, case: int
 
 @lru_cache(maxsize=_CACHED_DESIGNS)
 def build_stratified_design(
-    kind: Kind,
+    kind: DesignKind,
     seed: int,
     campaign: str,
     first_case: int,

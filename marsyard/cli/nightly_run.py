@@ -22,7 +22,7 @@ from marsyard.cli.outcome import evaluate_and_store
 from marsyard.reports.campaign_diff import list_metrics
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.history import History, NightCampaign, list_comparisons
-from marsyard.reports.history_changes import Change
+from marsyard.reports.history_changes import MetricChange
 from marsyard.reports.night_page import format_night_page
 
 #: Files and folders in the output folder of `marsyard nightly`.
@@ -91,14 +91,14 @@ def run_check(run: NightlyRun, check: PlannedCheck, folder: Path) -> None:
     run.history.add(run.number, result, [])
 
 
-def publish_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> None:
+def publish_page(history: History, night: int, out: Path, changes: Sequence[MetricChange]) -> None:
     """Write the page and the dashboard, and print the page."""
     text = write_page(history, night, out, changes)
     write_site(out / SITE, [out / RUNS])
     typer.echo(text)
 
 
-def write_page(history: History, night: int, out: Path, changes: Sequence[Change]) -> str:
+def write_page(history: History, night: int, out: Path, changes: Sequence[MetricChange]) -> str:
     """Write the page with the results of the night so far, and the significant changes; return its text."""
     nights = {record.night: record for record in history.nights()}
     earlier_nights = [record for number, record in nights.items() if number < night]

@@ -22,7 +22,7 @@ def run_until_decided(
 ) -> None:
     """Run a campaign until its verdicts are decided, with at most the configured number of cases.
 
-    See `marsyard.reports.statistics.proportions`. Raises CampaignError for dependent draws, or if no requirement has a
+    See `marsyard.reports.statistics.sequential`. Raises CampaignError for dependent draws, or if no requirement has a
     confidence level.
     """
     definition = campaign.definition

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from marsyard.campaigns.definition.confirmation import Confirmation
-from marsyard.reports.assurance.elements import Element, ElementKind, State, defeater, goal, number_elements
+from marsyard.reports.assurance.elements import Element, ElementKind, GoalState, defeater, goal, number_elements
 from marsyard.reports.fits import Constant, read_constants
 from marsyard.reports.report_file import CampaignReport
 from marsyard.reports.stored import table
@@ -85,7 +85,7 @@ class AssuredRun:
 
 
 @dataclass(frozen=True)
-class Case:
+class AssuranceCase:
     """Assurance case: the argument, and the evidence that its page lists.
 
     - rows: rows of the validation page that concern a system of the campaigns
@@ -135,7 +135,7 @@ class Case:
         }
 
 
-def build_case(runs: Sequence[AssuredRun], folder: Path) -> Case:
+def build_case(runs: Sequence[AssuredRun], folder: Path) -> AssuranceCase:
     """Build the case of campaigns from the files of a package. Raises OSError or ValueError if one is invalid."""
     checks, constants = read_checks(folder / VALIDATION), read_constants(folder / REGISTER)
     factors = tomllib.loads((folder / CREDIBILITY).read_text(encoding="utf-8"))["factors"]
@@ -157,7 +157,7 @@ def build_case(runs: Sequence[AssuredRun], folder: Path) -> Case:
             (*(_argue_run(run, all_rows, constants) for run in runs), _argue_credibility(factors)),
         ),
     )
-    return Case(root, tuple(runs), tuple(rows), tuple(fitted), tuple(factors))
+    return AssuranceCase(root, tuple(runs), tuple(rows), tuple(fitted), tuple(factors))
 
 
 def _argue_run(run: AssuredRun, rows: Sequence[ValidationRow], constants: Iterable[Constant]) -> Element:
@@ -171,8 +171,8 @@ def _argue_run(run: AssuredRun, rows: Sequence[ValidationRow], constants: Iterab
         f"{run.algorithm} meets the requirements of {report.campaign}: {report.verdict}.",
         Element(ElementKind.CONTEXT, context, evidence=run.file("campaign.json")),
         Element(ElementKind.ASSUMPTION, assumption, evidence=run.file("campaign.json")) if assumed else None,
-        defeater(crashed, run.file("report.html"), State.REFUTED) if report.crashed else None,
-        defeater("The campaign has no requirement.", state=State.OPEN) if not report.verdicts else None,
+        defeater(crashed, run.file("report.html"), GoalState.REFUTED) if report.crashed else None,
+        defeater("The campaign has no requirement.", state=GoalState.OPEN) if not report.verdicts else None,
         Element(
             ElementKind.STRATEGY,
             "Argument over each requirement at its confidence",
@@ -189,9 +189,9 @@ def _argue_requirement(run: AssuredRun, verdict: Verdict) -> Element:
     required = f"{format_fraction(verdict.probability)} at {format_fraction(verdict.confidence)} confidence"
     bounds = "" if verdict.lower != verdict.lower else f", bounds {percent(verdict.lower)} to {percent(verdict.upper)}"
     numbers = f"{verdict.status}: {verdict.failures:,} of {count(verdict.n, 'case')} failed{bounds}. {verdict.note}"
-    state = State.SUPPORTED
+    state = GoalState.SUPPORTED
     if not verdict.status.is_met:
-        state = State.REFUTED if verdict.status is Status.FAIL else State.OPEN
+        state = GoalState.REFUTED if verdict.status is Status.FAIL else GoalState.OPEN
     is_assumed = verdict.kind == "ours" or _ASSUMED in verdict.source.lower()
     return goal(
         f"{verdict.requirement_id}: {verdict.statement} Required: {required}.",
@@ -250,7 +250,7 @@ def _argue_evidence(run: AssuredRun) -> Element:
         solution,
         Element(ElementKind.CONTEXT, f"Options set on declared calibration runs: {calibrated}") if calibrated else None,
         *(
-            defeater(text, run.file("campaign.json"), State.CHALLENGED if solution else State.OPEN)
+            defeater(text, run.file("campaign.json"), GoalState.CHALLENGED if solution else GoalState.OPEN)
             for text in qualifications
         ),
     )

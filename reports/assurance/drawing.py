@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 
-from marsyard.reports.assurance.elements import Element, ElementKind, State
+from marsyard.reports.assurance.elements import Element, ElementKind, GoalState
 
 #: SVG dash pattern of the box of a defeater.
 _DASHES = 'stroke-dasharray="6 3"'
@@ -15,11 +15,11 @@ _DASHES = 'stroke-dasharray="6 3"'
 _WIDTH, _COLUMN_GAP, _ROW_GAP, _LINE, _PAD = 300.0, 56.0, 12.0, 15.0, 11.0
 _CHARACTERS = 44
 #: Colours of the states, readable on white; the state is also written in each box.
-_COLOURS: Mapping[State, str] = {
-    State.SUPPORTED: "#1c7c5c",
-    State.CHALLENGED: "#9c6a00",
-    State.OPEN: "#5a6672",
-    State.REFUTED: "#b3261e",
+_COLOURS: Mapping[GoalState, str] = {
+    GoalState.SUPPORTED: "#1c7c5c",
+    GoalState.CHALLENGED: "#9c6a00",
+    GoalState.OPEN: "#5a6672",
+    GoalState.REFUTED: "#b3261e",
 }
 
 

@@ -17,8 +17,8 @@ class ElementKind(StrEnum):
     DEFEATER = "D"
 
 
-class State(StrEnum):
-    """State of a goal, from the least to the most severe."""
+class GoalState(StrEnum):
+    """GoalState of a goal, from the least to the most severe."""
 
     SUPPORTED = "supported"
     CHALLENGED = "supported, with open defeaters"
@@ -38,12 +38,12 @@ class Element:
     text: str
     children: tuple[Element, ...] = ()
     evidence: str = ""
-    own_state: State = State.SUPPORTED
+    own_state: GoalState = GoalState.SUPPORTED
 
     @property
-    def state(self) -> State:
+    def state(self) -> GoalState:
         """The worst state of this element and those below; an open defeater challenges all goals above it."""
-        order = list(State)
+        order = list(GoalState)
         return max((self.own_state, *(child.state for child in self.children)), key=order.index)
 
 
@@ -52,7 +52,7 @@ def goal(text: str, *children: Element | None) -> Element:
     return Element(ElementKind.GOAL, text, tuple(child for child in children if child is not None))
 
 
-def defeater(text: str, evidence: str = "", state: State = State.CHALLENGED) -> Element:
+def defeater(text: str, evidence: str = "", state: GoalState = GoalState.CHALLENGED) -> Element:
     """Create an open defeater."""
     return Element(ElementKind.DEFEATER, text, evidence=evidence, own_state=state)
 

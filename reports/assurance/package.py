@@ -22,7 +22,7 @@ from marsyard.campaigns.store.confirmation_record import read_record
 from marsyard.campaigns.store.record import utc_now
 from marsyard.campaigns.store.rows import ROWS_FILE, readable_store
 from marsyard.campaigns.studies.results import ROBUST_FOLDER
-from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuredRun, Case, build_case
+from marsyard.reports.assurance.case import CREDIBILITY, REGISTER, VALIDATION, AssuranceCase, AssuredRun, build_case
 from marsyard.reports.assurance.drawing import draw_case
 from marsyard.reports.assurance.signature import signature_path
 from marsyard.reports.campaign import write_evaluation
@@ -43,7 +43,7 @@ _REPORTS_FOLDER = REGISTER_FILE.parent
 _CREDIBILITY_FILE = REGISTER_FILE.with_name("credibility.toml")
 
 
-def write_package(directories: Sequence[Path], folder: Path) -> Case:
+def write_package(directories: Sequence[Path], folder: Path) -> AssuranceCase:
     """Write the package of stored campaigns into an existing empty folder.
 
     Raises CampaignError for a study or an unfinished campaign, StoreError for rows that were changed, and OSError if
@@ -128,7 +128,7 @@ def read_run_evidence(folder: Path, name: str) -> AssuredRun:
     return AssuredRun(name, report, data, record, head, identity, entries, record_head)
 
 
-def render_case(case: Case) -> Mapping[str, str]:
+def render_case(case: AssuranceCase) -> Mapping[str, str]:
     """Render the files that are computed from the evidence: the case as JSON, its drawing, and the page."""
     drawing = draw_case(case.root)
     content = hide_folders(json.dumps(case.to_json(), indent=1, ensure_ascii=False)) + "\n"
@@ -136,7 +136,7 @@ def render_case(case: Case) -> Mapping[str, str]:
     return {CASE: content, DRAWING: hide_folders(drawing), PAGE: hide_folders(page)}
 
 
-def _create_context(case: Case, drawing: str) -> dict[str, Any]:
+def _create_context(case: AssuranceCase, drawing: str) -> dict[str, Any]:
     """Create the context of the page."""
     # the drawing escapes all texts
     return {"case": case, "drawing": Markup(drawing), "verify": "marsyard assure --verify FOLDER"}  # noqa: S704

@@ -15,6 +15,9 @@ from marsyard.reports.statistics.samples import (
     standard_deviation_interval,
 )
 
+#: Probabilities of the quantiles of a summary, and confidence of its intervals and bounds.
+_QUANTILES, _CONFIDENCE = (0.5, 0.95, 0.99), 0.95
+
 
 @dataclass(frozen=True)
 class Quantile:
@@ -54,12 +57,7 @@ class ErrorSummary:
     confidence: Number
 
 
-def summarize(
-    sample: Float[np.ndarray, " n"],
-    quantiles: tuple[float, ...] = (0.5, 0.95, 0.99),
-    confidence: float = 0.95,
-    groups: Groups = None,
-) -> ErrorSummary:
+def summarize(sample: Float[np.ndarray, " n"], groups: Groups = None) -> ErrorSummary:
     """Summarize a sample of errors; values that are not finite are counted as missing and ignored.
 
     For radial errors the quantiles 0.5 and 0.95 are the circular error probable and the 95 % radius about the truth.
@@ -68,12 +66,12 @@ def summarize(
     finite, finite_groups = values[np.isfinite(values)], None if groups is None else groups[np.isfinite(values)]
     n, missing = finite.size, values.size - finite.size
     median = float(np.median(finite)) if n else math.nan
-    mean_lower, mean_upper = mean_interval(finite, confidence, finite_groups)
-    sd_lower, sd_upper = standard_deviation_interval(finite, confidence, finite_groups)
+    mean_lower, mean_upper = mean_interval(finite, _CONFIDENCE, finite_groups)
+    sd_lower, sd_upper = standard_deviation_interval(finite, _CONFIDENCE, finite_groups)
     quantile_results = []
-    for probability in quantiles:
+    for probability in _QUANTILES:
         estimate = float(np.quantile(finite, probability)) if is_interpolated(n, probability) else math.nan
-        bounds = quantile_bounds(finite, probability, confidence, finite_groups)
+        bounds = quantile_bounds(finite, probability, _CONFIDENCE, finite_groups)
         quantile_results.append(Quantile(probability, estimate, *bounds))
     return ErrorSummary(
         n=n,
@@ -89,7 +87,7 @@ def summarize(
         robust_sd=1.4826 * float(np.median(np.abs(finite - median))) if n else math.nan,
         largest=float(np.abs(finite).max()) if n else math.nan,
         quantiles=tuple(quantile_results),
-        confidence=confidence,
+        confidence=_CONFIDENCE,
     )
 
 

@@ -1,6 +1,6 @@
 """Success rates of independent cases: exact binomial bounds, and numbers of cases that they need.
 
-`marsyard.reports.statistics.clusters` computes bounds for cases that share terrains.
+`marsyard.reports.statistics.clustered_cases` computes bounds for cases that share terrains.
 
 The bounds are those of Clopper & Pearson, "The use of confidence or fiducial limits illustrated in the case of the
 binomial", Biometrika 26, 1934.

@@ -1,11 +1,11 @@
 """Columns in the rows of a parachute descent."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, instrument_error, outcome
+from marsyard.scenarios.columns import Column, ColumnKind, Columns, condition, error, flag, instrument_error, outcome
 
 #: Columns of custom motions, altimeters and attitude sources, which the user's code names.
 _CUSTOM = tuple(
-    Column(f"{part}_*", Kind.CONDITION, f"quantity of a custom {noun}", type=type_)
+    Column(f"{part}_*", ColumnKind.CONDITION, f"quantity of a custom {noun}", type=type_)
     for part, noun in (("flight", "motion"), ("altimeter", "altimeter"), ("attitude_source", "source of attitudes"))
     for type_ in (float, bool, str)
 )
@@ -35,7 +35,7 @@ COLUMNS = Columns(
         ),
         Column(
             "feasible_overlap",
-            Kind.TRUTH,
+            ColumnKind.TRUTH,
             "in both image pairs, the ground that both images show outside of the bright spot opposite the sun is at "
             "least 110 m across",
             population="with feasible overlap",

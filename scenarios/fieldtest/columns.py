@@ -1,7 +1,7 @@
 """Columns in the rows of a field test: one triple of images of a helicopter flight."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Column, Columns, Kind, condition, flag, instrument_error, text
+from marsyard.scenarios.columns import Column, ColumnKind, Columns, condition, flag, instrument_error, text
 
 COLUMNS = Columns(
     (
@@ -14,17 +14,17 @@ COLUMNS = Columns(
         *common.IMAGES,
         text("run", "name of the run"),
         text("category", "category of the triple: short time, same direction, opposite direction"),
-        flag("one_direction", "all images show one flight direction", "with one direction of flight", Kind.TRUTH),
-        flag("clear_sky", "no cloud shadow moves over the ground", "without clouds", Kind.TRUTH),
-        flag("intact_cable", "the cable causes no noise", "with an intact cable", Kind.CONFIGURED),
-        flag("noisy_cable", "the cable causes noise", "with noise from the cable", Kind.CONFIGURED),
+        flag("one_direction", "all images show one flight direction", "with one direction of flight", ColumnKind.TRUTH),
+        flag("clear_sky", "no cloud shadow moves over the ground", "without clouds", ColumnKind.TRUTH),
+        flag("intact_cable", "the cable causes no noise", "with an intact cable", ColumnKind.CONFIGURED),
+        flag("noisy_cable", "the cable causes noise", "with noise from the cable", ColumnKind.CONFIGURED),
         condition("location_east_m", "east position at the second image", "east position on the terrain"),
         condition("location_north_m", "north position at the second image", "north position on the terrain"),
         condition("interval_*_s", "true time between the images of a pair"),
         instrument_error("attitude_change_*_deg", "change of the attitude error between the images of a pair"),
         condition("cloud_transmittance_*", "mean fraction of direct sunlight that clouds transmit at an image"),
         condition("cloud_change_*", "mean change of the transmitted fraction between the images of a pair"),
-        Column("image_time_*_s", Kind.PROVENANCE, "true time of an image from the start of the run"),
-        Column("pass_*", Kind.PROVENANCE, "number of the pass over the target at an image"),
+        Column("image_time_*_s", ColumnKind.PROVENANCE, "true time of an image from the start of the run"),
+        Column("pass_*", ColumnKind.PROVENANCE, "number of the pass over the target at an image"),
     )
 )

@@ -1,7 +1,7 @@
 """Columns in the rows of a landing: motion, map, site and touchdown."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, instrument_error, outcome
+from marsyard.scenarios.columns import ColumnKind, Columns, condition, error, flag, instrument_error, outcome
 
 COLUMNS = Columns(
     (
@@ -60,27 +60,31 @@ COLUMNS = Columns(
             "mean standard deviation that the receiver reports after touchdown, north",
             "north error of averaged GPS",
         ),
-        flag("safe_site_exists", "a safe site is visible in both images", "with a safe site", Kind.TRUTH),
-        flag("no_safe_site_exists", "no safe site is visible in both images", "without a safe site", Kind.TRUTH),
-        flag("narrow_site_exists", "safe sites exist, but none is wide", "with only narrow safe sites", Kind.TRUTH),
+        flag("safe_site_exists", "a safe site is visible in both images", "with a safe site", ColumnKind.TRUTH),
+        flag("no_safe_site_exists", "no safe site is visible in both images", "without a safe site", ColumnKind.TRUTH),
+        flag(
+            "narrow_site_exists", "safe sites exist, but none is wide", "with only narrow safe sites", ColumnKind.TRUTH
+        ),
         flag(
             "wide_site_exists",
             "around a safe site all positions within one lander radius are safe",
             "with a wide safe site",
-            Kind.TRUTH,
+            ColumnKind.TRUTH,
         ),
-        flag("hazard_visible", "both images show a footprint that is not safe", "with a visible hazard", Kind.TRUTH),
+        flag(
+            "hazard_visible", "both images show a footprint that is not safe", "with a visible hazard", ColumnKind.TRUTH
+        ),
         flag(
             "within_limits",
             "the change between the images is within the paper's limits",
             "within the tracking limits",
-            Kind.TRUTH,
+            ColumnKind.TRUTH,
         ),
         flag(
             "strict_threshold",
             "the algorithm's limit of the roughness is at most that of the lander",
             "with a threshold within the lander's limit",
-            Kind.CONFIGURED,
+            ColumnKind.CONFIGURED,
         ),
         outcome("features", "selected features"),
         outcome("tracks", "accepted tracks"),

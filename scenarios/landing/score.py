@@ -103,21 +103,22 @@ def landing_row(
         columns = (*(f"touchdown_{column}" for column in GROUND_COLUMNS), *TOUCHDOWN_COLUMNS)
         return {"landed": False, **dict.fromkeys(columns, NAN)}
     position, velocity = touchdown.state.position_m, touchdown.state.velocity_m_s
-    numbers = (
-        horizontal_distance_m(touchdown.gps_m, site),
-        horizontal_distance_m(touchdown.estimated_m, site),
-        horizontal_distance_m(position, site - flight.position_error_m),
-        float(touchdown.gps_deviation_m[1]),
-        float(touchdown.gps_deviation_m[0]),
-        touchdown.gps_solutions,
-        touchdown.iterations,
-        touchdown.path_change_m,
-        touchdown.time_s - flight.states[1].time_s,
-        -float(velocity[2]),
-        float(np.hypot(*velocity[:2])),
-    )
     ground_row = _ground_row("touchdown", position[:2], truth)
-    return {"landed": True, **ground_row, **dict(zip(TOUCHDOWN_COLUMNS, numbers, strict=True))}
+    return {
+        "landed": True,
+        **ground_row,
+        "touchdown_error_gps_m": horizontal_distance_m(touchdown.gps_m, site),
+        "touchdown_error_estimated_m": horizontal_distance_m(touchdown.estimated_m, site),
+        "touchdown_error_m": horizontal_distance_m(position, site - flight.position_error_m),
+        "gps_sd_north_m": float(touchdown.gps_deviation_m[1]),
+        "gps_sd_east_m": float(touchdown.gps_deviation_m[0]),
+        "gps_solutions": touchdown.gps_solutions,
+        "landing_iterations": touchdown.iterations,
+        "landing_path_change_m": touchdown.path_change_m,
+        "landing_after_s": touchdown.time_s - flight.states[1].time_s,
+        "touchdown_sink_m_s": -float(velocity[2]),
+        "touchdown_horizontal_speed_m_s": float(np.hypot(*velocity[:2])),
+    }
 
 
 def map_row(

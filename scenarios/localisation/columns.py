@@ -1,7 +1,7 @@
 """Columns in the rows of a descent with localisation on a map."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Columns, Kind, condition, error, flag, instrument_error, outcome
+from marsyard.scenarios.columns import ColumnKind, Columns, condition, error, flag, instrument_error, outcome
 
 COLUMNS = Columns(
     (
@@ -19,7 +19,9 @@ COLUMNS = Columns(
         instrument_error("map_shift_m", "length of the map's registration error", "position error of the map"),
         instrument_error("initial_error_m", "horizontal error of the initial position, relative to the map"),
         instrument_error("initial_attitude_error_deg", "error of the initial attitude"),
-        flag("false_fix", "a reported position is more than 40 m from the true one", "with a false fix", Kind.TRUTH),
+        flag(
+            "false_fix", "a reported position is more than 40 m from the true one", "with a false fix", ColumnKind.TRUTH
+        ),
         flag("position_reported", "a position is reported", "with a reported position"),
         flag(
             "fixed_in_time",

@@ -3,11 +3,11 @@
 from dataclasses import replace
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, outcome, text
+from marsyard.scenarios.columns import Column, ColumnKind, Columns, condition, error, flag, outcome, text
 
 _CASE = (
     text("measured_case", "name of the case"),
-    text("image_hash", "hash of the counts of all images", Kind.PROVENANCE),
+    text("image_hash", "hash of the counts of all images", ColumnKind.PROVENANCE),
     condition("images", "number of images"),
     condition("duration_s", "time from the first to the last image"),
     condition("max_rotation_deg", "largest rotation between two images", "largest rotation between two images"),
@@ -59,7 +59,7 @@ MAP_COLUMNS = Columns(
     (
         *_CASE[:2],
         *_map_columns("", "recorded image"),
-        text("rendered.outcome", "outcome of the rendered image", Kind.OUTCOME),
+        text("rendered.outcome", "outcome of the rendered image", ColumnKind.OUTCOME),
         *_map_columns("rendered.", "rendered image"),
         error("rendered.pose_error_px", "median distance between the pixels of the landmarks by found and true pose"),
     )

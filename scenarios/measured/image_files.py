@@ -82,7 +82,7 @@ def read_elevation(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "ro
 
 
 def read_format(
-    path: Path, size: tuple[int, int] | None = None, *, is_published: bool = False
+    path: Path, size: tuple[int, int] | None = None, *, is_published: bool
 ) -> tuple[str, tuple[int, int]]:
     """Return the format of an image and its size (columns, rows).
 

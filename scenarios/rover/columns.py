@@ -1,7 +1,17 @@
 """Columns in the rows of tracked targets: runs of a rover, and targets on the images of a shared drive."""
 
 from marsyard.scenarios import common_columns as common
-from marsyard.scenarios.columns import Column, Columns, Kind, condition, error, flag, instrument_error, outcome, text
+from marsyard.scenarios.columns import (
+    Column,
+    ColumnKind,
+    Columns,
+    condition,
+    error,
+    flag,
+    instrument_error,
+    outcome,
+    text,
+)
 
 _TARGET = (
     *common.SITE,
@@ -11,25 +21,27 @@ _TARGET = (
     text("camera", "preset of the cameras"),
     text("incline", "kind of the incline"),
     text("map_by", "cameras of the terrain map: body, mast, or none without one"),
-    text("losses", "criteria that lost the target, or none", Kind.OUTCOME),
-    flag("navcam", "the cameras are navcams", "with the navcam", Kind.CONFIGURED),
-    flag("pancam", "the cameras are pancams", "with the pancam", Kind.CONFIGURED),
-    flag("visual_odometry", "the rover corrects its pose by visual odometry", "", Kind.CONFIGURED),
-    flag("autonav", "the rover avoids hazards by itself", "with autonomous navigation", Kind.CONFIGURED),
-    flag("roll_compensated", "the tracker rotates its template", "with roll compensation", Kind.CONFIGURED),
-    flag("roll_ignored", "the tracker does not rotate its template", "without roll compensation", Kind.CONFIGURED),
-    Column("search_px", Kind.CONFIGURED, "side of the search window"),
+    text("losses", "criteria that lost the target, or none", ColumnKind.OUTCOME),
+    flag("navcam", "the cameras are navcams", "with the navcam", ColumnKind.CONFIGURED),
+    flag("pancam", "the cameras are pancams", "with the pancam", ColumnKind.CONFIGURED),
+    flag("visual_odometry", "the rover corrects its pose by visual odometry", "", ColumnKind.CONFIGURED),
+    flag("autonav", "the rover avoids hazards by itself", "with autonomous navigation", ColumnKind.CONFIGURED),
+    flag("roll_compensated", "the tracker rotates its template", "with roll compensation", ColumnKind.CONFIGURED),
+    flag(
+        "roll_ignored", "the tracker does not rotate its template", "without roll compensation", ColumnKind.CONFIGURED
+    ),
+    Column("search_px", ColumnKind.CONFIGURED, "side of the search window"),
     condition("rock_diameter_m", "diameter of the target's rock", "rock diameter"),
     condition("rock_height_m", "height of the target's rock"),
     flag(
         "selectable",
         "the designated point is sunlit, unoccluded and away from the edge of the rock",
         "with a selectable target",
-        Kind.TRUTH,
+        ColumnKind.TRUTH,
     ),
-    flag("point_lit", "the sun reaches the designated point", kind=Kind.CONDITION),
-    flag("point_on_edge", "the designated point is near the occluding edge of its rock", kind=Kind.CONDITION),
-    flag("clear_sky", "no cloud shadow moves over the ground", "without clouds", Kind.TRUTH),
+    flag("point_lit", "the sun reaches the designated point", kind=ColumnKind.CONDITION),
+    flag("point_on_edge", "the designated point is near the occluding edge of its rock", kind=ColumnKind.CONDITION),
+    flag("clear_sky", "no cloud shadow moves over the ground", "without clouds", ColumnKind.TRUTH),
     instrument_error("disparity_error_start_px", "disparity error at 10 m", "disparity error at the start"),
     instrument_error("disparity_error_goal_px", "disparity error at 2 m", "disparity error at the goal"),
     instrument_error("mast_azimuth_error_deg", "zero error of the mast's azimuth"),
@@ -54,12 +66,12 @@ _TARGET = (
         "obliquity of the target's surface at the start",
     ),
     condition("obliquity_max_deg", "maximum obliquity", "maximum obliquity of the target's surface"),
-    flag("rover_shadow_on_target", "the rover's shadow lies on the target", "", Kind.TRUTH),
+    flag("rover_shadow_on_target", "the rover's shadow lies on the target", "", ColumnKind.TRUTH),
     flag(
         "no_rover_shadow_on_target",
         "the rover's shadow never lies on the target",
         "whose target is never in the rover's shadow",
-        Kind.TRUTH,
+        ColumnKind.TRUTH,
     ),
     condition(
         "azimuth_change_max_deg",
@@ -76,8 +88,8 @@ _TARGET = (
     flag("tracked", "the target is tracked", "with a tracked target"),
     flag("not_tracked", "the target is not tracked", "without a tracked target"),
     flag("target_held", "the target is tracked at the last stop"),
-    flag("stuck", "the rover hardly moves over several steps", "with a stuck rover", Kind.TRUTH),
-    flag("mobile", "the rover is not stuck", "with a rover that is not stuck", Kind.TRUTH),
+    flag("stuck", "the rover hardly moves over several steps", "with a stuck rover", ColumnKind.TRUTH),
+    flag("mobile", "the rover is not stuck", "with a rover that is not stuck", ColumnKind.TRUTH),
     flag("no_false_track", "there is no false track"),
     flag("handed_off", "the target is handed off to the arm"),
     outcome("updates", "updates of the tracker"),
@@ -127,12 +139,12 @@ _UPDATES = {
 COLUMNS = Columns(
     (
         *_TARGET,
-        flag("point_in_view", "the designated point stays visible", "whose point stays in view", Kind.TRUTH),
+        flag("point_in_view", "the designated point stays visible", "whose point stays in view", ColumnKind.TRUTH),
         flag(
             "placeable",
             "a position within 8 mm of the designated point is free of collisions",
             "whose target permits a placement",
-            Kind.TRUTH,
+            ColumnKind.TRUTH,
         ),
         flag("placed", "the instrument is placed", "with a placed instrument"),
         flag("placement_safe", "the instrument is placed within 3 cm of the designated point without a collision"),
@@ -148,18 +160,20 @@ DRIVE_COLUMNS = Columns(
     (
         *_TARGET,
         condition("step", "step between two updates: fraction of the distance, or degrees of a turn or circle"),
-        flag("in_view", "the designated point stays visible", "whose point stays in view", Kind.TRUTH),
+        flag("in_view", "the designated point stays visible", "whose point stays in view", ColumnKind.TRUTH),
         flag(
             "on_face",
             "the point is on the face seen from both ends",
             "whose point is on the face seen from both ends",
-            Kind.TRUTH,
+            ColumnKind.TRUTH,
         ),
-        flag("with_scale", "the tracker changes the scale of its template", "with template scale", Kind.CONFIGURED),
-        flag("pure_ncc", "the tracker is pure-ncc", "without template scale", Kind.CONFIGURED),
+        flag(
+            "with_scale", "the tracker changes the scale of its template", "with template scale", ColumnKind.CONFIGURED
+        ),
+        flag("pure_ncc", "the tracker is pure-ncc", "without template scale", ColumnKind.CONFIGURED),
         # ranges of steps, which the campaign names
-        flag("at_*", "the step is in the range", "with steps of *", Kind.CONFIGURED),
-        flag("to_*", "the step is in the range", "with steps of up to *", Kind.CONFIGURED),
+        flag("at_*", "the step is in the range", "with steps of *", ColumnKind.CONFIGURED),
+        flag("to_*", "the step is in the range", "with steps of up to *", ColumnKind.CONFIGURED),
     ),
     named_flags="step_ranges",
 )

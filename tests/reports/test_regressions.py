@@ -8,7 +8,7 @@ import pytest
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.reports.history import FINISHED, INTERRUPTED, RUNNING, History, NightCampaign, list_comparisons
-from marsyard.reports.history_changes import Change, Comparison, find_changes
+from marsyard.reports.history_changes import MetricChange, NightComparison, find_changes
 from marsyard.reports.night_page import format_night_page
 from marsyard.reports.statistics.changes import Metric, Sample
 
@@ -36,13 +36,13 @@ def _draw_metrics(
 
 def _detect_changes(
     rng: np.random.Generator, pool: tuple[np.ndarray, np.ndarray], error_factor: float = 1.0
-) -> list[Change]:
+) -> list[MetricChange]:
     """Compare a nightly run of two campaigns with seven earlier runs; `error_factor` changes the first campaign."""
     comparisons = []
     for campaign, factor in (("first", error_factor), ("second", 1.0)):
         earlier_runs = [_draw_metrics(rng, pool) for _ in range(7)]
         for index, metric in enumerate(_draw_metrics(rng, pool, factor)):
-            comparisons.append(Comparison(campaign, metric, [run[index].sample for run in earlier_runs]))
+            comparisons.append(NightComparison(campaign, metric, [run[index].sample for run in earlier_runs]))
     return find_changes(comparisons)
 
 
@@ -152,8 +152,8 @@ def test_page_lists_regressions_and_interrupted_runs(tmp_path: Path) -> None:
         later, earlier = history.nights()
     # campaign, metric, is a rate, value before, value now, p-value, number of earlier nights
     changes_of_night = [
-        Change("first", "DIMES-VEL", True, 0.95, 0.7, 2e-6, 7),
-        Change("first", "error (m)", False, 2.0, 1.0, 1e-3, 7),
+        MetricChange("first", "DIMES-VEL", True, 0.95, 0.7, 2e-6, 7),
+        MetricChange("first", "error (m)", False, 2.0, 1.0, 1e-3, 7),
     ]
     text = format_night_page(
         later, [earlier], [NightCampaign(hostile, "d", "x", "FAIL", 1, hostile)], changes_of_night, 6

@@ -22,7 +22,7 @@ from scipy.stats import norm
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dispersion_changes import ChangeKind, list_changes
-from marsyard.reports.robustness import ALL_DISPERSIONS, Outcome, Robustness, evaluate_robustness
+from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness, evaluate_robustness
 from marsyard.reports.robustness_sentences import reach_text, robustness_text
 from marsyard.reports.sampling_design import read_sampling_design
 from marsyard.reports.statistics.crossing import Crossing, find_crossing
@@ -136,10 +136,10 @@ def test_changes_have_the_units_of_the_parameters(tmp_path: Path) -> None:
     down = records["loads.1", ChangeKind.MEAN_DOWN]
     assert down.spread == pytest.approx(20.0 / math.sqrt(12.0), rel=1e-3)
     assert down.passes_at == pytest.approx(30.0 - down.spread * down.lower, rel=1e-3)
-    assert up.outcome is down.outcome is Outcome.FOUND
+    assert up.outcome is down.outcome is ChangeOutcome.FOUND
     # the other direction does not lead to FAIL within the reach of the cases
     other = records["loads.0", ChangeKind.MEAN_DOWN]
-    assert other.outcome is Outcome.REFUSED
+    assert other.outcome is ChangeOutcome.REFUSED
     assert math.isnan(other.change)
 
 
@@ -154,7 +154,7 @@ def test_probability_of_a_value(tmp_path: Path) -> None:
     # 80 failures: the standard deviation of their fraction is 0.02
     assert rough.fails_at == pytest.approx(0.25, rel=0.2)
     assert 0.1 < rough.passes_at < 0.25
-    assert plain.outcome is Outcome.NONE
+    assert plain.outcome is ChangeOutcome.NONE
 
 
 def test_unobserved_value_is_no_evidence() -> None:
@@ -236,14 +236,14 @@ def test_few_cases_are_refused(tmp_path: Path) -> None:
     """Of 29 cases, nothing is said about any change, except about those of bounded divergence."""
     _, _, records = evaluate(tmp_path, 29, 0.9, lambda first, second, kind: first > 9.0)
     assert [item.kind for item in records] == [ChangeKind.DIVERGENCE]
-    assert records[0].outcome is Outcome.REFUSED
+    assert records[0].outcome is ChangeOutcome.REFUSED
 
 
 def test_change_is_refused_below_30_effective_cases(tmp_path: Path) -> None:
     """Of 200 cases, a shift d leaves 200 exp(-d^2) effective cases: at most d = 1.377."""
     _, records, _ = evaluate(tmp_path, 200, 0.9, lambda first, second, kind: first > 9.0)
     item = records["loads.0", ChangeKind.MEAN_UP]
-    assert item.outcome is Outcome.REFUSED
+    assert item.outcome is ChangeOutcome.REFUSED
     assert 0.0 < item.lower < item.reach <= math.sqrt(math.log(200.0 / 30.0)) + 1e-9
     assert item.effective_cases >= 30.0 * (1.0 - 1e-6)
 
@@ -332,7 +332,7 @@ def test_change_of_few_failures_is_not_named(tmp_path: Path) -> None:
     verdicts, records, all_records = evaluate(
         tmp_path, 1000, 0.98, lambda first, second, kind: np.argsort(np.argsort(-first)) < 3
     )
-    assert records["loads.0", ChangeKind.MEAN_UP].outcome is Outcome.FOUND
+    assert records["loads.0", ChangeKind.MEAN_UP].outcome is ChangeOutcome.FOUND
     assert records["loads.0", ChangeKind.MEAN_UP].effective_cases >= 30.0
     assert math.isnan(records["loads.0", ChangeKind.WIDER].upper)
     assert "standard deviation of loads 0" not in robustness_text(verdicts[0], all_records)

@@ -32,7 +32,7 @@ from marsyard.cli.app import app
 from marsyard.reports.dashboard.site import write_site
 from marsyard.reports.dispersion_changes import ChangeKind
 from marsyard.reports.evaluation import evaluate_run
-from marsyard.reports.robustness import Outcome
+from marsyard.reports.robustness import ChangeOutcome
 from marsyard.reports.robustness_sentences import reach_text
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
 from marsyard.reports.variants import RobustStudy, _evaluate, _find_step
@@ -84,7 +84,7 @@ def test_change_of_a_fixed_parameter(run: Path) -> None:
     item = next(item for item in evaluation.robustness if item.kind is ChangeKind.VALUE and item.requirement == "LOAD")
     loads = np.sort([row["load"] for row in base])[::-1]
     exact = 100.0 - loads[10]  # decrease of beta at which 11 of 200 cases fail, more than 5 %
-    assert item.outcome is Outcome.FOUND
+    assert item.outcome is ChangeOutcome.FOUND
     assert item.assumed - item.fails_at == pytest.approx(exact, abs=0.05)
     assert item.lower < item.change < item.upper
     assert item.passes_at == pytest.approx(BETA * (1.0 - item.lower))

@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
-from marsyard.reports.assurance.case import Case, build_case
-from marsyard.reports.assurance.elements import ElementKind, State, number_elements
+from marsyard.reports.assurance.case import AssuranceCase, build_case
+from marsyard.reports.assurance.elements import ElementKind, GoalState, number_elements
 from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package
@@ -23,7 +23,7 @@ from tests.reports.assurance.stored_run import write_stored_run
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Case]:
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, AssuranceCase]:
     """Write a package of one campaign of 240 cases; return its folder and its case."""
     folder = tmp_path_factory.mktemp("assured")
     run = write_stored_run(folder / "run")
@@ -32,7 +32,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Case]:
 
 
 @pytest.fixture
-def stored(written: tuple[Path, Case]) -> Path:
+def stored(written: tuple[Path, AssuranceCase]) -> Path:
     """Return the folder of the package, which must not be changed."""
     return written[0]
 
@@ -203,7 +203,7 @@ def test_signature_shows_who_wrote_the_hashes(package: Path, tmp_path: Path) -> 
     assert any(problem.startswith("manifest.json.sig: ") for problem in verify_package(package).problems)
 
 
-def test_case_has_all_kinds_of_defeaters(written: tuple[Path, Case]) -> None:
+def test_case_has_all_kinds_of_defeaters(written: tuple[Path, AssuranceCase]) -> None:
     folder, case = written
     texts = [item.text for _, item, _ in case.defeaters]
     beginnings = (
@@ -213,7 +213,7 @@ def test_case_has_all_kinds_of_defeaters(written: tuple[Path, Case]) -> None:
     for beginning in beginnings:
         assert any(text.startswith(beginning) for text in texts), beginning
     # an exploration does not show that its cases are new
-    assert case.root.state in (State.OPEN, State.REFUTED)
+    assert case.root.state in (GoalState.OPEN, GoalState.REFUTED)
     content = case.to_json()
     names = [name for name, _, _ in number_elements(case.root)]
     assert [item["id"] for item in content["elements"]] == names
@@ -229,7 +229,7 @@ def test_failed_requirement_refutes_the_claim(tmp_path: Path) -> None:
     (run / "campaign.json").write_text(record.replace('"bound": 5.0', '"bound": 0.001'))
     (tmp_path / "package").mkdir()
     case = write_package([run], tmp_path / "package")
-    assert case.root.state is State.REFUTED
+    assert case.root.state is GoalState.REFUTED
     solution = next(item for _, item, _ in number_elements(case.root) if item.kind is ElementKind.SOLUTION)
     assert solution.text.startswith("FAIL: ")
 
