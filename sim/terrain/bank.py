@@ -29,6 +29,7 @@ from marsyard.sim.terrain.surface import (
     split_levels,
 )
 
+CREST_WIDTH = 1.5
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py", "environment.py", "published_sites.py")
 #: Beginning of the identity of a terrain on an imported DTM.
@@ -97,11 +98,21 @@ def _add_fine_ground(
 
     `relief_log_albedo` is the log albedo of ground that is one standard deviation of the fine relief higher.
     """
+    height, log_albedo = fine.height, fine.log_albedo
+    roughness, texture = (
+        refine(np.ascontiguousarray(factors[..., channel]), ground.side) for channel in (ROUGHNESS, TEXTURE)
+    )
+    log_albedo *= texture
     if relief_log_albedo:
-        log_albedo = ground.log_albedo
-        log_albedo += np.float32(relief_log_albedo / fine.height.std(dtype=np.float64)) * fine.height
-    for total, part, factor in ((ground.height, fine.height, ROUGHNESS), (ground.log_albedo, fine.log_albedo, TEXTURE)):
-        total += part * refine(np.ascontiguousarray(factors[..., factor]), ground.side)
+        np.abs(height, out=height)
+        mean = height.mean(dtype=np.float64)
+        np.minimum(height, np.float32(CREST_WIDTH * mean), out=height)
+        np.subtract(height.mean(dtype=np.float64), height, out=height)
+        height *= roughness
+        log_albedo += np.float32(relief_log_albedo / mean) * height
+    else:
+        height *= roughness
+    ground.add(fine)
 
 
 @cache

@@ -36,6 +36,9 @@ class TerrainParameters(Parameters):
     crater_sand_log_albedo: Annotated[
         float, bounded_field(-2.0, 1.0, "mean logarithm of the albedo of this sand divided by the ground's")
     ] = -0.4
+    craters_wear_albedo: Annotated[
+        bool, Field(description="whether sand and ejecta fade as craters wear; otherwise they do not depend on the age")
+    ] = False
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
     crater_ejecta_contrast: Annotated[

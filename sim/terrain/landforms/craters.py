@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
 
 RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
-EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
+#: Maximum distance of ejecta from the centre of a crater, in radii; optical depth of the ejecta at the rim (assumed: they
+#: cover a third of the ground at two radii).
+EJECTA_EXTENT_RADII, EJECTA_OPACITY = 3.0, 3.0
+#: Width of the margin in which a crater's fill thins out, in crater radii; fitted to Spirit's descent images.
+FILL_MARGIN = 0.4
 #: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
 #: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
 FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
@@ -32,10 +36,13 @@ SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in cr
 OUTLINES, POSITIONS, OUTLINE_WAVES = 64, 256, (2, 24)
 OUTLINE_RMS, OUTLINE_EXPONENT = 0.06, -1.25
 RAY_WAVES = (5, 16)  #: Rays around a crater: waves of equal amplitude (assumed).
+WORN_EXTENT_RADII = 1.6  #: Extent of the ejecta of the most worn craters, in radii (assumed).
+#: Small craters in clusters of secondaries (assumed): largest diameter, fraction, number and radius of a cluster.
+LARGEST_SECONDARY_M, SECONDARY_FRACTION, CLUSTER_SIZE, CLUSTER_RADIUS_M = 30.0, 0.5, 10, 45.0
 _TABLE_SEED = 20040104  #: Seed of the tables of outlines and rays, which are the same for all terrains.
 
 
-def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 14"]:
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 18"]:
     """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
 
     Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
@@ -73,7 +80,8 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
     ejecta_log_albedo = p.crater_ejecta_contrast * size_factor * rng.gamma(3.0, 1.0 / 3.0, count)
     ejecta_log_albedo *= np.where(rng.uniform(size=count) < DARK_EJECTA, -1.0, 1.0)
-    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * size_factor
+    sand_factor = 1.0 if p.craters_wear_albedo else size_factor
+    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * sand_factor
     fill_log_albedo = np.where(
         has_sand,
         p.crater_sand_log_albedo * rng.uniform(0.5, 1.5, count),
@@ -84,8 +92,36 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     lee = 0.3 * rng.standard_normal((count, 2))
     outline = rng.integers(0, OUTLINES, count)
     rotation = rng.uniform(0.0, 1.0, count)
+    extent, opacity = np.full(count, EJECTA_EXTENT_RADII), np.full(count, EJECTA_OPACITY)
+    margin, core = np.full(count, FILL_MARGIN), np.zeros(count)
+    if p.craters_wear_albedo:
+        # ejecta are mixed into the soil as fast as the rim wears, and a deep bowl shelters more sand than a shallow one
+        extent = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
+        opacity *= freshness**2
+        ejecta_log_albedo = np.abs(ejecta_log_albedo)
+        depth_factor = freshness * rng.uniform(0.7, 1.3, count) * size_factor**-0.3
+        fill_log_albedo = depth_factor * np.where(has_sand, p.crater_sand_log_albedo * size_factor, 0.0)
+        fill_log_albedo *= np.minimum(np.sqrt(2.0 * FULL_CONTRAST_M / diameter), 1.0)
+        fill_log_albedo += p.crater_floor_contrast * size_factor * rng.standard_normal(count)
+        margin_m = 1.5 + 12.0 * (1.0 - freshness) * rng.uniform(0.3, 1.0, count)
+        margin = np.minimum(2.0 * margin_m / diameter, 0.5)
+        fill_radius = 1.0 + 0.2 * margin
+        core = rng.uniform(0.3, 1.0, count) * size_factor
+        _gather_secondaries(position, diameter, period, rng)
     albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
-    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, rotation])
+    shape = (position, diameter / 2.0, depth, rim, rounding, fill)
+    return np.column_stack([*shape, *albedo, lee, outline, rotation, extent, opacity, margin, core])
+
+
+def _gather_secondaries(
+    position: Float64[np.ndarray, "craters 2"], diameter: Float64[np.ndarray, "craters"], period: float, rng: Generator
+) -> None:
+    """Move a fraction of the small craters into clusters, in place: ejecta of a distant impact fall together."""
+    is_secondary = (diameter < LARGEST_SECONDARY_M) & (rng.uniform(size=diameter.size) < SECONDARY_FRACTION)
+    count = int(np.count_nonzero(is_secondary))
+    clusters = rng.uniform(0.0, period, (count // CLUSTER_SIZE + 1, 2))
+    offset = CLUSTER_RADIUS_M * rng.standard_normal((count, 2))
+    position[is_secondary] = clusters[rng.integers(0, len(clusters), count)] + offset
 
 
 @cache
@@ -109,7 +145,7 @@ def outline_tables() -> tuple[Float64[np.ndarray, "outlines positions"], Float64
     return tables[0], tables[1]
 
 
-def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 14"]) -> None:
+def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 18"]) -> None:
     """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
     octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
     layer = None
@@ -118,5 +154,5 @@ def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 14"
         if layer is not None:
             grid.add(layer)
         rows = craters[octave == step]
-        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, rows, *outline_tables(), EJECTA_EXTENT_RADII)
+        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, rows, *outline_tables())
         layer = grid
