@@ -105,14 +105,15 @@ def _add_fine_ground(
     log_albedo *= texture
     if relief_log_albedo:
         np.abs(height, out=height)
-        mean = height.mean(dtype=np.float64)
+        mean = float(height[::FACTOR_STEP, ::FACTOR_STEP].mean(dtype=np.float64))
         np.minimum(height, np.float32(CREST_WIDTH * mean), out=height)
-        np.subtract(height.mean(dtype=np.float64), height, out=height)
-        height *= roughness
-        log_albedo += np.float32(relief_log_albedo / mean) * height
-    else:
-        height *= roughness
+        roughness *= np.float32(-1.0)
+    height *= roughness
     ground.add(fine)
+    if relief_log_albedo:
+        height *= np.float32(relief_log_albedo / mean)
+        total = ground.log_albedo
+        total += height
 
 
 @cache

@@ -28,6 +28,7 @@ FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
 FRESH_RIM = 0.04
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
+LEAST_FILL = 0.25
 DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
 FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
 SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
@@ -97,7 +98,8 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     if p.craters_wear_albedo:
         # ejecta are mixed into the soil as fast as the rim wears, and a deep bowl shelters more sand than a shallow one
         extent = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
-        opacity *= freshness**2
+        opacity *= freshness**1.5
+        fill += LEAST_FILL * (1.0 - fill)
         ejecta_log_albedo = np.abs(ejecta_log_albedo)
         depth_factor = freshness * rng.uniform(0.7, 1.3, count) * size_factor**-0.3
         fill_log_albedo = depth_factor * np.where(has_sand, p.crater_sand_log_albedo * size_factor, 0.0)

@@ -103,7 +103,8 @@ def stamp_craters(
         blend_width = 0.25 * fill * bottom + 1e-9
         for i in range(math.ceil((y - extent) / spacing), math.floor((y + extent) / spacing) + 1):
             dy = i * spacing - y
-            for j in range(math.ceil((x - extent) / spacing), math.floor((x + extent) / spacing) + 1):
+            chord = math.sqrt(max(extent * extent - dy * dy, 0.0))
+            for j in range(math.ceil((x - chord) / spacing), math.floor((x + chord) / spacing) + 1):
                 dx = j * spacing - x
                 d = math.sqrt(dx * dx + dy * dy)
                 if d >= extent:
