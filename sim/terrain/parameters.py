@@ -59,7 +59,7 @@ class TerrainParameters(Parameters):
         bool, Field(description="whether sand darkens the hollows of the fractal relief, and leaves its crests bright")
     ] = False
     relief_log_albedo: Annotated[
-        float, bounded_field(-1.0, 1.0, "log albedo of ground one SD of the fine relief above its surroundings")
+        float, bounded_field(-1.0, 1.0, "log albedo of ridges of fine relief relative to the ground; 0: no ridges")
     ] = 0.0
     units: Annotated[SurfaceUnits | None, Field(description="surface units; None: uniform ground")] = None
     fine_below_m: Annotated[

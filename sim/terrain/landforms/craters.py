@@ -28,7 +28,7 @@ FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
 FRESH_RIM = 0.04
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
-LEAST_FILL = 0.25
+LEAST_FILL = 0.25  #: Fraction that is filled in fresh craters whose albedo wears (assumed).
 DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
 FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
 SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
@@ -81,8 +81,7 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     size_factor = np.minimum(diameter / FULL_CONTRAST_M, 1.0)
     ejecta_log_albedo = p.crater_ejecta_contrast * size_factor * rng.gamma(3.0, 1.0 / 3.0, count)
     ejecta_log_albedo *= np.where(rng.uniform(size=count) < DARK_EJECTA, -1.0, 1.0)
-    sand_factor = 1.0 if p.craters_wear_albedo else size_factor
-    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * sand_factor
+    has_sand = rng.uniform(size=count) < p.crater_sand_fraction * size_factor
     fill_log_albedo = np.where(
         has_sand,
         p.crater_sand_log_albedo * rng.uniform(0.5, 1.5, count),
@@ -93,26 +92,36 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     lee = 0.3 * rng.standard_normal((count, 2))
     outline = rng.integers(0, OUTLINES, count)
     rotation = rng.uniform(0.0, 1.0, count)
-    extent, opacity = np.full(count, EJECTA_EXTENT_RADII), np.full(count, EJECTA_OPACITY)
-    margin, core = np.full(count, FILL_MARGIN), np.zeros(count)
+    wear = [np.full(count, value) for value in (EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN, 0.0)]
     if p.craters_wear_albedo:
-        # ejecta are mixed into the soil as fast as the rim wears, and a deep bowl shelters more sand than a shallow one
-        extent = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
-        opacity *= freshness**1.5
         fill += LEAST_FILL * (1.0 - fill)
         ejecta_log_albedo = np.abs(ejecta_log_albedo)
-        depth_factor = freshness * rng.uniform(0.7, 1.3, count) * size_factor**-0.3
-        fill_log_albedo = depth_factor * np.where(has_sand, p.crater_sand_log_albedo * size_factor, 0.0)
-        fill_log_albedo *= np.minimum(np.sqrt(2.0 * FULL_CONTRAST_M / diameter), 1.0)
-        fill_log_albedo += p.crater_floor_contrast * size_factor * rng.standard_normal(count)
-        margin_m = 1.5 + 12.0 * (1.0 - freshness) * rng.uniform(0.3, 1.0, count)
-        margin = np.minimum(2.0 * margin_m / diameter, 0.5)
-        fill_radius = 1.0 + 0.2 * margin
-        core = rng.uniform(0.3, 1.0, count) * size_factor
+        fill_log_albedo, fill_radius, *wear = _draw_worn_albedo(p, diameter, freshness, rng)
         _gather_secondaries(position, diameter, period, rng)
-    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
     shape = (position, diameter / 2.0, depth, rim, rounding, fill)
-    return np.column_stack([*shape, *albedo, lee, outline, rotation, extent, opacity, margin, core])
+    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius, lee)
+    return np.column_stack([*shape, *albedo, outline, rotation, *wear])
+
+
+def _draw_worn_albedo(
+    p: TerrainParameters, diameter: Float64[np.ndarray, "craters"], freshness: Float64[np.ndarray, "craters"], rng: Generator
+) -> tuple[Float64[np.ndarray, "craters"], ...]:
+    """Draw the columns of `stamp_craters` that depend on the age: log albedo and radius of the fill, and the last four.
+
+    A deep bowl shelters more sand than a shallow one. Ejecta are mixed into the soil as the rim wears, and the border
+    of the fill becomes gradual. Large craters have a deposit of dust in their middle. All laws are assumed.
+    """
+    count, size_factor = diameter.size, np.minimum(diameter / FULL_CONTRAST_M, 1.0)
+    has_sand = rng.uniform(size=count) < p.crater_sand_fraction
+    supply = size_factor**0.7 * np.minimum(np.sqrt(2.0 * FULL_CONTRAST_M / diameter), 1.0)
+    fill_log_albedo = p.crater_sand_log_albedo * has_sand * supply * freshness * rng.uniform(0.7, 1.3, count)
+    fill_log_albedo += p.crater_floor_contrast * size_factor * rng.standard_normal(count)
+    extent = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
+    opacity = EJECTA_OPACITY * freshness**1.5
+    margin_m = 1.5 + 12.0 * (1.0 - freshness) * rng.uniform(0.3, 1.0, count)
+    margin = np.minimum(2.0 * margin_m / diameter, 0.5)
+    core = size_factor * rng.uniform(0.3, 1.0, count)
+    return fill_log_albedo, 1.0 + 0.2 * margin, extent, opacity, margin, core
 
 
 def _gather_secondaries(

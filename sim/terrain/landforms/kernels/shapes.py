@@ -72,10 +72,21 @@ def _azimuth_fraction(c: float, s: float) -> float:
     return 0.25 * quarter if s >= 0.0 else 1.0 + 0.25 * quarter
 
 
+@njit(cache=True, inline="always")
+def _core_deposit(dx: float, dy: float, radius: float, lee_x: float, lee_y: float) -> tuple[float, float]:
+    """Return the coverage by the deposit in a crater's middle, and the height of its ridges, metres.
+
+    The deposit is displaced in the direction (lee_x, lee_y); the ridges run across it, and their crests wander.
+    """
+    x, y = dx / radius - lee_x, dy / radius - lee_y
+    phase = (lee_x * dx + lee_y * dy) / max(math.hypot(lee_x, lee_y), 1e-9)
+    phase += 4.0 * math.sin((lee_x * dy - lee_y * dx) / RIDGE_WAVELENGTH_M)
+    ridge = RIDGE_HEIGHT_M * math.sin(2.0 * math.pi / RIDGE_WAVELENGTH_M * phase)
+    return max(1.0 - (x * x + y * y) / (CORE_RADIUS * CORE_RADIUS), 0.0), ridge
+
+
 @njit(cache=True)
-def stamp_craters(
-    height: Grid, log_albedo: Grid, spacing: float, craters: Array, outlines: Array, rays: Array
-) -> None:
+def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array, outlines: Array, rays: Array) -> None:
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
     Each crater is a row of `craters`:
@@ -85,12 +96,12 @@ def stamp_craters(
       the fill in crater radii; relative increase of its strength per radius along x and y
     - number of its outline; rotation of outline and rays, as a fraction of a turn
     - extent of the ejecta in radii; their optical depth a at the rim; width of the margin in which the fill thins out, in
-      radii; fraction of the fill's change of albedo that a deposit with ridges in its middle takes back
+      radii; coverage by a deposit with ridges in its middle. 0: none, and the scallops of the rim reach the centre
 
     `outlines` and `rays` have a row per outline: the relative change of the radius, and the strength of the rays, at
     positions of `_azimuth_fraction`. With the distance r from the centre in radii, the bowl rises with r**2.2. The
-    ejecta blanket falls with r**-3, has rays outside the rim and ends at its extent. The rim is lower where the outline is
-    displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-a r**-3).
+    ejecta blanket falls with r**-3, has rays outside the rim and ends at its extent. The rim is lower where the outline
+    is displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-a r**-3).
     """
     mask, positions = height.shape[0] - 1, outlines.shape[1]
     for n in range(craters.shape[0]):
@@ -150,19 +161,12 @@ def stamp_craters(
                     log_albedo[row, column] += ejecta_log_albedo * coverage * fade
                 if fill_log_albedo != 0.0 and r < fill_radius:
                     # the fill thins out at its margin, and upwind
-                    edge = fill_radius - r
-                    if core > 0.0:
-                        edge += TEETH * outline[(TEETH_STEP * k) % positions]
+                    edge = fill_radius - r + (TEETH * outline[(TEETH_STEP * k) % positions] if core > 0.0 else 0.0)
                     filled = min(max(edge, 0.0) / margin, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
-                    middle_x, middle_y = dx / radius - lee_x, dy / radius - lee_y
-                    middle = 1.0 - (middle_x * middle_x + middle_y * middle_y) / (CORE_RADIUS * CORE_RADIUS)
-                    if core > 0.0 and middle > 0.0:
-                        middle *= core
-                        filled *= 1.0 - middle
-                        # ridges across the direction of the asymmetry; their crests wander
-                        phase = (lee_x * dx + lee_y * dy) / math.hypot(lee_x, lee_y)
-                        phase += 4.0 * math.sin((lee_x * dy - lee_y * dx) / RIDGE_WAVELENGTH_M)
-                        height[row, column] += middle * RIDGE_HEIGHT_M * math.sin(2.0 * math.pi / RIDGE_WAVELENGTH_M * phase)
+                    if core > 0.0:
+                        middle, ridge = _core_deposit(dx, dy, radius, lee_x, lee_y)
+                        filled *= 1.0 - core * middle
+                        height[row, column] += core * middle * ridge
                     log_albedo[row, column] += fill_log_albedo * filled
 
 
