@@ -30,6 +30,8 @@ from marsyard.sim.terrain.surface import (
     split_levels,
 )
 
+#: Height of the ridges of fine relief, divided by its mean absolute height (assumed): the ground between them is level.
+RIDGE_HEIGHT = 1.5
 #: Modules whose code does not change the samples of a terrain; `rocks` changes them only with wind tails.
 _MODULES_NOT_HASHED = ("rocks", "sites.py", "environment.py", "published_sites.py")
 #: Beginning of the identity of a terrain on an imported DTM.
@@ -94,15 +96,26 @@ def synthesise(parameters: TerrainParameters, rng: np.random.Generator) -> Surfa
 def _add_fine_ground(
     ground: TerrainGround, fine: TerrainGround, factors: Float32[np.ndarray, "side side 3"], relief_log_albedo: float
 ) -> None:
-    """Add fine relief and albedo, scaled by the factors of the surface units, and albedo by the height of the relief.
+    """Add fine relief and albedo, scaled by the factors of the surface units.
 
-    `relief_log_albedo` is the log albedo of ground that is one standard deviation of the fine relief higher.
+    With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``, and
+    the log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.
     """
+    height, log_albedo = fine.height, fine.log_albedo
+    roughness, texture = (
+        refine(np.ascontiguousarray(factors[..., channel]), ground.side) for channel in (ROUGHNESS, TEXTURE)
+    )
     if relief_log_albedo:
-        log_albedo = ground.log_albedo
-        log_albedo += np.float32(relief_log_albedo / fine.height.std(dtype=np.float64)) * fine.height
-    for total, part, factor in ((ground.height, fine.height, ROUGHNESS), (ground.log_albedo, fine.log_albedo, TEXTURE)):
-        total += part * refine(np.ascontiguousarray(factors[..., factor]), ground.side)
+        np.abs(height, out=height)
+        mean = float(height[::FACTOR_STEP, ::FACTOR_STEP].mean(dtype=np.float64))
+        np.minimum(height, np.float32(RIDGE_HEIGHT * mean), out=height)
+        np.negative(roughness, out=roughness)
+    height *= roughness
+    log_albedo *= texture
+    ground.add(fine)
+    if relief_log_albedo:
+        height *= np.float32(relief_log_albedo / mean)
+        np.add(ground.log_albedo, height, out=ground.log_albedo)
 
 
 @cache

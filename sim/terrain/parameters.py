@@ -36,6 +36,9 @@ class TerrainParameters(Parameters):
     crater_sand_log_albedo: Annotated[
         float, bounded_field(-2.0, 1.0, "mean logarithm of the albedo of this sand divided by the ground's")
     ] = -0.4
+    craters_wear_albedo: Annotated[
+        bool, Field(description="whether sand and ejecta fade as craters wear; otherwise they do not depend on the age")
+    ] = False
     crater_diameter_min_m: Annotated[Positive, Field(description="smallest crater diameter, m")] = 12.0
     crater_diameter_max_m: Annotated[Positive, Field(description="largest crater diameter, m")] = 600.0
     crater_ejecta_contrast: Annotated[
@@ -56,7 +59,7 @@ class TerrainParameters(Parameters):
         bool, Field(description="whether sand darkens the hollows of the fractal relief, and leaves its crests bright")
     ] = False
     relief_log_albedo: Annotated[
-        float, bounded_field(-1.0, 1.0, "log albedo of ground one SD of the fine relief above its surroundings")
+        float, bounded_field(-1.0, 1.0, "log albedo of ridges of fine relief relative to the ground; 0: no ridges")
     ] = 0.0
     units: Annotated[SurfaceUnits | None, Field(description="surface units; None: uniform ground")] = None
     fine_below_m: Annotated[

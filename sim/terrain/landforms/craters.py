@@ -16,7 +16,11 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
 
 RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
-EJECTA_EXTENT_RADII = 3.0  #: Maximum distance of ejecta from the centre of a crater, in radii.
+#: Maximum distance of ejecta from the centre of a crater, in radii; optical depth of the ejecta at the rim (assumed: they
+#: cover a third of the ground at two radii).
+EJECTA_EXTENT_RADII, EJECTA_OPACITY = 3.0, 3.0
+#: Width of the margin in which a crater's fill thins out, in crater radii; fitted to Spirit's descent images.
+FILL_MARGIN = 0.4
 #: Depth from the rim crest to the floor, divided by the diameter: 0.2 for fresh simple craters (Pike 1977; Robbins &
 #: Hynek 2012 for Mars); 0.04 is barely visible. Small Martian craters are mostly degraded (Golombek et al. 2014).
 FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
@@ -24,6 +28,7 @@ FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
 FRESH_RIM = 0.04
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
+LEAST_FILL = 0.25  #: Fraction that is filled in fresh craters whose albedo wears (assumed).
 DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
 FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
 SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
@@ -32,10 +37,13 @@ SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in cr
 OUTLINES, POSITIONS, OUTLINE_WAVES = 64, 256, (2, 24)
 OUTLINE_RMS, OUTLINE_EXPONENT = 0.06, -1.25
 RAY_WAVES = (5, 16)  #: Rays around a crater: waves of equal amplitude (assumed).
+WORN_EXTENT_RADII = 1.6  #: Extent of the ejecta of the most worn craters, in radii (assumed).
+#: Small craters in clusters of secondaries (assumed): largest diameter, fraction, number and radius of a cluster.
+LARGEST_SECONDARY_M, SECONDARY_FRACTION, CLUSTER_SIZE, CLUSTER_RADIUS_M = 30.0, 0.5, 10, 45.0
 _TABLE_SEED = 20040104  #: Seed of the tables of outlines and rays, which are the same for all terrains.
 
 
-def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 14"]:
+def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.ndarray, "craters 18"]:
     """Draw impact craters in order of decreasing size, as rows of `kernels.stamp_craters`.
 
     Their number has a Poisson distribution. The cumulative size-frequency distribution is ``D**-crater_exponent`` up to
@@ -84,8 +92,47 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     lee = 0.3 * rng.standard_normal((count, 2))
     outline = rng.integers(0, OUTLINES, count)
     rotation = rng.uniform(0.0, 1.0, count)
-    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius)
-    return np.column_stack([position, diameter / 2.0, depth, rim, rounding, fill, *albedo, lee, outline, rotation])
+    wear = [np.full(count, value) for value in (EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN, 0.0)]
+    if p.craters_wear_albedo:
+        fill += LEAST_FILL * (1.0 - fill)
+        ejecta_log_albedo = np.abs(ejecta_log_albedo)
+        fill_log_albedo, fill_radius, *wear = _draw_worn_albedo(p, diameter, freshness, rng)
+        _gather_secondaries(position, diameter, period, rng)
+    shape = (position, diameter / 2.0, depth, rim, rounding, fill)
+    albedo = (ejecta_log_albedo, fill_log_albedo, fill_radius, lee)
+    return np.column_stack([*shape, *albedo, outline, rotation, *wear])
+
+
+def _draw_worn_albedo(
+    p: TerrainParameters, diameter: Float64[np.ndarray, "craters"], freshness: Float64[np.ndarray, "craters"], rng: Generator
+) -> tuple[Float64[np.ndarray, "craters"], ...]:
+    """Draw the columns of `stamp_craters` that depend on the age: log albedo and radius of the fill, and the last four.
+
+    A deep bowl shelters more sand than a shallow one. Ejecta are mixed into the soil as the rim wears, and the border
+    of the fill becomes gradual. Large craters have a deposit of dust in their middle. All laws are assumed.
+    """
+    count, size_factor = diameter.size, np.minimum(diameter / FULL_CONTRAST_M, 1.0)
+    has_sand = rng.uniform(size=count) < p.crater_sand_fraction
+    supply = size_factor**0.7 * np.minimum(np.sqrt(2.0 * FULL_CONTRAST_M / diameter), 1.0)
+    fill_log_albedo = p.crater_sand_log_albedo * has_sand * supply * freshness * rng.uniform(0.7, 1.3, count)
+    fill_log_albedo += p.crater_floor_contrast * size_factor * rng.standard_normal(count)
+    extent = WORN_EXTENT_RADII + (EJECTA_EXTENT_RADII - WORN_EXTENT_RADII) * freshness
+    opacity = EJECTA_OPACITY * freshness**1.5
+    margin_m = 1.5 + 12.0 * (1.0 - freshness) * rng.uniform(0.3, 1.0, count)
+    margin = np.minimum(2.0 * margin_m / diameter, 0.5)
+    core = size_factor * rng.uniform(0.3, 1.0, count)
+    return fill_log_albedo, 1.0 + 0.2 * margin, extent, opacity, margin, core
+
+
+def _gather_secondaries(
+    position: Float64[np.ndarray, "craters 2"], diameter: Float64[np.ndarray, "craters"], period: float, rng: Generator
+) -> None:
+    """Move a fraction of the small craters into clusters, in place: ejecta of a distant impact fall together."""
+    is_secondary = (diameter < LARGEST_SECONDARY_M) & (rng.uniform(size=diameter.size) < SECONDARY_FRACTION)
+    count = int(np.count_nonzero(is_secondary))
+    clusters = rng.uniform(0.0, period, (count // CLUSTER_SIZE + 1, 2))
+    offset = CLUSTER_RADIUS_M * rng.standard_normal((count, 2))
+    position[is_secondary] = clusters[rng.integers(0, len(clusters), count)] + offset
 
 
 @cache
@@ -109,7 +156,7 @@ def outline_tables() -> tuple[Float64[np.ndarray, "outlines positions"], Float64
     return tables[0], tables[1]
 
 
-def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 14"]) -> None:
+def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 18"]) -> None:
     """Add craters, each on the coarsest grid with at least `RADIUS_SAMPLES` samples along its radius."""
     octave = np.floor(np.log2(np.maximum(craters[:, 2] / (RADIUS_SAMPLES * ground.spacing_m), 1.0)))
     layer = None
@@ -118,5 +165,5 @@ def add_craters(ground: TerrainGround, craters: Float64[np.ndarray, "craters 14"
         if layer is not None:
             grid.add(layer)
         rows = craters[octave == step]
-        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, rows, *outline_tables(), EJECTA_EXTENT_RADII)
+        stamp_craters(grid.height, grid.log_albedo, grid.spacing_m, rows, *outline_tables())
         layer = grid

@@ -53,6 +53,7 @@ class SurfaceUnit(Parameters):
     elevation: Annotated[
         float, bounded_field(-5.0, 5.0, "preference for high ground, if positive, or low ground; 0: none")
     ] = 0.0
+    craters: Annotated[float, bounded_field(-5.0, 5.0, "preference for the surroundings of craters; 0: none")] = 0.0
 
 
 class SurfaceUnits(Parameters):
@@ -107,6 +108,9 @@ class SurfaceUnits(Parameters):
         if elevation.any():
             height = compute_relative_height(ground, self.largest_m)
             fields += (height / max(float(height.std()), 1e-6))[..., None] * elevation
+        halo = np.array([unit.craters for unit in units], dtype=np.float32)
+        if halo.any():
+            fields += self._draw_halos(craters, side, spacing, downwind, rng)[..., None] * halo
         membership = self._compute_membership(fields, areas)
         unit_factors = np.array([(unit.roughness, unit.texture, unit.rocks) for unit in units])
         factors = np.exp(membership @ np.log(np.maximum(unit_factors, 1e-3)).astype(np.float32))
@@ -154,6 +158,24 @@ class SurfaceUnits(Parameters):
         log_albedo = self.streak_log_albedo_rms * rng.standard_normal(count)
         streaks = np.column_stack([sources[:, :2], radius, length, np.cos(heading), np.sin(heading), log_albedo])
         stamp_streaks(ground.log_albedo, ground.spacing_m, streaks)
+
+    def _draw_halos(
+        self,
+        craters: Float64[np.ndarray, "craters columns"],
+        side: int,
+        spacing: float,
+        downwind: float,
+        rng: Generator,
+    ) -> Grid:
+        """Draw the surroundings of large craters, 1 at most for each: long downwind, short upwind, weaker for worn ones."""
+        sources = craters[craters[:, 2] > 0.5 * self.streak_min_m]
+        radius = sources[:, 2]
+        strength = np.minimum((sources[:, 3] + sources[:, 4]) / radius / 0.4 * rng.uniform(0.5, 1.5, len(sources)), 1.0)
+        halos = np.zeros((side, side), dtype=np.float32)
+        for heading, length in ((downwind, rng.uniform(3.0, 12.0, len(sources))), (downwind + np.pi, 4.0)):
+            c, s = (np.full(len(sources), value) for value in (np.cos(heading), np.sin(heading)))
+            stamp_streaks(halos, spacing, np.column_stack([sources[:, :2], 2.0 * radius, length * radius, c, s, strength]))
+        return halos
 
     def _compute_membership(
         self, fields: Float32[np.ndarray, "side side kinds"], areas: Float[np.ndarray, "kinds"]

@@ -13,12 +13,13 @@ Grid = NDArray[np.float32]
 GridRow = NDArray[np.float32]
 #: Relative change of the rim height of a crater per relative change of its radius.
 RIM_HEIGHT_SENSITIVITY = 8.0
-#: Optical depth of the ejecta at the rim; assumed: they cover a third of the ground at two radii.
-EJECTA_OPACITY = 3.0
 #: RMS of the rays relative to the mean thickness and opacity of the ejecta (assumed).
 RAY_CONTRAST = 0.25
-#: Width of the margin in which a crater's fill thins out, in crater radii; fitted to Spirit's descent images.
-FILL_MARGIN = 0.4
+#: Radius of the deposit in the middle of a crater's fill, in crater radii; wavelength and amplitude of the ridges on it,
+#: metres (assumed; transverse ridges in craters: Balme et al. 2008).
+CORE_RADIUS, RIDGE_WAVELENGTH_M, RIDGE_HEIGHT_M = 0.7, 10.0, 0.15
+#: Finer scallops in the fill's border of large craters: their size, and the factor of their wavenumbers (assumed).
+TEETH, TEETH_STEP = 0.4, 5
 
 
 class Bedforms(NamedTuple):
@@ -71,10 +72,21 @@ def _azimuth_fraction(c: float, s: float) -> float:
     return 0.25 * quarter if s >= 0.0 else 1.0 + 0.25 * quarter
 
 
+@njit(cache=True, inline="always")
+def _core_deposit(dx: float, dy: float, radius: float, lee_x: float, lee_y: float) -> tuple[float, float]:
+    """Return the coverage by the deposit in a crater's middle, and the height of its ridges, metres.
+
+    The deposit is displaced in the direction (lee_x, lee_y); the ridges run across it, and their crests wander.
+    """
+    x, y = dx / radius - lee_x, dy / radius - lee_y
+    phase = (lee_x * dx + lee_y * dy) / max(math.hypot(lee_x, lee_y), 1e-9)
+    phase += 4.0 * math.sin((lee_x * dy - lee_y * dx) / RIDGE_WAVELENGTH_M)
+    ridge = RIDGE_HEIGHT_M * math.sin(2.0 * math.pi / RIDGE_WAVELENGTH_M * phase)
+    return max(1.0 - (x * x + y * y) / (CORE_RADIUS * CORE_RADIUS), 0.0), ridge
+
+
 @njit(cache=True)
-def stamp_craters(
-    height: Grid, log_albedo: Grid, spacing: float, craters: Array, outlines: Array, rays: Array, max_r: float
-) -> None:
+def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array, outlines: Array, rays: Array) -> None:
     """Add bowls, rims and ejecta of craters to height and to the logarithm of albedo, in order.
 
     Each crater is a row of `craters`:
@@ -83,16 +95,18 @@ def stamp_craters(
     - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the fill; radius of
       the fill in crater radii; relative increase of its strength per radius along x and y
     - number of its outline; rotation of outline and rays, as a fraction of a turn
+    - extent of the ejecta in radii; their optical depth a at the rim; width of the margin in which the fill thins out, in
+      radii; coverage by a deposit with ridges in its middle. 0: none, and the scallops of the rim reach the centre
 
     `outlines` and `rays` have a row per outline: the relative change of the radius, and the strength of the rays, at
     positions of `_azimuth_fraction`. With the distance r from the centre in radii, the bowl rises with r**2.2. The
-    ejecta blanket falls with r**-3, has rays outside the rim and ends at `max_r`. The rim is lower where the outline is
-    displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-EJECTA_OPACITY r**-3).
+    ejecta blanket falls with r**-3, has rays outside the rim and ends at its extent. The rim is lower where the outline
+    is displaced inwards. The ejecta change the albedo where they cover the ground: by 1 - exp(-a r**-3).
     """
     mask, positions = height.shape[0] - 1, outlines.shape[1]
     for n in range(craters.shape[0]):
         x, y, radius, depth, rim, rounding, fill, ejecta_log_albedo, fill_log_albedo, fill_radius = craters[n, :10]
-        lee_x, lee_y, number, rotation = craters[n, 10:]
+        lee_x, lee_y, number, rotation, max_r, opacity, margin, core = craters[n, 10:]
         outline, ray = outlines[int(number)], rays[int(number)]
         extent = max_r * radius * (1.0 + outline.max())
         # depth of the bowl before its fill
@@ -100,7 +114,8 @@ def stamp_craters(
         blend_width = 0.25 * fill * bottom + 1e-9
         for i in range(math.ceil((y - extent) / spacing), math.floor((y + extent) / spacing) + 1):
             dy = i * spacing - y
-            for j in range(math.ceil((x - extent) / spacing), math.floor((x + extent) / spacing) + 1):
+            chord = math.sqrt(max(extent * extent - dy * dy, 0.0))
+            for j in range(math.ceil((x - chord) / spacing), math.floor((x + chord) / spacing) + 1):
                 dx = j * spacing - x
                 d = math.sqrt(dx * dx + dy * dy)
                 if d >= extent:
@@ -111,6 +126,10 @@ def stamp_craters(
                 weight = position - k
                 first, second = k % positions, (k + 1) % positions
                 displacement = outline[first] + weight * (outline[second] - outline[first])
+                if core > 0.0:
+                    # scallops of the rim fade towards the middle and on the ejecta
+                    square = d * d / (radius * radius)
+                    displacement *= min(square, 1.0 / max(square, 1.0))
                 # distance from the centre in local radii: 1 on the rim
                 r = d / (radius * (1.0 + displacement))
                 if r >= max_r:
@@ -138,11 +157,16 @@ def stamp_craters(
                 row, column = i & mask, j & mask
                 height[row, column] += change
                 if ejecta_log_albedo != 0.0:
-                    coverage = 1.0 - math.exp(-EJECTA_OPACITY * thickness * strength)
+                    coverage = 1.0 - math.exp(-opacity * thickness * strength)
                     log_albedo[row, column] += ejecta_log_albedo * coverage * fade
                 if fill_log_albedo != 0.0 and r < fill_radius:
                     # the fill thins out at its margin, and upwind
-                    filled = min((fill_radius - r) / FILL_MARGIN, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
+                    edge = fill_radius - r + (TEETH * outline[(TEETH_STEP * k) % positions] if core > 0.0 else 0.0)
+                    filled = min(max(edge, 0.0) / margin, 1.0) * (1.0 + lee_x * c * r + lee_y * s * r)
+                    if core > 0.0:
+                        middle, ridge = _core_deposit(dx, dy, radius, lee_x, lee_y)
+                        filled *= 1.0 - core * middle
+                        height[row, column] += core * middle * ridge
                     log_albedo[row, column] += fill_log_albedo * filled
 
 
