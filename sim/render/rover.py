@@ -87,12 +87,12 @@ def rover_objects(
         for material, solids in parts.items()
         for solid in solids
     ]
-    # The sky is hidden by a frustum, from a rectangle between the wheels at the body's bottom to one around the deck.
+    # The sky is hidden by a frustum, from a rectangle around the wheels at the body's bottom to one around the deck.
     # Parts outside of it (wheels, arm, equipment) hide about as much as its corners beyond body and panels.
     corners = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     deck_size = np.array([rover.body_length_m, rover.body_width_m])
-    wheel_base = np.array([rover.front_m + rover.rear_m, 2.0 * rover.half_track_m])
-    bottom = np.column_stack([corners * wheel_base, np.full(4, rover.clearance_m)])
+    wheels = np.array([rover.front_m + rover.rear_m, 2.0 * rover.half_track_m]) + size[[0, 2]] * (2.0, 1.0)
+    bottom = np.column_stack([corners * wheels, np.full(4, rover.clearance_m)])
     top = np.column_stack([corners * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
     return Objects.join(bodies).with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
 
