@@ -11,8 +11,8 @@ from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.objects import Objects
 
 #: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast: dusty, matt,
-#: assumed.
-ALBEDOS = {"deck": 0.14, "body": 0.3, "wheel": 0.26, "mast": 0.35}
+#: assumed; rather dark, because parts do not hide the light of the sky from each other.
+ALBEDOS = {"deck": 0.14, "body": 0.15, "wheel": 0.2, "mast": 0.35}
 #: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
 #: Width of the legs, radius of the mast, thickness of the deck, m, assumed; length and width of the body as fractions
@@ -42,7 +42,7 @@ _CLEATS, _CLEAT_HEIGHT, _RIM, _HUB, _SPOKES = 20, 0.05, 0.84, 0.3, 6
 #: Height of the steering motors above the wheels' centres, in radii; gap between bracket and wheel, m; assumed.
 _STEERING_HEIGHT, _BRACKET_GAP_M = 1.6, 0.03
 #: Number of sides of the prism that represents a cylinder, and of segments of a cable.
-_SIDES, _SEGMENTS = 8, 6
+_SIDES, _SEGMENTS = 12, 6
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
 _ARM_JOINTS_M = ((0.02, 0.25, -0.3), (0.04, -0.3, -0.34), (0.05, 0.22, -0.37))
