@@ -126,6 +126,6 @@ def _intersect_triangles(
             moment = np.cross(offset, direction)
             p = np.sum(second * moment, axis=-1) * scale
             q = -np.sum(first * moment, axis=-1) * scale
-        is_hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
+            is_hit = (p >= -1e-12) & (q >= -1e-12) & (p + q <= 1.0 + 1e-12) & (t > nearest)
         ranges[start : start + size] = np.where(is_hit, t, np.inf).min(axis=1)
     return ranges

@@ -26,10 +26,11 @@ BEDDED_FRACTION, MAX_BED_RATIO = 0.5, 3.5
 FRACTURE_CELL, FRACTURE_WIDTH, FRACTURE_LOG_ALBEDO = 0.6, 0.016, -0.4
 #: Cells of the noise in the margin of the dust as a fraction of a rock's size, and its effect on the vertical component
 #: of the normal (assumed): dust reaches further down in some directions.
-MARGIN_CELL, MARGIN = 0.25, 0.8
+MARGIN_CELL, MARGIN = 0.25, 0.5
 #: Angles between a rock's face and the horizontal, radians, up to which dust stays on it (about the angle of repose),
-#: and from which it is bare: a thin, cohesive film stays on steep faces (assumed).
-MAX_DUSTY_TILT, MIN_BARE_TILT = math.radians(30.0), math.radians(100.0)
+#: and from which it is bare: a thin, cohesive film stays on steep faces (assumed; the second with a view to the darkest
+#: parts of mast images).
+MAX_DUSTY_TILT, MIN_BARE_TILT = math.radians(30.0), math.radians(115.0)
 #: Texture of other objects, such as rovers, as a fraction of that of rocks: slight wear (assumed).
 WEAR = 0.15
 

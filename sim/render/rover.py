@@ -11,8 +11,8 @@ from marsyard.sim.measurements import MastGeometry
 from marsyard.sim.render.objects import Objects
 
 #: Albedo of the deck with its solar cells, of other parts of body and arm, of the wheels, and of the mast: dusty, matt,
-#: assumed.
-ALBEDOS = {"deck": 0.14, "body": 0.3, "wheel": 0.26, "mast": 0.35}
+#: assumed; rather dark, because parts do not hide the light of the sky from each other.
+ALBEDOS = {"deck": 0.14, "body": 0.15, "wheel": 0.2, "mast": 0.35}
 #: Identifier of the rover in `names`: rocks have numbers from 0; truth layers use -1 for ground and -2 for sky.
 ROVER_NAME = -3
 #: Width of the legs, radius of the mast, thickness of the deck, m, assumed; length and width of the body as fractions
@@ -42,7 +42,7 @@ _CLEATS, _CLEAT_HEIGHT, _RIM, _HUB, _SPOKES = 20, 0.05, 0.84, 0.3, 6
 #: Height of the steering motors above the wheels' centres, in radii; gap between bracket and wheel, m; assumed.
 _STEERING_HEIGHT, _BRACKET_GAP_M = 1.6, 0.03
 #: Number of sides of the prism that represents a cylinder, and of segments of a cable.
-_SIDES, _SEGMENTS = 8, 6
+_SIDES, _SEGMENTS = 12, 6
 #: The stowed instrument arm, assumed: joints relative to the front edge of the body at the height of the deck, m (x
 #: forward, y left, z up); radii of the links and of the instrument turret, and length of the turret, m.
 _ARM_JOINTS_M = ((0.02, 0.25, -0.3), (0.04, -0.3, -0.34), (0.05, 0.22, -0.37))
@@ -74,13 +74,12 @@ def rover_objects(
     ``Objects.join([scene.objects, rover_objects(...)])``. `baseline_m` is the baseline of the widest stereo pair; the
     head is slightly wider.
     """
-    outline = _deck_outline(rover)
     centres = compute_wheel_centres(rover, stance.differential_rad, stance.bogies_rad)
     size = np.array([rover.wheel_radius_m, rover.wheel_radius_m, rover.wheel_width_m])
     # the axis of a wheel is y
     wheel = (_unit_wheel() * np.stack([size, 1.0 / size]))[..., [1, 2, 0]]
     wheel[:, :, 1] /= np.linalg.norm(wheel[:, :, 1], axis=2, keepdims=True)
-    parts = {"deck": [_build_deck(rover, outline)], "body": [_build_body(rover, stance)]}
+    parts = {"deck": [_build_deck(rover)], "body": [_build_body(rover, stance)]}
     parts |= {"wheel": [wheel + np.stack([centre, np.zeros(3)]) for centre in centres]}
     parts |= {"mast": [_build_mast(rover, mast, mast.rover_from_head(azimuth_rad, elevation_rad), baseline_m)]}
     bodies = [
@@ -88,14 +87,13 @@ def rover_objects(
         for material, solids in parts.items()
         for solid in solids
     ]
-    # the sky is hidden by a frustum from the bottom of the body to a rectangle with the deck's area
-    x, y = outline.T
-    area = 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
-    scale = np.sqrt(area / (rover.body_length_m * rover.body_width_m))
+    # The sky is hidden by a frustum, from a rectangle around the wheels at the body's bottom to one around the deck.
+    # Parts outside of it (wheels, arm, equipment) hide about as much as its corners beyond body and panels.
     corners = 0.5 * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     deck_size = np.array([rover.body_length_m, rover.body_width_m])
-    bottom = np.column_stack([corners * _BODY_FRACTION * deck_size, np.full(4, rover.clearance_m)])
-    top = np.column_stack([corners * scale * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
+    wheels = np.array([rover.front_m + rover.rear_m, 2.0 * rover.half_track_m]) + size[[0, 2]] * (2.0, 1.0)
+    bottom = np.column_stack([corners * wheels, np.full(4, rover.clearance_m)])
+    top = np.column_stack([corners * deck_size, np.full(4, rover.deck_m + 0.5 * _DECK_M)])
     return Objects.join(bodies).with_shelter(np.asarray(stance.world_from_rover.apply(np.concatenate([bottom, top]))))
 
 
@@ -107,19 +105,13 @@ def _create_body(solid: Solid, albedo: float) -> Objects:
     return Objects.of_mesh(points, normals, faces, names, albedo)
 
 
-def _deck_outline(rover: RoverParameters) -> Float64[np.ndarray, "corners 2"]:
-    """Corners of the deck, counter-clockwise from above."""
-    left = np.array(_OUTLINE)
-    outline = np.concatenate([left, left[:0:-1] * (1.0, -1.0)])
-    return np.asarray(outline * (0.5 * rover.body_length_m, 0.5 * rover.body_width_m))
-
-
-def _build_deck(rover: RoverParameters, outline: Float64[np.ndarray, "corners 2"]) -> Solid:
+def _build_deck(rover: RoverParameters) -> Solid:
     """Build the deck, which is star-shaped, with its equipment."""
     size = np.array([0.5 * rover.body_length_m, 0.5 * rover.body_width_m, 1.0])
     above = np.array([0.0, 0.0, rover.deck_m])
     equipment = [(size * start + above, size * end + above, radius) for start, end, radius in _EQUIPMENT]
-    half = 0.5 * _DECK_M
+    left, half = np.array(_OUTLINE), 0.5 * _DECK_M
+    outline = np.concatenate([left, left[:0:-1] * (1.0, -1.0)]) * size[:2]
     profile = [(rover.deck_m + z, factor) for z, factor in ((-half, 0.0), (-half, 1.0), (half, 1.0), (half, 0.0))]
     return np.concatenate([_shade_flat(_stack_rings(profile, outline)), _make_cylinders(equipment)])
 

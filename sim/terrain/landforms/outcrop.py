@@ -37,7 +37,7 @@ class Outcrop(Parameters):
     tilt_deg: Annotated[float, bounded_field(0.0, 30.0, "RMS tilt of the slabs along one axis, deg")] = 4.0
     joint_m: Annotated[Positive, Field(description="half width of the sand-filled joints between slabs, m")] = 0.06
     log_albedo: Annotated[float, bounded_field(-1.0, 1.0, "mean logarithm of albedo divided by the sand's")] = 0.2
-    log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm")] = 0.1
+    log_albedo_sd: Annotated[float, bounded_field(0.0, 1.0, "standard deviation of this logarithm")] = 0.06
     sand_log_albedo_sd: Annotated[
         float, bounded_field(0.0, 1.0, "the same of the sand between slabs, which varies from patch to patch")
     ] = 0.15

@@ -165,5 +165,5 @@ def test_dust_lies_on_level_faces_of_rocks_only(renderer: Renderer) -> None:
     # 0.2 * 0.1 + 0.8 * 0.5 on the rock; a rover has no dust
     assert brightness[5][0] == pytest.approx(0.42, abs=1e-3)
     assert brightness[ROVER_NAME][0] == pytest.approx(0.1, abs=1e-3)
-    # the steep face, 86 deg from level, has (cos(86) - cos(100)) / (cos(30) - cos(100)) = 23.6 % of this dust
-    assert brightness[5][1] / brightness[ROVER_NAME][1] == pytest.approx(1.0 + 3.2 * 0.236, abs=0.05)
+    # the steep face, 86 deg from level, has (cos(86) - cos(115)) / (cos(30) - cos(115)) = 38.2 % of this dust
+    assert brightness[5][1] / brightness[ROVER_NAME][1] == pytest.approx(1.0 + 3.2 * 0.382, abs=0.05)
