@@ -1,4 +1,4 @@
-"""Tests that the commands in the pages, and their options, exist."""
+"""Tests that the commands in the pages, and their options, exist, and that the page on algorithms names all of them."""
 
 import re
 from collections.abc import Iterator
@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.documentation.test_links import GENERATED, PAGES
+from marsyard.scenarios.imports import import_object
+from marsyard.scenarios.systems import systems
+from tests.documentation.test_links import GENERATED, PAGES, ROOT
 from tests.marsyard.test_commands import list_commands
 
 #: A command with its arguments: a line of a code block, or inline code.
@@ -38,3 +40,11 @@ def test_commands_and_options_exist(page: Path) -> None:
 def test_commands_are_found() -> None:
     text = "Run `marsyard run mine.toml\n--jobs 2` and\n\n    marsyard list --sort   # not --json\n    $ ls\n"
     assert list(find_commands(text)) == ["marsyard run mine.toml --jobs 2", "marsyard list --sort"]
+
+
+def test_page_names_every_included_algorithm() -> None:
+    page = (ROOT / "docs" / "custom-algorithms.md").read_text(encoding="utf-8")
+    tasks = [import_object(task) for system in systems() for task in system.tasks]
+    names = {name for task in tasks for name in task.shipped if not name.endswith(("-plus", "-custom"))}
+    assert len(names) > 10
+    assert names - set(re.findall(r"`([a-z-]+)`", page)) == set()

@@ -34,6 +34,8 @@ def test_container_has_all_sources_and_libraries() -> None:
     assert copied == {"marsyard", *packages}
     for path in re.findall(r"^COPY (.+) /source/$", text, re.MULTILINE)[0].split():
         assert (ROOT / path).is_file(), path
+    # the page on clusters uses Dask, and campaigns may have terrain files
+    assert re.search(r"pip install .* '\.\[dask,geo\]' ", text)
     # the libraries are those of the set-up
     match = re.search(r"^osmesa=\((.*)\)$", (ROOT / "tools" / "setup.sh").read_text(), re.MULTILINE)
     assert match is not None
