@@ -224,7 +224,8 @@ def _list_in_fine_grids(body_bounds: Bounds, all_bodies: np.ndarray, coarse_side
     cell, used = np.repeat(np.arange(len(counts)), counts), np.flatnonzero(counts)
     low, extent = all_bodies[:2], (all_bodies[3:5] - all_bodies[:2]) / coarse_side
     cell_low = low + extent * np.stack([cell % coarse_side, cell // coarse_side], axis=1)
-    margin, clipped = CELL_MARGIN * extent + SLACK_M, body_bounds[bodies]
+    # twice the margin of the coarse grid, so that each listed body has an extent in its cell, also after rounding
+    margin, clipped = 2.0 * CELL_MARGIN * extent + SLACK_M, body_bounds[bodies]
     clipped[:, :2] = np.maximum(clipped[:, :2], cell_low - margin)
     clipped[:, 3:5] = np.minimum(clipped[:, 3:5], cell_low + extent + margin)
     enclosing = np.zeros((len(counts), 6))

@@ -197,7 +197,7 @@ def pebble_surface(
     length = smaller(pebbles.height_ratio * horizontal / larger(sun.z, 1e-6), _MAX_SHADOW)
     lost = SIDE_LOSS + 0.5 * (dr.sqrt(1.0 + 4.0 / _MEAN_AXIS_RATIO * length * length) - 1.0)
     # middle between pebble and shadow, in diameters towards the sun
-    middle = [0.5 * length / horizontal * component for component in (sun.x, sun.y)]
+    middle_x, middle_y = (0.5 * length / horizontal * component for component in (sun.x, sun.y))
 
     def add_octave(
         octave: Values, diameter: Values, probability: Values, total: PebbleSurface
@@ -207,7 +207,7 @@ def pebble_surface(
         sin, cos = Float(sine), Float(cosine)
         light = Array3f(*_rotate(sun.x, sun.y, cos, sin), sun.z)
         columns, offsets = [], []
-        turned, shifts = _rotate(position.x, position.y, cosine, sine), _rotate(*middle, cos, sin)
+        turned, shifts = _rotate(position.x, position.y, cosine, sine), _rotate(middle_x, middle_y, cos, sin)
         for coordinate, shift in zip(turned, shifts, strict=True):
             floor = dr.floor((coordinate + Float64(shift) * diameter) / width - 0.5)
             columns.append(Int32(floor))

@@ -55,8 +55,8 @@ class Skyline:
     def of(cls, relief: Relief) -> Skyline:
         """Copy relief to the device."""
         layers, azimuths = relief.elevations.shape
-        arrays = (to_device(Float, values) for values in relief[:3])
-        return cls(*arrays, Float(relief.albedo), UInt32(layers), UInt32(azimuths))
+        elevations, transmissions, steepness = (to_device(Float, values) for values in relief[:3])
+        return cls(elevations, transmissions, steepness, Float(relief.albedo), UInt32(layers), UInt32(azimuths))
 
     def cover(self, sky: Values, direction: Values, law: Law, sun: Values, pixel_rad: Values) -> Values:
         """Return the radiance factor in directions, from that of the sky; upper edges are blurred over a pixel."""

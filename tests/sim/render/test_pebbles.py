@@ -5,7 +5,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 import pytest
-from scipy.ndimage import center_of_mass, label
+from scipy.ndimage import center_of_mass, gaussian_filter, label
 from scipy.spatial.transform import Rotation
 
 from marsyard.sim.camera import Cahv
@@ -15,6 +15,7 @@ from marsyard.sim.render.arrays import to_host
 from marsyard.sim.render.device import Array3f, Array3f64, Float
 from marsyard.sim.render.pebbles import CELL_DIAMETERS, PebbleField, pebble_surface
 from marsyard.sim.render.rover import ROVER_NAME
+from marsyard.sim.terrain import TerrainBank, site
 from marsyard.sim.terrain.sites import SitePebbles
 from marsyard.sim.terrain.surface import Surface
 from tests.sim.scenes import DOWN, LAMBERT, flat_ground
@@ -79,6 +80,19 @@ def test_pebbles_are_many_on_dark_ground_and_rare_on_bright_ground() -> None:
     sparse = SitePebbles(coverage=0.01, log_albedo=-0.5, log_albedo_sd=0.0)
     bare, lag = (np.mean(_sample(sparse, 1e-4, density=factor)[1] < -0.25) for factor in (0.5, 3.0))
     assert lag / bare == pytest.approx(6.0, rel=0.25)
+
+
+@pytest.mark.parametrize("name", ["gusev", "meridiani"])
+def test_hollows_hold_lag_and_crests_are_bare(name: str) -> None:
+    terrain, pebbles = site(name).terrain("ground", {"samples": 1024}), site(name).pebbles
+    assert pebbles is not None
+    surface = TerrainBank(terrain, 5).terrain(0)
+    height, albedo = np.moveaxis(surface.levels[0], -1, 0)
+    density = to_host(PebbleField.of(pebbles, surface).density_at(Float(albedo.ravel()))).reshape(albedo.shape)
+    # above the mean of the surroundings over half a metre
+    relative = height - gaussian_filter(height, 0.5 / terrain.spacing_m, mode="wrap")
+    low, high = np.quantile(relative, (0.1, 0.9))
+    assert density[relative < low].mean() > 1.5 * density[relative > high].mean()
 
 
 def test_pebbles_do_not_stand_in_rows_and_columns() -> None:
