@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
 
 RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
-#: Maximum distance of ejecta from the centre of a crater, in radii; optical depth of the ejecta at the rim (assumed: they
-#: cover a third of the ground at two radii).
+#: Maximum distance of ejecta from the centre of a crater, in radii; optical depth of the ejecta at the rim (assumed:
+#: they cover a third of the ground at two radii).
 EJECTA_EXTENT_RADII, EJECTA_OPACITY = 3.0, 3.0
 #: Width of the margin in which a crater's fill thins out, in crater radii; fitted to Spirit's descent images.
 FILL_MARGIN = 0.4
@@ -104,7 +104,10 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
 
 
 def _draw_worn_albedo(
-    p: TerrainParameters, diameter: Float64[np.ndarray, "craters"], freshness: Float64[np.ndarray, "craters"], rng: Generator
+    p: TerrainParameters,
+    diameter: Float64[np.ndarray, "craters"],
+    freshness: Float64[np.ndarray, "craters"],
+    rng: Generator,
 ) -> tuple[Float64[np.ndarray, "craters"], ...]:
     """Draw the columns of `stamp_craters` that depend on the age: log albedo and radius of the fill, and the last four.
 
