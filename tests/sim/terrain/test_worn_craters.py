@@ -53,7 +53,7 @@ def test_small_craters_gather_in_clusters() -> None:
     period = PARAMETERS.samples * PARAMETERS.spacing_m
     small = craters[2.0 * craters[:, 2] < LARGEST_SECONDARY_M, :2] % period
     large = craters[2.0 * craters[:, 2] >= LARGEST_SECONDARY_M, :2] % period
-    tree = cKDTree(small, boxsize=period)
+    tree = cKDTree(small, boxsize=[period, period])
     radius = 2.0 * CLUSTER_RADIUS_M
     near_small = np.mean([len(near) - 1 for near in tree.query_ball_point(small, radius)])
     near_large = np.mean([len(near) for near in tree.query_ball_point(large, radius)])
@@ -87,7 +87,8 @@ def test_unit_surrounds_craters_and_lies_downwind(preference: float) -> None:
     units = SurfaceUnits.model_validate(
         {"kinds": kinds, "boundary": 0.05, "largest_m": 100.0, "wind_from_deg": 270.0, "wind_spread_deg": 0.0}
     )
-    ground = TerrainGround(*np.zeros((2, 1024, 1024), dtype=np.float32), 2.0)
+    height, log_albedo = np.zeros((2, 1024, 1024), dtype=np.float32)
+    ground = TerrainGround(height, log_albedo, 2.0)
     # 16 craters of 40 m radius, every 512 m: 64 samples of the factors
     crater = np.zeros((16, 18))
     crater[:, :2] = np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) * 512.0 + 256.0
