@@ -53,10 +53,10 @@ def test_small_craters_gather_in_clusters() -> None:
     period = PARAMETERS.samples * PARAMETERS.spacing_m
     small = craters[2.0 * craters[:, 2] < LARGEST_SECONDARY_M, :2] % period
     large = craters[2.0 * craters[:, 2] >= LARGEST_SECONDARY_M, :2] % period
-    tree = cKDTree(small, boxsize=[period, period])
+    tree = cKDTree(small, boxsize=np.full(2, period))
     radius = 2.0 * CLUSTER_RADIUS_M
-    near_small = np.mean([len(near) - 1 for near in tree.query_ball_point(small, radius)])
-    near_large = np.mean([len(near) for near in tree.query_ball_point(large, radius)])
+    near_small = np.mean(tree.query_ball_point(small, radius, return_length=True)) - 1.0
+    near_large = np.mean(tree.query_ball_point(large, radius, return_length=True))
     # secondaries have 0.63 of the about 9 others of their cluster within twice its radius, which is a convolution of
     # two Gaussians: 1 - exp(-1)
     assert near_small - near_large > 0.5 * SECONDARY_FRACTION * 0.63 * 9.0
