@@ -201,7 +201,7 @@ _DESCENT = Conditions(
     site=("gusev",),
     camera=("mer-descent-flown",),
     sun_elevation_deg=(SUNS_DEG["gusev"][1],) * 2,
-    slope_deg=(1.7, 1.7),
+    slope_deg=(1.55, 1.55),
     optical_depth=_OPTICAL_DEPTH,
     range_m=ALTITUDES_M,
 )

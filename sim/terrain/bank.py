@@ -98,8 +98,8 @@ def _add_fine_ground(
 ) -> None:
     """Add fine relief and albedo, scaled by the factors of the surface units.
 
-    With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``, and
-    the log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.
+    With `relief_log_albedo` the relief z becomes ridges along its level lines z = 0, of height ``-min(|z|, limit)``.
+    The log albedo falls by `relief_log_albedo` per mean of abs(z) below their crests: sand fills the ground between.
     """
     height, log_albedo = fine.height, fine.log_albedo
     roughness, texture = (

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from marsyard.sim.terrain.parameters import TerrainParameters
 
 RADIUS_SAMPLES = 24  #: Minimum number of samples along the radius of a crater on a coarser grid.
-#: Maximum distance of ejecta from the centre of a crater, in radii; optical depth of the ejecta at the rim (assumed: they
-#: cover a third of the ground at two radii).
+#: Maximum distance of ejecta from the centre of a crater, in radii; optical depth of the ejecta at the rim (assumed:
+#: they cover a third of the ground at two radii).
 EJECTA_EXTENT_RADII, EJECTA_OPACITY = 3.0, 3.0
 #: Width of the margin in which a crater's fill thins out, in crater radii; fitted to Spirit's descent images.
 FILL_MARGIN = 0.4
@@ -28,7 +28,7 @@ FRESH_DEPTH, DEGRADED_DEPTH = 0.2, 0.04
 FRESH_RIM = 0.04
 SHARPEST_RIM, ROUNDEST_RIM = 0.08, 0.9  #: Height over which the rim is rounded, as a fraction of the depth.
 DEEPEST_FILL = 0.45  #: Fraction of the original bowl's depth that is filled in the most degraded craters.
-LEAST_FILL = 0.25  #: Fraction that is filled in fresh craters whose albedo wears (assumed).
+MIN_FILL = 0.25  #: Fraction that is filled in fresh craters whose albedo wears (assumed).
 DARK_EJECTA = 0.15  #: Fraction of the craters whose ejecta are darker than the ground (assumed).
 FULL_CONTRAST_M = 60.0  #: Diameter from which sand and ejecta have the contrast of the parameters (assumed).
 SMALLEST_FILL, LARGEST_FILL = 0.6, 1.0  #: Radius of the sand in a crater, in crater radii (assumed).
@@ -94,7 +94,7 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
     rotation = rng.uniform(0.0, 1.0, count)
     wear = [np.full(count, value) for value in (EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN, 0.0)]
     if p.craters_wear_albedo:
-        fill += LEAST_FILL * (1.0 - fill)
+        fill += MIN_FILL * (1.0 - fill)
         ejecta_log_albedo = np.abs(ejecta_log_albedo)
         fill_log_albedo, fill_radius, *wear = _draw_worn_albedo(p, diameter, freshness, rng)
         _gather_secondaries(position, diameter, period, rng)
@@ -104,7 +104,10 @@ def draw_craters(parameters: TerrainParameters, rng: Generator) -> Float64[np.nd
 
 
 def _draw_worn_albedo(
-    p: TerrainParameters, diameter: Float64[np.ndarray, "craters"], freshness: Float64[np.ndarray, "craters"], rng: Generator
+    p: TerrainParameters,
+    diameter: Float64[np.ndarray, "craters"],
+    freshness: Float64[np.ndarray, "craters"],
+    rng: Generator,
 ) -> tuple[Float64[np.ndarray, "craters"], ...]:
     """Draw the columns of `stamp_craters` that depend on the age: log albedo and radius of the fill, and the last four.
 

@@ -167,14 +167,16 @@ class SurfaceUnits(Parameters):
         downwind: float,
         rng: Generator,
     ) -> Grid:
-        """Draw the surroundings of large craters, 1 at most for each: long downwind, short upwind, weaker for worn ones."""
+        """Draw the surroundings of large craters, 1 at most: long downwind, short upwind, weaker for worn ones."""
         sources = craters[craters[:, 2] > 0.5 * self.streak_min_m]
         radius = sources[:, 2]
         strength = np.minimum((sources[:, 3] + sources[:, 4]) / radius / 0.4 * rng.uniform(0.5, 1.5, len(sources)), 1.0)
         halos = np.zeros((side, side), dtype=np.float32)
         for heading, length in ((downwind, rng.uniform(3.0, 12.0, len(sources))), (downwind + np.pi, 4.0)):
             c, s = (np.full(len(sources), value) for value in (np.cos(heading), np.sin(heading)))
-            stamp_streaks(halos, spacing, np.column_stack([sources[:, :2], 2.0 * radius, length * radius, c, s, strength]))
+            stamp_streaks(
+                halos, spacing, np.column_stack([sources[:, :2], 2.0 * radius, length * radius, c, s, strength])
+            )
         return halos
 
     def _compute_membership(

@@ -14,13 +14,7 @@ from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms import Dunes, Fans, Gullies, Lava, Playa, Ramp, Swell, TerrainGround
 from marsyard.sim.terrain.landforms.ground import draw_smooth_fields, refine, substream
 from marsyard.sim.terrain.landforms.kernels.bedrock import add_cracks
-from marsyard.sim.terrain.landforms.kernels.shapes import (
-    EJECTA_OPACITY,
-    RAY_CONTRAST,
-    Bedforms,
-    add_dunes,
-    stamp_craters,
-)
+from marsyard.sim.terrain.landforms.kernels.shapes import RAY_CONTRAST, Bedforms, add_dunes, stamp_craters
 from marsyard.sim.terrain.surface import mean_slope_deg
 
 SMOOTH = TerrainParameters(samples=512, rms_slope_deg=0.0, craters_per_km2=0.0, albedo_contrast=0.0)
@@ -259,10 +253,12 @@ def test_ejecta_have_rays() -> None:
     side, spacing, radius, rim, max_radius, turn = 128, 1.0, 12.0, 0.8, 4.0, 0.25
     height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
     # Columns: see `stamp_craters`.
-    crater = np.array([[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0, turn]])
+    crater = np.array(
+        [[64.0, 64.0, radius, 3.0, rim, 0.1, 0.3, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0, turn, max_radius, 2.0, 0.4, 0.0]]
+    )
     # one ray: its strength is linear along the square |x| + |y| = 1, and 1 where x = 1
     table = np.array([[1.0, 0.0, -1.0, 0.0]])
-    stamp_craters(height, log_albedo, spacing, crater, np.zeros((1, 4)), table, max_radius)
+    stamp_craters(height, log_albedo, spacing, crater, np.zeros((1, 4)), table)
     y, x = np.mgrid[:side, :side] - 64.0
     r = np.hypot(x, y) / radius
     is_ejecta = (r > 1.1) & (r < max_radius)
@@ -272,7 +268,7 @@ def test_ejecta_have_rays() -> None:
     strength = 1.0 + RAY_CONTRAST * ray * np.minimum(2.0 * (r - 1.0), 1.0)
     blanket = rim / np.maximum(r, 0.6) ** 3 * fade * strength
     np.testing.assert_allclose(height[is_ejecta], blanket[is_ejecta], atol=1e-6)
-    coverage = 1.0 - np.exp(-EJECTA_OPACITY / np.maximum(r, 0.6) ** 3 * strength)
+    coverage = 1.0 - np.exp(-2.0 / np.maximum(r, 0.6) ** 3 * strength)
     np.testing.assert_allclose(log_albedo[is_ejecta], 0.2 * (coverage * fade)[is_ejecta], atol=1e-6)
 
 

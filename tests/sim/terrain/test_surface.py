@@ -10,6 +10,9 @@ from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.kernels import CEILING_BLOCK
 from marsyard.sim.terrain.landforms.craters import (
     DEGRADED_DEPTH,
+    EJECTA_EXTENT_RADII,
+    EJECTA_OPACITY,
+    FILL_MARGIN,
     FRESH_DEPTH,
     OUTLINE_EXPONENT,
     OUTLINE_RMS,
@@ -18,7 +21,7 @@ from marsyard.sim.terrain.landforms.craters import (
     outline_tables,
 )
 from marsyard.sim.terrain.landforms.ground import FractalField, Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels.shapes import EJECTA_OPACITY, stamp_craters
+from marsyard.sim.terrain.landforms.kernels.shapes import stamp_craters
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +49,8 @@ def test_height_matches_scipy_spline(surface: Surface, positions: tuple[np.ndarr
 
 #: Tables of a round outline without rays.
 ROUND = (np.zeros((1, 4)), np.zeros((1, 4)))
+#: Last columns of a crater whose albedo does not wear: extent and opacity of ejecta, margin of the fill, deposit.
+NO_WEAR = (EJECTA_EXTENT_RADII, EJECTA_OPACITY, FILL_MARGIN, 0.0)
 
 
 def test_gradient_is_the_derivative_of_height(surface: Surface, positions: tuple[np.ndarray, np.ndarray]) -> None:
@@ -172,9 +177,9 @@ def test_white_noise_replaces_the_finest_octave(hurst: float) -> None:
 def test_large_craters_are_equal_on_a_coarser_grid() -> None:
     """A crater with a radius of 150 samples, on a grid of every fourth sample: equal within 2 % of its depth."""
     shape = (512, 512)
-    crater = np.array([[200.0, 260.0, 150.0, 24.0, 6.0, 2.4, 0.0, 0.1, -0.3, 0.8, *np.zeros(4)]])
+    crater = np.array([[200.0, 260.0, 150.0, 24.0, 6.0, 2.4, 0.0, 0.1, -0.3, 0.8, *np.zeros(4), *NO_WEAR]])
     height, log_albedo = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-    stamp_craters(height, log_albedo, 1.0, crater, *outline_tables(), 3.0)
+    stamp_craters(height, log_albedo, 1.0, crater, *outline_tables())
     ground = TerrainGround(np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32), 1.0)
     add_craters(ground, crater)
     # the B-spline of the coarser grid smooths the crest over a sample
@@ -210,8 +215,8 @@ def test_outlines_have_a_power_law_of_waves() -> None:
     powers = []
     for number in range(32):
         height[:] = 0.0
-        crater = [256.0, 256.0, 80.0, 16.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, number, 0.1]
-        stamp_craters(height, log_albedo, 1.0, np.array([crater]), *outline_tables(), 3.0)
+        crater = [256.0, 256.0, 80.0, 16.0, 0.0, 1e-6, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, number, 0.1, *NO_WEAR]
+        stamp_craters(height, log_albedo, 1.0, np.array([crater]), *outline_tables())
         # without a rim, the bowl ends at the outline: it is at half its depth at 0.5**(1 / 2.2) of the local radius
         radii = np.arange(20.0, 80.0, 0.25)
         rays = [256.0 + radii[:, None] * shape(azimuth) for shape in (np.sin, np.cos)]
@@ -231,8 +236,8 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     height, log_albedo = np.zeros((256, 256), dtype=np.float32), np.zeros((256, 256), dtype=np.float32)
     radius, depth, rim = 20.0, 6.4, 1.6
     # A crater with a sharp rim and a round outline, centred on the corner of the grid. Columns: see `stamp_craters`.
-    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, 0.0, 1.0, *np.zeros(4)]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND, 3.0)
+    crater = [0.0, 0.0, radius, depth, rim, 0.0, 0.0, 0.1, 0.0, 1.0, *np.zeros(4), *NO_WEAR]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND)
     centred = np.roll(height, (128, 128), axis=(0, 1))
     assert centred[128, 128] == pytest.approx(-depth)
     assert tuple(map(int, np.unravel_index(centred.argmin(), centred.shape))) == (128, 128)
@@ -247,8 +252,8 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     # A crater of radius 30 m and depth 3 m, filled up to a flat floor. Columns: see `stamp_craters`.
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, 0.0, 1.0, *np.zeros(4)]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND, 3.0)
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.4, 0.0, 0.0, 1.0, *np.zeros(4), *NO_WEAR]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), *ROUND)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
     assert np.ptp(height[64, 56:73]) < 0.15
     assert not log_albedo.any()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
+from scipy.stats import norm
 
 from marsyard.sim.terrain import (
     PlacedRock,
@@ -17,9 +18,10 @@ from marsyard.sim.terrain import (
     TerrainParameters,
     synthesise,
 )
+from marsyard.sim.terrain.bank import RIDGE_HEIGHT
 from marsyard.sim.terrain.landforms.craters import DARK_EJECTA, FULL_CONTRAST_M, draw_craters
 from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
-from marsyard.sim.terrain.landforms.kernels.shapes import FILL_MARGIN, scale_roughness, stamp_craters, stamp_streaks
+from marsyard.sim.terrain.landforms.kernels.shapes import scale_roughness, stamp_craters, stamp_streaks
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms
 from marsyard.sim.terrain.rocks.shapes import SHAPES_OF_FORM
@@ -35,7 +37,7 @@ KINDS: list[dict[str, Any]] = [
 ]
 PLAIN = [{"name": "plain", "fraction": 1.0}]
 #: An empty table of craters; columns: see `stamp_craters`.
-NO_CRATERS = np.empty((0, 14))
+NO_CRATERS = np.empty((0, 18))
 
 
 def _make_units(**changes: Any) -> SurfaceUnits:
@@ -158,12 +160,12 @@ def test_sand_in_a_crater_has_the_specified_albedo_and_margin() -> None:
     height, log_albedo = np.zeros((128, 128), dtype=np.float32), np.zeros((128, 128), dtype=np.float32)
     # x, y, radius, depth, rim height, rim width; filled fraction; albedo of ejecta and sand; radius of the sand and its
     # increase along x and y; number and rotation of the outline, which is round
-    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, -0.5, 0.8, 0.3, 0.0, 0.0, 0.0]
-    stamp_craters(height, log_albedo, 1.0, np.array([crater]), np.zeros((1, 4)), np.zeros((1, 4)), 3.0)
+    crater = [64.0, 64.0, 30.0, 3.0, 0.3, 1.0, 0.0, 0.0, -0.5, 0.8, 0.3, 0.0, 0.0, 0.0, 3.0, 3.0, 0.4, 0.0]
+    stamp_craters(height, log_albedo, 1.0, np.array([crater]), np.zeros((1, 4)), np.zeros((1, 4)))
     assert log_albedo[64, 64] == pytest.approx(-0.5)
     assert log_albedo[64, 64 + 12] == pytest.approx(-0.5 * (1.0 + 0.3 * 0.4))
     assert log_albedo[64, 64 - 12] == pytest.approx(-0.5 * (1.0 - 0.3 * 0.4))
-    assert log_albedo[64 + 21, 64] == pytest.approx(-0.5 * (0.8 - 0.7) / FILL_MARGIN, rel=1e-5)
+    assert log_albedo[64 + 21, 64] == pytest.approx(-0.5 * (0.8 - 0.7) / 0.4, rel=1e-5)
     assert not log_albedo[np.hypot(*(np.mgrid[:128, :128] - 64.0)) >= 24.0].any()
 
 
@@ -316,17 +318,22 @@ def test_abundance_changes_the_cached_terrain_only_with_tails(tmp_path: Path, mo
     assert len(terrains) == 3  # one without tails, two with tails
 
 
-def test_albedo_follows_the_fine_relief() -> None:
-    """Ground above its surroundings is darker with a negative parameter, in proportion to the fine relief."""
-    parameters = _make_parameters(albedo_contrast=0.0, units={"kinds": PLAIN}, relief_log_albedo=-0.1)
-    level, other = (
-        synthesise(p, np.random.default_rng(3)).levels[0].astype(np.float64)
-        for p in (parameters, parameters.model_copy(update={"relief_log_albedo": 0.0}))
+def test_fine_relief_consists_of_bright_ridges() -> None:
+    """Sharp crests at one level, level ground between them at the depth limit, and albedo that follows the height."""
+    parameters = _make_parameters(
+        albedo_contrast=0.0, units={"kinds": PLAIN}, relief_log_albedo=0.1, fine_below_m=1e6, rms_slope_deg=3.0
     )
-    change = np.log(level[..., 1] / other[..., 1])
-    assert change.std() == pytest.approx(0.1, rel=0.02)
-    relief = level[..., 0] - gaussian_filter(level[..., 0], 10.0, mode="wrap")
-    assert np.corrcoef(change.ravel(), relief.ravel())[0, 1] < -0.8
+    samples = synthesise(parameters, np.random.default_rng(3)).levels[0].astype(np.float64)
+    height, log_albedo = samples[..., 0], np.log(samples[..., 1])
+    # all relief is fine: the heights are those of the ridges
+    below = height.max() - height
+    assert np.polyfit(below.ravel(), log_albedo.ravel(), 1)[0] == pytest.approx(
+        -0.1 / (below.max() / RIDGE_HEIGHT), rel=0.05
+    )
+    assert np.corrcoef(below.ravel(), log_albedo.ravel())[0, 1] < -0.99
+    # a Gaussian field exceeds RIDGE_HEIGHT times its mean absolute value with this probability
+    level = 2.0 * (1.0 - norm.cdf(RIDGE_HEIGHT * np.sqrt(2.0 / np.pi)))
+    assert np.mean(below > 0.99 * below.max()) == pytest.approx(level, abs=0.08)
 
 
 def test_small_craters_have_less_sand_and_fainter_ejecta() -> None:

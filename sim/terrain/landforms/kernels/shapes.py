@@ -15,8 +15,8 @@ GridRow = NDArray[np.float32]
 RIM_HEIGHT_SENSITIVITY = 8.0
 #: RMS of the rays relative to the mean thickness and opacity of the ejecta (assumed).
 RAY_CONTRAST = 0.25
-#: Radius of the deposit in the middle of a crater's fill, in crater radii; wavelength and amplitude of the ridges on it,
-#: metres (assumed; transverse ridges in craters: Balme et al. 2008).
+#: Radius of the deposit in the middle of a crater's fill, in crater radii; wavelength and amplitude of the ridges on
+#: it, metres (assumed; transverse ridges in craters: Balme et al. 2008).
 CORE_RADIUS, RIDGE_WAVELENGTH_M, RIDGE_HEIGHT_M = 0.7, 10.0, 0.15
 #: Finer scallops in the fill's border of large craters: their size, and the factor of their wavenumbers (assumed).
 TEETH, TEETH_STEP = 0.4, 5
@@ -95,8 +95,8 @@ def stamp_craters(height: Grid, log_albedo: Grid, spacing: float, craters: Array
     - fraction of the depth that is filled; changes of the logarithm of albedo on the ejecta and on the fill; radius of
       the fill in crater radii; relative increase of its strength per radius along x and y
     - number of its outline; rotation of outline and rays, as a fraction of a turn
-    - extent of the ejecta in radii; their optical depth a at the rim; width of the margin in which the fill thins out, in
-      radii; coverage by a deposit with ridges in its middle. 0: none, and the scallops of the rim reach the centre
+    - extent of the ejecta in radii; their optical depth a at the rim; width of the margin in which the fill thins out,
+      in radii; coverage by a deposit with ridges in its middle. 0: none, and the scallops of the rim reach the centre
 
     `outlines` and `rays` have a row per outline: the relative change of the radius, and the strength of the rays, at
     positions of `_azimuth_fraction`. With the distance r from the centre in radii, the bowl rises with r**2.2. The
