@@ -81,9 +81,7 @@ def read_elevation(path: Path, size: tuple[int, int]) -> Float32[np.ndarray, "ro
     return np.asarray(cv2.resize(elevation, size, interpolation=cv2.INTER_LINEAR))
 
 
-def read_format(
-    path: Path, size: tuple[int, int] | None = None, *, is_published: bool
-) -> tuple[str, tuple[int, int]]:
+def read_format(path: Path, size: tuple[int, int] | None = None, *, is_published: bool) -> tuple[str, tuple[int, int]]:
     """Return the format of an image and its size (columns, rows).
 
     Raises IngestError for another format or size, or a rotated image.
