@@ -18,9 +18,8 @@ from marsyard.reports.rates import CONFIDENCE, CaseFraction, PooledRate, finite_
 from marsyard.reports.section import Block, Grid, svg_figure
 from marsyard.reports.wording import format_fraction, label, number, percent
 
-Rows = pd.DataFrame
 #: Function that computes a rate of rows.
-RateFunction = Callable[[Rows], CaseFraction | PooledRate]
+RateFunction = Callable[[pd.DataFrame], CaseFraction | PooledRate]
 #: Maximum number of bins of a condition (bins have equal numbers of cases), and minimum number of cases of a bin.
 _MAX_BINS, _MIN_CASES_IN_BIN = 5, 4
 #: Maximum number of values of a condition with a row each.
@@ -40,12 +39,12 @@ class Quantity:
         """The name on the page."""
         return self.name or label(self.column)
 
-    def values(self, frame: Rows) -> Float[np.ndarray, " n"]:
+    def values(self, frame: pd.DataFrame) -> Float[np.ndarray, " n"]:
         """The scaled numbers; NaN if missing."""
         return np.asarray(self.scale * numbers(frame, self.column))
 
 
-def collect_values(frame: Rows, quantities: Sequence[Quantity]) -> dict[str, Float[np.ndarray, " n"]]:
+def collect_values(frame: pd.DataFrame, quantities: Sequence[Quantity]) -> dict[str, Float[np.ndarray, " n"]]:
     """Collect the finite values of quantities by title."""
     return {quantity.title: finite_values(frame, quantity.column, quantity.scale) for quantity in quantities}
 
@@ -53,7 +52,7 @@ def collect_values(frame: Rows, quantities: Sequence[Quantity]) -> dict[str, Flo
 def flag_rate(name: str, *conditions: str) -> RateFunction:
     """Return a function that computes how often flag `name` is true, in the rows with all flags `conditions`."""
 
-    def compute_rate(frame: Rows) -> CaseFraction:
+    def compute_rate(frame: pd.DataFrame) -> CaseFraction:
         all_rows = np.ones(len(frame), dtype=np.bool_)
         masks = (populations.flag_mask(frame, condition) for condition in conditions)
         selected_rows = frame[np.logical_and.reduce([all_rows, *masks])]
@@ -97,7 +96,7 @@ def rate_block(
 
 
 def condition_blocks(
-    frame: Rows, key: str, by: Quantity, declared_rates: Sequence[Rate], cases: str = "Cases",
+    frame: pd.DataFrame, key: str, by: Quantity, declared_rates: Sequence[Rate], cases: str = "Cases",
     ylabel: str = "fraction of cases", text: str = "", note: str = "", caption: str = "",
     limit: tuple[str, float] | None = None, data: str = "by_condition",
 ) -> list[Block]:  # fmt: skip
@@ -161,7 +160,7 @@ def distribution_block(
 
 
 def quantile_block(
-    frame: Rows, quantities: Sequence[Quantity], columns: Mapping[str, float], heading: str = "", note: str = ""
+    frame: pd.DataFrame, quantities: Sequence[Quantity], columns: Mapping[str, float], heading: str = "", note: str = ""
 ) -> Block | None:
     """Create a table of quantiles; `columns` maps headings to probabilities. None if there are no values."""
     rows = [

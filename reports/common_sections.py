@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool
 
 from marsyard.reports import populations, rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figures import ELLIPSE
@@ -114,13 +114,13 @@ def scatter_section(subject: Subject) -> Section | None:
     )
 
 
-def _classify_answers(rows: Rows, metric: str, bound: float) -> dict[str, Bool[np.ndarray, " n"]]:
+def _classify_answers(rows: pd.DataFrame, metric: str, bound: float) -> dict[str, Bool[np.ndarray, " n"]]:
     """Create the masks of answers within the bound (`valid`), cases without an answer (`invalid`) and wrong answers."""
     is_answered, is_correct = populations.population_mask(rows, "valid"), populations.success_mask(rows, metric, bound)
     return {"valid": is_answered & is_correct, "invalid": ~is_answered, "wrong": is_answered & ~is_correct}
 
 
-def find_frequent_refusal(rows: Rows) -> str:
+def find_frequent_refusal(rows: pd.DataFrame) -> str:
     """Return the most frequent outcome of cases without an answer; empty if all cases have an answer."""
     if "outcome" not in rows:
         return ""

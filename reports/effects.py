@@ -5,9 +5,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import pandas as pd
 
 from marsyard.reports import rates
-from marsyard.reports.blocks import Quantity, Rows, condition_bins
+from marsyard.reports.blocks import Quantity, condition_bins
 from marsyard.reports.plots import scatter_panels
 from marsyard.reports.rates import CONFIDENCE, varies
 from marsyard.reports.section import Block, Grid, svg_figure
@@ -31,7 +32,7 @@ class Effect:
     medians: list[float]
 
 
-def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[Effect]:
+def estimate_effects(frame: pd.DataFrame, x: Sequence[Quantity], y: Sequence[Quantity]) -> list[Effect]:
     """Compute the effect of every condition `x` that varies on every response `y`."""
     effects, groups = [], rates.terrain_groups(frame)
     for condition in (condition for condition in x if varies(frame, condition.column)):
@@ -46,7 +47,7 @@ def estimate_effects(frame: Rows, x: Sequence[Quantity], y: Sequence[Quantity]) 
 
 
 def scatter_block(
-    frame: Rows, key: str, x: Sequence[Quantity], y: Sequence[Quantity], caption: str, heading: str = "",
+    frame: pd.DataFrame, key: str, x: Sequence[Quantity], y: Sequence[Quantity], caption: str, heading: str = "",
     note: str = "", *, logarithmic: bool = False, statistics: bool = True,
 ) -> Block | None:  # fmt: skip
     """Draw responses `y` against the conditions `x` that vary; None if no condition varies.

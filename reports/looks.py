@@ -1,4 +1,4 @@
-"""Repeated looks at the growing results of one campaign."""
+"""Looks (evaluations) of a growing campaign: the result for the record of confirmations, and the next look."""
 
 from collections.abc import Sequence
 

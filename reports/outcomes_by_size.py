@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool
 
 from marsyard.reports import rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.plots import stacked_bars
 from marsyard.reports.section import Block, Grid, svg_figure
 from marsyard.reports.wording import NOTHING, percent
@@ -27,7 +27,7 @@ class ExtraColumn(NamedTuple):
 
     heading: str
     key: str
-    compute: Callable[[Rows], Any]
+    compute: Callable[[pd.DataFrame], Any]
     format_value: Callable[[Any], str]
 
 
@@ -42,13 +42,13 @@ class OutcomesBySize:
     - wording: function that returns fault type and size in words; an unknown size is empty
     """
 
-    outcomes: Callable[[Rows], Mapping[str, Bool[np.ndarray, " n"]]]
+    outcomes: Callable[[pd.DataFrame], Mapping[str, Bool[np.ndarray, " n"]]]
     styles: Mapping[str, tuple[str, str]]
     cases: str
     wording: Callable[[str, float], tuple[str, str]]
     extra_columns: Sequence[ExtraColumn] = ()
 
-    def records(self, frame: Rows) -> list[dict[str, Any]]:
+    def records(self, frame: pd.DataFrame) -> list[dict[str, Any]]:
         """Count the outcomes for each fault type and size; cases without a fault come first."""
         records = []
         for fault, size, rows in rates.group_by_size(frame, "fault", "fault_size", NO_FAULT):
@@ -60,7 +60,7 @@ class OutcomesBySize:
             records.append({"fault": fault, "size": size, "n": len(rows), **counts, **values})
         return records
 
-    def blocks(self, frame: Rows, key: str, caption: str, note: str = "") -> list[Block]:
+    def blocks(self, frame: pd.DataFrame, key: str, caption: str, note: str = "") -> list[Block]:
         """Create stacked bars and a table of the outcomes; empty if no row has a fault."""
         records = self.records(frame) if "fault" in frame else []
         if all(record["fault"] == NO_FAULT for record in records):

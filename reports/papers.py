@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from marsyard.reports.blocks import Rows
 from marsyard.reports.populations import all_flags
 from marsyard.reports.rates import finite_values, flag_fraction, fraction_text, median_text
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section
@@ -51,7 +51,7 @@ _VALUES_NOTE = (
 )
 
 
-def format_simulated_value(frame: Rows, row: Mapping[str, Any]) -> str:
+def format_simulated_value(frame: pd.DataFrame, row: Mapping[str, Any]) -> str:
     """Format Marsyard's value of a quantity of a paper; `row` is a row of `paper_section`."""
     rows, column = frame[all_flags(frame, *row.get("among", ()))], row["column"]
     if row.get("statistic") == "rate":

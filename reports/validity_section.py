@@ -1,4 +1,4 @@
-"""Section on the domain of validity."""
+"""Section on the domain of validity: cases outside of the conditions in which the simulation was checked."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 
 from marsyard.reports import populations, rates
-from marsyard.reports.blocks import Rows, distribution_block, rate_block
+from marsyard.reports.blocks import distribution_block, rate_block
 from marsyard.reports.column_values import numbers
 from marsyard.reports.empty_cells import omit_empty_rows
 from marsyard.reports.rates import CONFIDENCE
@@ -59,7 +59,7 @@ def landing_rows(subject: Subject) -> pd.DataFrame | None:
     return landings if len(landings) else None
 
 
-def landing_fractions(landings: Rows) -> dict[str, rates.CaseFraction]:
+def landing_fractions(landings: pd.DataFrame) -> dict[str, rates.CaseFraction]:
     """Compute fractions of landings with a lower and a higher speed, and of answers available before ignition."""
     change = numbers(landings, SPEED_CORRECTED) - numbers(landings, SPEED_UNCORRECTED)
     fractions = {
@@ -97,7 +97,7 @@ _LANDING_NOTE = (
 )
 
 
-def create_speed_block(landings: Rows, subject: Subject) -> Block:
+def create_speed_block(landings: pd.DataFrame, subject: Subject) -> Block:
     """Create the table of touchdown speeds with and without steering: mean, quantiles, fractions above speeds."""
     columns = [numbers(landings, name) for name in (SPEED_CORRECTED, SPEED_UNCORRECTED)]
     groups = rates.terrain_groups(landings)

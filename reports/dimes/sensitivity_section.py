@@ -1,4 +1,7 @@
-"""Section on the effect of each condition on the velocity error."""
+"""Section on the effect of each condition on the velocity error.
+
+The paper is Johnson et al., "Field Testing of the MER DIMES".
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from marsyard.reports import populations, rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.dimes.presentation import explain
@@ -26,7 +26,7 @@ from marsyard.reports.section import Block, Section, Subject, SvgFigure, build_g
 from marsyard.reports.wording import NOTHING, count, format_fraction, label, note_text, number, percent
 from marsyard.scenarios.columns import split_unit
 
-#: Rows of the paper's Fig. 11 by (category, run).
+#: pd.DataFrame of the paper's Fig. 11 by (category, run).
 FIG_11: Mapping[tuple[str, str], Mapping[str, Any]] = {
     (group["category"], row["run"]): row
     for group in read_paper(Path(__file__).with_name("paper.toml"))["fig_11"]
@@ -147,7 +147,7 @@ def scatter_figures(subject: Subject) -> list[SvgFigure]:
 
 
 @in_page_style
-def _draw_scatter(rows: Rows, components: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
+def _draw_scatter(rows: pd.DataFrame, components: Sequence[str], subject: Subject, axis_limit: float) -> Figure:
     figure, axes = new_axes(4.2, 4.4)
     runs = sorted(str(run) for run in subject.frame["run"].dropna().unique())
     for index, run in enumerate(runs):

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from marsyard.reports import section
-from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figure_style import in_page_style
 from marsyard.reports.plots import RateLine, draw_rates
@@ -79,7 +79,7 @@ _RATE_NOTE = (
 )
 
 
-def count_hazard_classes(frame: Rows) -> list[HazardClass]:
+def count_hazard_classes(frame: pd.DataFrame) -> list[HazardClass]:
     """Count missed hazards by size; empty if the rows do not contain the counts."""
     edges = (0.0, *CLASS_BOUNDS, math.inf)
     classes = []
@@ -94,7 +94,7 @@ def count_hazard_classes(frame: Rows) -> list[HazardClass]:
     return classes
 
 
-def create_class_blocks(frame: Rows) -> list[Block]:
+def create_class_blocks(frame: pd.DataFrame) -> list[Block]:
     """Create figure and tables of missed hazards by size, and of rates of footprints; nothing without the counts."""
     classes = count_hazard_classes(frame)
     if not classes:

@@ -1,4 +1,7 @@
-"""Rows of landing cases, with the paper's values and the note that their sections share."""
+"""Rows of landing cases, with the paper's values and the note that their sections share.
+
+The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,7 @@
-"""Section on false alarms and misses of the map of hazards, by roughness threshold."""
+"""Section on false alarms and misses of the map of hazards, by roughness threshold.
+
+"The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""
 
 from marsyard.reports.blocks import Quantity, Rate, condition_blocks, flag_rate, pooled_fraction
 from marsyard.reports.column_values import numbers

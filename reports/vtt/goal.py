@@ -12,7 +12,7 @@ import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
 from marsyard.reports import rates
-from marsyard.reports.blocks import Rows, distribution_block
+from marsyard.reports.blocks import distribution_block
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
@@ -49,13 +49,13 @@ _RATES_NOTE = (
 )
 
 
-def _group_by_camera(runs: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
+def _group_by_camera(runs: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Yield the name of each camera and its rows."""
     for name in sorted(runs["camera"].dropna().unique()):
         yield str(name), runs[runs["camera"].eq(name)]
 
 
-def summarize_cameras(runs: Rows) -> list[dict[str, Any]]:
+def summarize_cameras(runs: pd.DataFrame) -> list[dict[str, Any]]:
     """Summarize each camera: rates (`_RATES`), and position errors and drift of its completed runs.
 
     `range` and `cross` are the error components along and across the line of sight.
@@ -95,7 +95,7 @@ def _errors_grid(cameras: Sequence[Mapping[str, Any]]) -> Grid:
     return Grid(["Camera", *columns], rows)
 
 
-def _create_camera_blocks(runs: Rows) -> list[Block]:
+def _create_camera_blocks(runs: pd.DataFrame) -> list[Block]:
     """Create the tables of rates and errors of each camera, and of the runs that lost the target."""
     cameras = summarize_cameras(runs)
     rows = [

@@ -1,13 +1,14 @@
 """Table of the runs that lost the target."""
 
+import pandas as pd
+
 from marsyard.algorithms.interface import TargetLoss
 from marsyard.reports import populations, rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.section import Grid
 from marsyard.reports.wording import NOTHING
 
 
-def losses_grid(frame: Rows) -> Grid:
+def losses_grid(frame: pd.DataFrame) -> Grid:
     """Count runs that ended without a tracked target, by outcome and loss criteria."""
     failed_runs = frame[~populations.flag_mask(frame, "tracked")]
     has_clouds = "clear_sky" in failed_runs and rates.flag_fraction(failed_runs, "clear_sky", value=False).hits > 0
@@ -25,7 +26,7 @@ def losses_grid(frame: Rows) -> Grid:
     return Grid([*head, "With clouds"] if has_clouds else head, rows)
 
 
-def losses_note(frame: Rows) -> str:
+def losses_note(frame: pd.DataFrame) -> str:
     """Describe the table of `losses_grid`, with the meaning of the loss criteria that occur."""
     occurring = ", ".join(frame.loc[~populations.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)).split(
         ", "

@@ -1,4 +1,7 @@
-"""Numbers of the paper, and the campaigns that repeat its runs."""
+"""Numbers of the paper, and the campaigns that repeat its runs.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from collections.abc import Mapping
 from pathlib import Path

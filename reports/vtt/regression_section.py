@@ -1,4 +1,7 @@
-"""Section on the regression runs of the paper."""
+"""Section on the regression runs of the paper.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 import numpy as np
 import pandas as pd

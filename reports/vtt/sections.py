@@ -8,9 +8,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from marsyard.reports import rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import paper_section
 from marsyard.reports.section import Block, Grid, Section, Subject
@@ -23,7 +23,7 @@ from marsyard.reports.vtt.updates_section import updates_section
 from marsyard.reports.wording import note_text
 
 
-def table_4_grid(frame: Rows, legs: Sequence[Mapping[str, Any]]) -> Grid:
+def table_4_grid(frame: pd.DataFrame, legs: Sequence[Mapping[str, Any]]) -> Grid:
     """Create Table IV: tracking updates and minutes of each operational mode; `legs` are the legs of the drive.
 
     The minutes of a mode end at its last update, and start at the end of the previous mode.

@@ -10,7 +10,6 @@ from typing import Any
 import pandas as pd
 
 from marsyard.reports import rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.plots import RateLine, rate_figure
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid, svg_figure
@@ -114,7 +113,7 @@ def step_rates(subject: Subject) -> list[dict[str, Any]]:
     return cells
 
 
-def _group_by_line(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
+def _group_by_line(frame: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
     """Group rows by the column that varies (`_LINE_COLUMNS`); a single line without name if no column varies."""
     column = next((name for name in _LINE_COLUMNS if name in frame and frame[name].nunique() > 1), None)
     if column is None:
@@ -126,7 +125,7 @@ def _group_by_line(frame: Rows) -> Iterator[tuple[str, pd.DataFrame]]:
         yield name, frame[frame[column].eq(value)]
 
 
-def _obliquity_grid(frame: Rows, unit: str) -> Grid | None:
+def _obliquity_grid(frame: pd.DataFrame, unit: str) -> Grid | None:
     """Create a table of tracked targets by maximum obliquity and step size; None if rows contain no obliquities.
 
     Trackers have separate rows; search windows are pooled.

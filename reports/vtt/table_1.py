@@ -1,10 +1,14 @@
-"""Section on Table I of the paper: printed and measured accuracy of tracking."""
+"""Section on Table I of the paper: printed and measured accuracy of tracking.
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from marsyard.algorithms.vtt.accuracy import (
     GOAL_M,
@@ -15,7 +19,6 @@ from marsyard.algorithms.vtt.accuracy import (
     tracked_approach_error_m,
 )
 from marsyard.reports import rates
-from marsyard.reports.blocks import Rows
 from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import read_paper
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
@@ -81,7 +84,7 @@ def table_1_section(subject: Subject) -> Section | None:
     )
 
 
-def measured_accuracy(frame: Rows) -> list[dict[str, Any]]:
+def measured_accuracy(frame: pd.DataFrame) -> list[dict[str, Any]]:
     """Compute the 3-sigma errors (three times the root mean square) of the completed runs of each camera.
 
     untracked_cm: error without tracking, computed by Eq. 3 from the errors of designation and pose

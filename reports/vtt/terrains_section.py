@@ -1,4 +1,7 @@
-"""Section on tracking on four kinds of ground (Table II)."""
+"""Section on tracking on four kinds of ground (Table II).
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 from collections import Counter
 

@@ -1,4 +1,7 @@
-"""Section on the updates of a tracking case (Table III)."""
+"""Section on the updates of a tracking case (Table III).
+
+The paper is Kim et al., "Targeted Driving Using Visual Tracking".
+"""
 
 import re
 
