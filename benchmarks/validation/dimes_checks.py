@@ -108,7 +108,7 @@ CHECKS = (
                 site=("gusev",),
                 camera=("mer-descent-flown",),
                 sun_elevation_deg=(30.0, 60.0),
-                slope_deg=(1.7, 1.7),
+                slope_deg=(1.55, 1.55),
                 optical_depth=(0.9, 0.9),
                 range_m=(1400.0, 2100.0),
             ),

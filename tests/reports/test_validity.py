@@ -14,13 +14,15 @@ from marsyard.reports.campaign import write_report
 from marsyard.reports.evaluation import evaluate_run
 from marsyard.reports.report_file import read_report
 from marsyard.reports.validation_rows import Conditions, RowKind, ValidationRow, read_checks
+from marsyard.sim.terrain import sites
 from tests.command import marsyard
 from tests.reports.synthetic_run import MakeRun, make_rows
 
+_SLOPE_DEG = sites()["gusev"].terrain("descent").rms_slope_deg
 #: A met verification, a met comparison with fitted data, and a missed comparison with other data.
 CHECKED = Conditions(
     systems=("dimes",), site=("gusev",), camera=("mer-descent-flown",), sun_elevation_deg=(30.0, 45.0),
-    slope_deg=(1.7, 1.7), optical_depth=(0.9, 0.9), range_m=(1900.0, 2100.0),
+    slope_deg=(_SLOPE_DEG, _SLOPE_DEG), optical_depth=(0.9, 0.9), range_m=(1900.0, 2100.0),
 )  # fmt: skip
 VERIFIED = ValidationRow("ranges", 1.0, "px", 2.0, "at most", "rays", CHECKED)
 FITTED = replace(
