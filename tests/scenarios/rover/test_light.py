@@ -79,7 +79,9 @@ def test_head_shadow_is_at_the_sun_ray_intersection(elevation_deg: float) -> Non
         patch = sample_template(head, position, 0.002)
         return rover_shades_patch(ROCKY_8, stance, RESEARCH_MAST, (0.0, 0.0), patch, sun)
 
-    assert is_shaded(0.0, 0.0)
+    # the boxes of both cameras, 0.3 m apart
+    assert is_shaded(0.0, -0.15)
+    assert is_shaded(0.0, 0.15)
     # The head is at most half a metre wide. The ground 0.6 m ahead or to the side is sunlit.
     assert not is_shaded(0.6, 0.0)
     assert not is_shaded(0.0, 0.6)
