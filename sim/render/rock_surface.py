@@ -28,8 +28,8 @@ FRACTURE_CELL, FRACTURE_WIDTH, FRACTURE_LOG_ALBEDO = 0.6, 0.016, -0.4
 #: of the normal (assumed): dust reaches further down in some directions.
 MARGIN_CELL, MARGIN = 0.25, 0.5
 #: Angles between a rock's face and the horizontal, radians, up to which dust stays on it (about the angle of repose),
-#: and from which it is bare: a thin, cohesive film stays on steep faces (assumed; the second with a view to the darkest
-#: parts of mast images).
+#: and from which it is bare: a thin, cohesive film stays on steep faces (the first assumed, the second fitted to the
+#: darkest parts of mast images).
 MAX_DUSTY_TILT, MIN_BARE_TILT = math.radians(30.0), math.radians(115.0)
 #: Texture of other objects, such as rovers, as a fraction of that of rocks: slight wear (assumed).
 WEAR = 0.15
