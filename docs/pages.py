@@ -20,8 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.error_sources import error_sources
-from marsyard.scenarios.measured.image_table import COLUMNS
-from marsyard.scenarios.measured.layout import IngestFile
+from marsyard.scenarios.measured.layout import COLUMNS, IngestFile
 from marsyard.scenarios.systems import catalogue, scenario, scenario_names
 from marsyard.sim.parameters import list_alternatives, list_models
 

@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from typing import Any
 
 from marsyard.scenarios import views
-from marsyard.scenarios.terrain_model_sites import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
+from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, check_site_name, is_terrain_file, load_site
 from marsyard.sim import sensor
 from marsyard.sim.terrain import Site, sites
 

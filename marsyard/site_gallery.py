@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from marsyard.image_request import ImageRequest
 from marsyard.reports.page_environment import page_environment
-from marsyard.scenarios.terrain_model_sites import SUFFIXES, is_terrain_file, load_site
+from marsyard.scenarios.terrain_files import SUFFIXES, is_terrain_file, load_site
 from marsyard.site_images import render_images
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]

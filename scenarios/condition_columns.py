@@ -1,8 +1,10 @@
-"""Values of the condition columns that several scenarios have: sun, contrast and attitude.
+"""Values of the columns that several scenarios have: sun, contrast, attitude, and provenance of images.
 
 `marsyard.scenarios.common_columns` declares the columns.
 """
 
+import hashlib
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import cv2
@@ -11,6 +13,9 @@ from jaxtyping import Float, Float64, UInt16
 
 from marsyard.scenarios.interface import Scalar
 from marsyard.sim.dynamics import State
+from marsyard.sim.kernel_cache import processor_features
+from marsyard.sim.render import process_renderer
+from marsyard.sim.render.backend import Backend
 from marsyard.sim.sensor import DetectorParameters
 
 #: Side of the image of which the local contrast is computed, pixels, as in DIMES; and side of its blocks.
@@ -66,3 +71,18 @@ def off_nadir_deg(state: State) -> float:
 def attitude_rate_deg_s(state: State) -> float:
     """Return the magnitude of the body rate."""
     return float(np.degrees(np.linalg.norm(state.body_rate_rad_s)))
+
+
+def hash_images(images: Iterable[UInt16[np.ndarray, "rows columns"]]) -> str:
+    """Compute the SHA-256 of the counts of images."""
+    return hashlib.sha256(b"".join(counts.tobytes() for counts in images)).hexdigest()
+
+
+def image_columns(backend: Backend, image_hash: str) -> dict[str, Scalar]:
+    """Return the provenance columns of images rendered by a backend."""
+    return {
+        "image_hash": image_hash,
+        "gl_backend": backend,
+        "gl_version": process_renderer(backend).description(),
+        "processor_features": processor_features(),
+    }

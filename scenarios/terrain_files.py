@@ -8,6 +8,7 @@ must have heights and cell sizes in metres.
 import os
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,11 +16,11 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator
 
-from marsyard.scenarios.map_projection import NoInverseError, map_scale
 from marsyard.scenarios.missing_heights import find_missing_value
 from marsyard.sim.files import check_regular, read_npz_headers, report_damage
-from marsyard.sim.terrain import TerrainParameters, sites
+from marsyard.sim.terrain import Site, TerrainParameters, site, sites
 from marsyard.sim.terrain.geotiff import brightness_problems, read_heights
+from marsyard.sim.terrain.imported import choose_grid
 from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, check_holes, read_rasters
 
 #: Maximum number of DTM posts along a side (size of the largest terrain), and of orthoimage pixels (memory).
@@ -33,6 +34,14 @@ _METRE_UNITS = ("", "m", "metre", "metres", "meter", "meters")
 _NO_GEOTIFF = "is not a valid GeoTIFF"
 #: Arrays of an .npz archive and their dimensions.
 _ARRAYS = {"dem": 2, "dem_gsd": 0, "ortho": 2, "ortho_gsd": 0, "ortho_valid": 2}
+#: Distance from a pole, in cells, below which the direction of true north is undefined.
+_POLE_CELLS = 2.0
+#: File suffixes of terrain models.
+SUFFIXES = (".npz", ".tif", ".tiff", ".img", ".cub")
+#: Preset that supplies light, air, scattering and fine texture for imported ground.
+LIGHT_PRESET = "gusev"
+#: Default maximum fraction of posts without height in a terrain model.
+MAX_HOLE_FRACTION = float(RealTerrain.model_fields["max_hole_fraction"].default)
 
 
 def _check_terrain(terrain: TerrainParameters) -> TerrainParameters:
@@ -235,3 +244,109 @@ def _check_values(path: Path, values: np.ndarray, posting_m: float, source: Real
             f"{path}: the height {missing.height_m:.10g} m at {missing.posts} of {values.size} posts is probably a "
             f"value for missing data: it is repeated exactly, with cliffs at its border; {advice}"
         )
+
+
+@dataclass(frozen=True)
+class MapScale:
+    """Scale of a map projection at a point.
+
+    - min_ratio, max_ratio: extreme ratios of map lengths to ground lengths over all directions: the singular
+      values of the projection's derivative (Snyder 1987, Map Projections: A Working Manual, section 4)
+    - grid_north_deg: grid convergence: azimuth of the columns' upward direction, clockwise from true north, -180 to
+      180; None at a pole
+    """
+
+    min_ratio: float
+    max_ratio: float
+    grid_north_deg: float | None
+
+
+class NoInverseError(Exception):
+    """PROJ cannot compute the ground position of a point of a map projection."""
+
+
+def map_scale(file: Any) -> MapScale | None:
+    """Compute the scale of a rasterio dataset's projection at its centre; None if its terms are unknown.
+
+    Raises NoInverseError for a projection without inverse.
+    """
+    from rasterio._err import CPLE_BaseError  # GDAL's errors, which are no RasterioError
+    from rasterio.crs import CRS
+    from rasterio.errors import RasterioError
+    from rasterio.warp import transform
+
+    cell = file.transform
+    x, y = cell.c + 0.5 * file.width * cell.a, cell.f + 0.5 * file.height * cell.e
+    # central differences of positions in body-fixed axes, which have no singularity at the poles; the step is large
+    # compared with rounding and small compared with the curvature of the projection
+    step = max(abs(cell.a), 1.0)
+    xs, ys = [x - step, x + step, x, x], [y, y, y - step, y + step]
+    try:
+        terms, unit_m = file.crs.to_dict(), float(file.crs.linear_units_factor[1])
+        body = {name: terms[name] for name in ("a", "b", "R", "ellps", "datum", "rf") if name in terms}
+        body_fixed = CRS.from_dict({"proj": "geocent", **body, "units": "m", "no_defs": True})
+        positions = np.array(transform(file.crs, body_fixed, xs, ys, [0.0] * 4), dtype=np.float64).T
+    except (RasterioError, ValueError):
+        return None
+    except CPLE_BaseError as error:
+        raise NoInverseError(str(error)) from error
+    # derivatives of the ground position with respect to the map's x and y
+    length = 2.0 * step * unit_m
+    tangent_x, tangent_y = (positions[1] - positions[0]) / length, (positions[3] - positions[2]) / length
+    # the eigenvalues of the Gram matrix are the squared extreme ratios
+    gram = np.array([[tangent_x @ tangent_x, tangent_x @ tangent_y], [tangent_x @ tangent_y, tangent_y @ tangent_y]])
+    if not np.all(np.isfinite(gram)) or np.linalg.det(gram) <= 0.0:
+        return None
+    ground_ratios = np.sqrt(np.linalg.eigvalsh(gram))
+    azimuth_deg = None
+    if float(np.hypot(*positions.mean(axis=0)[:2])) >= _POLE_CELLS * abs(cell.a) * unit_m:
+        normal = np.cross(tangent_x, tangent_y)
+        normal = normal / max(float(np.linalg.norm(normal)), 1e-300)
+        true_east = np.cross([0.0, 0.0, 1.0], normal)
+        true_north = np.cross(normal, true_east)
+        azimuth_deg = float(np.degrees(np.arctan2(tangent_y @ true_east, tangent_y @ true_north)))
+    return MapScale(1.0 / float(ground_ratios[1]), 1.0 / float(ground_ratios[0]), azimuth_deg)
+
+
+def is_terrain_file(name: str) -> bool:
+    """Return whether a name is the file of a terrain model, not a site."""
+    return Path(name).suffix.lower() in SUFFIXES
+
+
+def check_site_name(name: str) -> None:
+    """Raise TerrainFileError if a name that is no terrain model is the name of a file, not of a site."""
+    path = Path(name)
+    if name not in sites() and (path.suffix or len(path.parts) > 1 or path.is_file()):
+        raise TerrainFileError(
+            f"{name}: is not a terrain model; allowed: {', '.join(SUFFIXES)} (GeoTIFF, PDS3 or ISIS products, "
+            f"arrays); convert other rasters with rio convert {path.name} {path.stem}.tif"
+        )
+
+
+def load_site(name: str, max_hole_fraction: float = MAX_HOLE_FRACTION) -> Site:
+    """Return a preset by name, or a terrain model's file as a site: one terrain at both scales, no rocks or craters.
+
+    Raises ValueError, or TerrainFileError.
+    """
+    if not is_terrain_file(name):
+        check_site_name(name)
+        return site(name)
+    path = Path(name)
+    source = RealTerrain(dtm=path, max_hole_fraction=max_hole_fraction)
+    check_source(source)
+    return _import_site(source, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _import_site(source: RealTerrain, _modified_ns: int) -> Site:
+    """Create the site of a terrain model; the modification time is a key of the cache."""
+    samples, spacing_m = choose_grid(source)
+    terrain = TerrainParameters(samples=samples, spacing_m=spacing_m, craters_per_km2=0.0, source=source)
+    changes = {
+        "name": source.dtm.name,
+        "description": f"terrain model {source.dtm} with the light of {LIGHT_PRESET}",
+        "descent": terrain,
+        "ground": terrain,
+        "hills": (),
+    }
+    return site(LIGHT_PRESET).model_copy(update=changes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -101,6 +102,23 @@ class SiteGround:
             if air.optical_depth == 0.0 or air.single_scattering_albedo == 0.0 or air.asymmetry < 0.0
             else DustySky(air.optical_depth, air.single_scattering_albedo, air.asymmetry),
         )
+
+
+def load_ground(site: Site, terrain: TerrainParameters, seed: int, number: int) -> SiteGround:
+    """Return `SiteGround.from_bank`; a process keeps the last four (12 MB each on a small terrain)."""
+    source = terrain.source
+    paths = () if source is None else (source.dtm, source.ortho)
+    return _load_ground(
+        site, terrain, seed, number, tuple(path.stat().st_mtime_ns for path in paths if path is not None)
+    )
+
+
+@lru_cache(maxsize=4)
+def _load_ground(
+    site: Site, terrain: TerrainParameters, seed: int, number: int, _modified_ns: tuple[int, ...]
+) -> SiteGround:
+    """Load a ground; the modification times of its files are a key of the cache, so that changed files are read."""
+    return SiteGround.from_bank(site, terrain, seed, number)
 
 
 @dataclass(frozen=True)

@@ -67,8 +67,7 @@ def stats(
     """
     import numpy as np
 
-    from marsyard.scenarios.terrain_files import grid_north_deg
-    from marsyard.scenarios.terrain_model_sites import MAX_HOLE_FRACTION, load_site
+    from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site
     from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
     from marsyard.sim.terrain.published_sites import PUBLISHED_SITES

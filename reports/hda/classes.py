@@ -18,7 +18,7 @@ from marsyard.reports.plots import RateLine, draw_rates
 from marsyard.reports.rates import CONFIDENCE, PooledRate, pooled_rate, rate_text
 from marsyard.reports.section import Block, Grid, build_grid
 from marsyard.reports.wording import format_fraction
-from marsyard.scenarios.landing.map_errors import CLASS_BOUNDS, CLASS_NAMES
+from marsyard.scenarios.landing.score import CLASS_BOUNDS, CLASS_NAMES
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.vtt.losses import losses_grid, losses_note
 from marsyard.reports.vtt.run_selection import is_closed_loop, selectable_targets
 from marsyard.reports.wording import format_fraction
-from marsyard.scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover.run_state import RunOutcome
 
 #: Maximum position error for the instrument placement (section 4.2), metres, and required quantile of the runs.
 MAX_ERROR_M, QUANTILE = 0.03, 0.99

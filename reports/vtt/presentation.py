@@ -14,7 +14,7 @@ from marsyard.reports.vtt.goal import goal_section
 from marsyard.reports.vtt.sections import SECTIONS
 from marsyard.reports.vtt.updates_section import DEFINITIONS
 from marsyard.reports.wording import NOTHING, label, number, percent
-from marsyard.scenarios.rover.stops import RunOutcome
+from marsyard.scenarios.rover.run_state import RunOutcome
 
 #: Maximum number of stops with images on the page.
 _MAX_STOPS = 8

@@ -12,10 +12,9 @@ from pydantic import BaseModel
 from marsyard.algorithms.dimes import DimesDetails
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun
-from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.case_evaluation import Score, evaluate_case
-from marsyard.scenarios.condition_columns import contrast_columns
-from marsyard.scenarios.descent.conditions import conditions, instrument_errors
+from marsyard.scenarios.condition_columns import contrast_columns, hash_images, image_columns
+from marsyard.scenarios.descent.conditions import conditions, instrument_errors, overlap_row
 from marsyard.scenarios.descent.faults import add_terrain_fault
 from marsyard.scenarios.descent.flight import create_flight, gravity_m_s2, states_at_images
 from marsyard.scenarios.descent.images import camera_optics, take_exposures
@@ -24,14 +23,15 @@ from marsyard.scenarios.descent.simulation import Descent, draw_detector
 from marsyard.scenarios.descent.timeline import descent_timeline
 from marsyard.scenarios.descent.touchdown import compute_touchdown, propagate_to_firing
 from marsyard.scenarios.descent.world import DescentWorld
-from marsyard.scenarios.image_provenance import hash_images, image_columns
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.parts.named import DYNAMICS, INSTRUMENT, SCORE, PartKind
 from marsyard.scenarios.parts.scores import ScoredDescent
-from marsyard.scenarios.velocity import VELOCITY, run_estimator
-from marsyard.scenarios.velocity_columns import (
+from marsyard.scenarios.terrain_scenario import TerrainScenario
+from marsyard.scenarios.velocity import (
+    VELOCITY,
     consistency_row,
+    run_estimator,
     stream_products,
     stream_row,
     velocity_products,
@@ -84,7 +84,7 @@ class DescentScenario(TerrainScenario[DescentScenarioParameters]):
         p = self.check_parameters(parameters)
         descent = Descent.simulate(p, streams)
         shared = {
-            **descent.overlap,
+            **overlap_row(p, descent.world, descent.states),
             **conditions(p, descent.world, descent.states, descent.at_firing, descent.instruments),
             **contrast_columns(descent.images[0], p.detector),
             **instrument_errors(descent.world, descent.states, descent.measurements),

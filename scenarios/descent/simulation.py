@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,11 +11,9 @@ from marsyard.scenarios.case_faults import Images, add_detector_faults, corrupt_
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, states_at_images, true_velocity
 from marsyard.scenarios.descent.images import camera_optics, take_exposures
 from marsyard.scenarios.descent.measurement import DescentInstruments, add_increments, measure, measure_exactly
-from marsyard.scenarios.descent.overlap import overlap_row
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
-from marsyard.scenarios.interface import Scalar
-from marsyard.scenarios.velocity_columns import Horizontal, Span
+from marsyard.scenarios.velocity import Horizontal, Span
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements
 from marsyard.sim.sensor import Detector
@@ -34,7 +32,6 @@ class Descent:
 
     - p: parameters of the case
     - states, images: true states at the images, and the delivered images
-    - overlap: columns of `overlap_row`, empty if there are fewer than three images
     """
 
     p: DescentScenarioParameters
@@ -45,7 +42,6 @@ class Descent:
     states: Sequence[State]
     images: Images
     measurements: DescentMeasurements
-    overlap: Mapping[str, Scalar]
 
     @classmethod
     def simulate(cls, p: DescentScenarioParameters, streams: Streams) -> Descent:
@@ -63,11 +59,7 @@ class Descent:
         else:
             measurements = measure(p, world, flight.motion, images, detector, instruments, streams)
         measurements = add_increments(measurements, p, flight, streams)
-        overlap: Mapping[str, Scalar] = {}
-        if p.triple_indices is not None:
-            triple = [states[index] for index in p.triple_indices]
-            overlap = overlap_row(triple, world, optics.camera)
-        return cls(p, streams, world, flight, instruments, states, images, measurements, overlap)
+        return cls(p, streams, world, flight, instruments, states, images, measurements)
 
     @cached_property
     def at_firing(self) -> State:

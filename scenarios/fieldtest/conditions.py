@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from marsyard.scenarios import condition_columns
-from marsyard.scenarios.fieldtest.flown_run import FlownRun
-from marsyard.scenarios.fieldtest.imaging import sun_at
-from marsyard.scenarios.fieldtest.measurement import TripleCase
+from marsyard.scenarios.fieldtest.flight import FlownRun
+from marsyard.scenarios.fieldtest.images import sun_at
+from marsyard.scenarios.fieldtest.measurements import TripleCase
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.triples import Category
 from marsyard.scenarios.interface import Scalar

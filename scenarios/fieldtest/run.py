@@ -1,22 +1,18 @@
-"""Simulate and process a run of the field test: flight, attitudes, altitudes and triples (paper, III.D and IV).
-
-The paper is Johnson et al., "Field Testing of the MER DIMES".
-"""
+"""Simulation and processing of a run (paper: Johnson et al., "Field Testing of the MER DIMES")."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.base import LoadGround
-from marsyard.scenarios.fieldtest import imaging
-from marsyard.scenarios.fieldtest.attitude import solve_attitude
-from marsyard.scenarios.fieldtest.elevation_model import simulate_elevation_model
-from marsyard.scenarios.fieldtest.flown_run import FlownRun, RunKey, field_camera
-from marsyard.scenarios.fieldtest.gyros import EarthRotation, InertialTrajectory, add_thermal_drift
-from marsyard.scenarios.fieldtest.target_detection import detect_targets
-from marsyard.scenarios.fieldtest.targets import Sightings, Targets, project_targets
+from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory, add_thermal_drift, solve_attitude
+from marsyard.scenarios.fieldtest.flight import FlownRun, RunKey, field_camera
+from marsyard.scenarios.fieldtest.images import build_start_scene, run_ground, take_image
+from marsyard.scenarios.fieldtest.parameters import ElevationParameters
+from marsyard.scenarios.fieldtest.targets import Sightings, Targets, detect_targets, project_targets
 from marsyard.scenarios.fieldtest.triples import ImageMeasurements, Triple, draw_triples
 from marsyard.scenarios.views import SiteGround
 from marsyard.sim.dynamics import Motion
@@ -26,8 +22,10 @@ from marsyard.sim.sensor.gps import Gps
 from marsyard.sim.sensor.imu import DEG_H, Imu
 from marsyard.sim.sensor.inertial import InertialSolution
 from marsyard.sim.sensor.instrument import Clock
-from marsyard.sim.terrain import site
+from marsyard.sim.terrain import Surface, site
 
+#: Margin of the elevation model around the requested points, posts.
+_MARGIN_POSTS = 2
 #: Number of points on the flight line whose mean ground height is the reference of the flight's heights.
 _GROUND_POINTS = 256
 #: Rays along each side of a pixel at the edges of the targets.
@@ -36,6 +34,26 @@ _TARGET_EDGE_RAYS = 4
 _MIN_SIGHTINGS = 3
 #: Spacing of the mesh at the centre of the scene, in samples of the terrain; it increases outwards.
 _MESH_SAMPLES = 0.67
+
+
+def simulate_elevation_model(
+    p: ElevationParameters, surface: Surface, points_m: Float64[np.ndarray, "n 2"], rng: np.random.Generator
+) -> RegularGridInterpolator:
+    """Simulate an elevation model of the ground around points; heights are linear between posts (paper, III.D.1).
+
+    The height of a post is the mean height of its cell plus a correlated error.
+    """
+    x, y = (
+        p.posting_m * np.arange(np.floor(low) - _MARGIN_POSTS, np.ceil(high) + _MARGIN_POSTS + 1.0)
+        for low, high in zip(points_m.min(axis=0) / p.posting_m, points_m.max(axis=0) / p.posting_m, strict=True)
+    )
+    level = int(np.clip(np.rint(np.log2(p.posting_m / surface.spacing_m)), 0, len(surface.levels) - 1))
+    ground = surface.height(*np.meshgrid(x, y, indexing="ij"), level)
+    sigma = p.correlation_m / p.posting_m
+    error = gaussian_filter(rng.standard_normal(ground.shape), sigma, mode="wrap")
+    # Gaussian smoothing reduces the variance of white noise to the fraction 1 / (4 pi sigma**2)
+    error *= p.error_m * np.sqrt(4.0 * np.pi) * sigma
+    return RegularGridInterpolator((x, y), ground + error)
 
 
 @dataclass(frozen=True)
@@ -56,10 +74,10 @@ class FieldRun:
     triples: tuple[Triple, ...]
 
 
-def simulate_run(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> FieldRun:
+def simulate_run(key: RunKey) -> FieldRun:
     """Simulate and process a run; the result depends only on the key."""
     p, run, generator = key.field_test, key.parameters, key.generator
-    ground = imaging.run_ground(key, load_ground)
+    ground = run_ground(key)
     surface = ground.surface
     # flight line with random position and azimuth; heights refer to the mean ground below it
     rng = generator("flight")
@@ -142,7 +160,7 @@ def render_and_detect_targets(
 ) -> list[Float64[np.ndarray, "targets 2"]]:
     """Render the images of a pass over the targets and detect the targets in them; see `detect_targets`."""
     p, key = run.key.field_test, run.key
-    scene = imaging.build_start_scene(run, ground, p.helicopter.fly_over_m)
+    scene = build_start_scene(run, ground, p.helicopter.fly_over_m)
     objects = Objects.join([scene.objects, targets.panels(p.targets.albedo)])
     # more rays at edges than for rocks, because a side of a target is 2 pixels; at the targets, mesh lines are at most
     # one terrain sample apart, because coarser ground would hide some of the targets
@@ -154,6 +172,6 @@ def render_and_detect_targets(
     prior = Rotation.from_rotvec(prior_error) * Rotation.from_euler("z", 0.5 * np.pi - run.flight.azimuth_rad)
     centroids = []
     for time, position in zip(times_s.tolist(), gps_m, strict=True):
-        image, _ = imaging.take_image(run, scene, ground, run.flight.state(time), detector, noise)
+        image, _ = take_image(run, scene, ground, run.flight.state(time), detector, noise)
         centroids.append(detect_targets(image, targets, camera, position, prior, np.radians(p.targets.prior_deg)))
     return centroids

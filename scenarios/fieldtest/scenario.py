@@ -10,21 +10,20 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.fieldtest.case_order import find_triple
+from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.fieldtest.conditions import cloud_columns, triple_columns
-from marsyard.scenarios.fieldtest.flown_run import RunKey
-from marsyard.scenarios.fieldtest.imaging import build_start_scene, run_ground, take_image
-from marsyard.scenarios.fieldtest.measurement import TripleCase, measure, truth_velocities
+from marsyard.scenarios.fieldtest.flight import RunKey
+from marsyard.scenarios.fieldtest.images import build_start_scene, run_ground, take_image
+from marsyard.scenarios.fieldtest.measurements import TripleCase, measure, truth_velocities
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
 from marsyard.scenarios.fieldtest.run import simulate_run
 from marsyard.scenarios.fieldtest.timeline import triple_timeline
-from marsyard.scenarios.image_provenance import hash_images, image_columns
+from marsyard.scenarios.fieldtest.triples import find_triple
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.parts.scores import ScoredFlight
-from marsyard.scenarios.velocity import VELOCITY, check_last_interval
-from marsyard.scenarios.velocity_columns import consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.terrain_scenario import TerrainScenario
+from marsyard.scenarios.velocity import VELOCITY, check_last_interval, consistency_row, velocity_products, velocity_row
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
 
@@ -38,13 +37,11 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
     name = "fieldtest"
     parameters_type = FieldTestParameters
     task = VELOCITY
-    max_cached_grounds = 3
 
     def __init__(self) -> None:
-        super().__init__()
-        self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(lambda key: simulate_run(key, self.load_ground))
+        self._simulate_run = lru_cache(maxsize=_CACHED_RUNS)(simulate_run)
         self._start_scene = lru_cache(maxsize=_CACHED_SCENES)(
-            lambda key: build_start_scene(self._simulate_run(key).flown, run_ground(key, self.load_ground))
+            lambda key: build_start_scene(self._simulate_run(key).flown, run_ground(key))
         )
 
     def shared_inputs(self, parameters: BaseModel) -> tuple[int, ...]:
@@ -66,7 +63,7 @@ class FieldTestScenario(TerrainScenario[FieldTestParameters]):
         p = self.check_parameters(parameters)
         number, index = find_triple(p, streams.case)
         key = RunKey(p, number, streams.seed, streams.campaign)
-        run, ground = self._simulate_run(key), run_ground(key, self.load_ground)
+        run, ground = self._simulate_run(key), run_ground(key)
         triple = run.triples[index]
         times_s = run.truth.times_s[list(triple.image_indices)].tolist()
         first, second, third = map(run.flown.flight.state, times_s)

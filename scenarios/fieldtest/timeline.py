@@ -8,8 +8,8 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.scenarios.cameras import camera_optics
-from marsyard.scenarios.fieldtest.flown_run import field_camera
-from marsyard.scenarios.fieldtest.imaging import sun_at
+from marsyard.scenarios.fieldtest.flight import field_camera
+from marsyard.scenarios.fieldtest.images import sun_at
 from marsyard.scenarios.fieldtest.run import FieldRun
 from marsyard.scenarios.timeline import Timeline
 from marsyard.scenarios.timeline_surface import surface_from_above

@@ -9,8 +9,8 @@ from marsyard.scenarios.condition_columns import contrast_columns, sun_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.flight import LandingFlight
 from marsyard.scenarios.landing.ground_truth import GroundTruth
-from marsyard.scenarios.landing.motion_columns import true_motion
-from marsyard.scenarios.landing.rendered_flight import RenderedFlight
+from marsyard.scenarios.landing.score import true_motion
+from marsyard.scenarios.landing.simulation import RenderedFlight
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor import height_above_ground
 

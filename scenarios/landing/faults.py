@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from marsyard.scenarios.case_faults import SizedFaults
-from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
 from marsyard.sim.error_sources import DETECTOR
 from marsyard.sim.parameters import bounded_field
 from marsyard.sim.sensor.rtk import Outage

@@ -12,7 +12,7 @@ from marsyard.algorithms.hda import HdaOptions
 from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.cameras import CalibrationParameters
 from marsyard.scenarios.landing.faults import LandingFaults
-from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters
 from marsyard.scenarios.landing.relief import Limits
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.meshes import MeshParameters

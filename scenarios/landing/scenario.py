@@ -9,22 +9,20 @@ from pydantic import BaseModel
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.image_provenance import hash_images, image_columns
+from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.image_samples import ImageSample, pixel_sample, select_middle_rows
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.landing import score
 from marsyard.scenarios.landing.conditions import conditions
-from marsyard.scenarios.landing.measurement import measure
-from marsyard.scenarios.landing.motion_columns import motion_row, times_row
+from marsyard.scenarios.landing.figures import case_products, landing_timeline
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
-from marsyard.scenarios.landing.products import case_products
-from marsyard.scenarios.landing.rendered_flight import RenderedFlight
-from marsyard.scenarios.landing.timeline import landing_timeline
+from marsyard.scenarios.landing.score import motion_row, times_row
+from marsyard.scenarios.landing.simulation import RenderedFlight, measure
 from marsyard.scenarios.landing.touchdown import simulate_touchdown
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding
+from marsyard.scenarios.terrain_scenario import TerrainScenario
 from marsyard.sim.streams import Streams
 
 
@@ -34,11 +32,10 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     name = "landing"
     parameters_type = LandingScenarioParameters
     task = LANDING
-    max_cached_grounds = 4
 
     def samples(self, parameters: BaseModel, streams: Streams) -> Iterator[ImageSample]:
         """Yield the two delivered images of a case with the ground truth of their pixels."""
-        case = RenderedFlight.simulate(self.check_parameters(parameters), streams, self.load_ground)
+        case = RenderedFlight.simulate(self.check_parameters(parameters), streams)
         p, pair = case.p, case.pair
         for frame, image, state in zip(pair.frames, pair.images, case.flight.states, strict=True):
             metadata: dict[str, Any] = {
@@ -55,7 +52,7 @@ class LandingScenario(TerrainScenario[LandingScenarioParameters]):
     def run(self, parameters: BaseModel, streams: Streams) -> CaseResult:
         """Simulate one case, run all algorithms, and score their answers and the resulting landings."""
         p = self.check_parameters(parameters)
-        case = RenderedFlight.simulate(p, streams, self.load_ground)
+        case = RenderedFlight.simulate(p, streams)
         flight, truth = case.flight, case.truth
         measurements = measure(p, flight, case.pair, streams)
         provenance = image_columns(p.render.backend, hash_images(case.pair.counts))

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.landing.faults import sun_elevation_with_shadow_deg
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.meshes import MeshParameters
 from marsyard.scenarios.radiance import SiteWorld, sun_at, sunlight_ratio
-from marsyard.scenarios.views import SiteGround
+from marsyard.scenarios.views import load_ground
 from marsyard.sim.terrain import site
 from marsyard.sim.terrain.sites import SiteTexture
 
@@ -23,9 +22,7 @@ class LandingWorld(SiteWorld):
     meshes: tuple[MeshParameters, ...] = ()
 
     @classmethod
-    def from_parameters(
-        cls, p: LandingScenarioParameters, load_ground: LoadGround = SiteGround.from_bank
-    ) -> LandingWorld:
+    def from_parameters(cls, p: LandingScenarioParameters) -> LandingWorld:
         """Create the world of a case."""
         # the site without the dust of the case, so that cases share the cached terrain
         ground = load_ground(site(p.site), p.terrain, p.location.bank_seed, p.location.terrain)

@@ -15,10 +15,9 @@ from numpy.random import Generator
 from scipy.interpolate import RectBivariateSpline
 
 from marsyard.algorithms.localisation.interface import MapProduct
-from marsyard.scenarios.localisation.fields import SmoothField
-from marsyard.scenarios.localisation.map_parameters import MapParameters
 from marsyard.scenarios.localisation.map_rendering import Coordinates, Grid, render_map, world_grid
-from marsyard.scenarios.localisation.map_truth import MapTruth
+from marsyard.scenarios.localisation.map_truth import MapTruth, SmoothField
+from marsyard.scenarios.localisation.parameters import MapParameters
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.sim.render.backend import Backend
 from marsyard.sim.terrain import Surface

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.localisation.map_parameters import MapParameters
 from marsyard.scenarios.localisation.map_truth import MapTruth
+from marsyard.scenarios.localisation.parameters import MapParameters
 from marsyard.scenarios.radiance import add_haze, sun_at
 from marsyard.scenarios.views import SiteGround, micro_relief
 from marsyard.sim.frames import rigid

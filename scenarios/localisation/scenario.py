@@ -9,18 +9,17 @@ from pydantic import BaseModel
 
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_on_measurements
-from marsyard.scenarios.base import TerrainScenario
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
-from marsyard.scenarios.image_provenance import hash_images, image_columns
+from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.scenarios.interface import CaseResult
 from marsyard.scenarios.localisation import score
+from marsyard.scenarios.localisation.figures import case_products, localisation_timeline
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
-from marsyard.scenarios.localisation.products import case_products
 from marsyard.scenarios.localisation.simulation import LocalisedDescent, map_terrain
 from marsyard.scenarios.localisation.task import LOCALISATION
-from marsyard.scenarios.localisation.timeline import localisation_timeline
 from marsyard.scenarios.parts.named import PartKind
 from marsyard.scenarios.streamed import StreamAnswers
+from marsyard.scenarios.terrain_scenario import TerrainScenario
 from marsyard.sim.render.renderer import return_freed_memory
 from marsyard.sim.streams import Streams
 

@@ -14,7 +14,6 @@ from marsyard.algorithms.dimes.binning import binned_size_for
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import lossy_bits_per_pixel, read_counts, read_flat_field, read_header
-from marsyard.scenarios.measured.image_table import ImageRow, read_table
 from marsyard.scenarios.measured.label_poses import describe_frame, is_mars_fixed, is_same_world, label_pose, world_from
 from marsyard.scenarios.measured.layout import (
     INGEST_FILE,
@@ -22,10 +21,12 @@ from marsyard.scenarios.measured.layout import (
     MAP,
     TABLE_FILE,
     VELOCITY,
+    ImageRow,
     IngestError,
     IngestFile,
     SunTable,
     read_ingest_file,
+    read_table,
 )
 from marsyard.scenarios.measured.map_matching import TOLERANCE_PX
 from marsyard.scenarios.measured.map_registration import add_map, describe_poses

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.measured.image_table import ImageRow
+from marsyard.scenarios.measured.layout import ImageRow
 from marsyard.sim.camera import CameraModel, FramedCamera, LabelFrame, Pds3Product
 from marsyard.sim.camera.label_frames import MARS_FIXED
 from marsyard.sim.frames import SITE_FROM_WORLD, rigid, world_from_mars_fixed

@@ -1,5 +1,6 @@
 """Estimation of landing sites from recorded images of the ground."""
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Annotated
@@ -7,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, Field
-from scipy.spatial.transform import RigidTransform
+from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.answers import check_site
 from marsyard.algorithms.hda import HdaDetails, HdaOptions, hda_products
@@ -19,13 +20,21 @@ from marsyard.scenarios.hda_stage_columns import motion_errors, stage_row
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance
-from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
-from marsyard.scenarios.measured.measurements import body_pose, landing_measurements
+from marsyard.scenarios.measured.matching import (
+    agreement_products,
+    agreement_row,
+    case_row,
+    compare_with_poses,
+    distance,
+    match_images,
+)
+from marsyard.scenarios.measured.store import MeasuredParameters
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredSite
+from marsyard.scenarios.typed_scenario import TypedScenario
 from marsyard.sim.camera import camera_pose
-from marsyard.sim.measurements import LandingMeasurements
+from marsyard.sim.frames import rigid
+from marsyard.sim.measurements import DetectorImage, LandingMeasurements, PoseMeasurement
 from marsyard.sim.streams import Streams
 
 
@@ -40,7 +49,7 @@ class MeasuredLandingParameters(AlgorithmSelection, CustomScores, MeasuredParame
     hda: Annotated[HdaOptions, Field(description="options of the hazard detection and avoidance")] = HdaOptions()
 
 
-class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
+class MeasuredLandingScenario(TypedScenario[MeasuredLandingParameters]):
     """Estimation of a landing site from two recorded images of the ground and their measured poses."""
 
     name = "measured-landing"
@@ -53,11 +62,11 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
         """Run one flight."""
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
-        measurements = landing_measurements(p.case, images)
+        measurements = _landing_measurements(p.case, images)
         pairs = compare_with_poses(images, match_images(images), [image.pose for image in p.case.images])
         true_poses = None
         if p.case.truth.poses is not None:
-            first, second = (body_pose(*pose) for pose in p.case.truth.poses)
+            first, second = (_body_pose(*pose) for pose in p.case.truth.poses)
             true_poses = first, second
         conditions: dict[str, Scalar] = {
             **case_row(p, images),
@@ -83,6 +92,23 @@ class MeasuredLandingScenario(MeasuredScenario[MeasuredLandingParameters]):
             return Score(is_converged, row, {**products, **agreement_products(images, pairs)}, scored)
 
         return evaluate_case(p, conditions, run, score)
+
+
+def _body_pose(position_m: store.Vector, xyzw: store.Quaternion) -> RigidTransform:
+    """Return the pose of a body in the world."""
+    return rigid(Rotation.from_quat(np.array(xyzw)), np.array(position_m))
+
+
+def _landing_measurements(case: store.StoredCase, images: tuple[DetectorImage, ...]) -> LandingMeasurements:
+    """Return the inputs of an estimator of landing sites."""
+    first, second = (PoseMeasurement(image.pose, image.time_s) for image in case.images)
+    return LandingMeasurements(
+        images=(images[0], images[1]),
+        poses=(first, second),
+        slant_range_m=math.nan if case.slant_range_m is None else case.slant_range_m,
+        up_body=case.images[0].attitude.inv().apply(np.array([0.0, 0.0, 1.0])),
+        apriori_site_world=np.array(case.site_m, dtype=np.float64),
+    )
 
 
 def _get_site(estimate: SiteEstimate | None) -> Float[np.ndarray, "3"] | None:

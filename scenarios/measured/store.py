@@ -1,16 +1,19 @@
-"""Write and read ingested cases: `cases.json`, and its images, cameras and flat fields with their hashes.
+"""Write and read ingested cases: `cases.json` with its images, cameras and flat fields, and select a case of it.
 
 World axes are east, north, up; attitudes are those of the body.
 """
+
+from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import Field, ValidationError, model_validator
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.exchange.files import read_counts
@@ -143,6 +146,31 @@ class CasesFile(UserFile):
     def stored(self) -> StoredCases:
         """The contents of the file."""
         return _load(self.file)[0]
+
+
+class MeasuredParameters(Parameters):
+    """Parameters of all tasks; subclasses define `task_name`, the required task of `cases.json`."""
+
+    task_name: ClassVar[TaskName]
+
+    cases: Annotated[CasesFile, Field(description="`cases.json` of `marsyard ingest`")]
+    number: Annotated[int, Field(ge=0, description="index of the case in the file; usually a grid over all cases")] = 0
+
+    @model_validator(mode="after")
+    def _check_case_and_task(self) -> MeasuredParameters:
+        stored = self.cases.stored
+        if self.number >= len(stored.cases):
+            raise ValueError(f"number is {self.number}; {self.cases.file} contains 0 to {len(stored.cases) - 1}")
+        if stored.task != self.task_name:
+            raise ValueError(
+                f"{self.cases.file}: its task is {stored.task}; the scenario measured-{stored.task} runs it"
+            )
+        return self
+
+    @property
+    def case(self) -> StoredCase:
+        """The case with this number."""
+        return self.cases.stored.cases[self.number]
 
 
 def _load(file: str) -> tuple[StoredCases, str]:

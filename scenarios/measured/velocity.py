@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from functools import partial
 from typing import Annotated
@@ -18,15 +19,28 @@ from marsyard.scenarios.algorithm_selection import AlgorithmSelection
 from marsyard.scenarios.case_evaluation import Runs, Score, evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.measured import store
-from marsyard.scenarios.measured.base import MeasuredParameters, MeasuredScenario, case_row, distance
-from marsyard.scenarios.measured.consistency import agreement_products, agreement_row, compare_with_poses, match_images
-from marsyard.scenarios.measured.measurements import descent_measurements
+from marsyard.scenarios.measured.matching import (
+    agreement_products,
+    agreement_row,
+    case_row,
+    compare_with_poses,
+    distance,
+    match_images,
+)
+from marsyard.scenarios.measured.store import MeasuredParameters
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.parts.scores import CustomScores, ScoredVelocity
-from marsyard.scenarios.velocity import VELOCITY, check_image_size, check_last_interval
-from marsyard.scenarios.velocity_columns import consistency_row, velocity_products, velocity_row
+from marsyard.scenarios.typed_scenario import TypedScenario
+from marsyard.scenarios.velocity import (
+    VELOCITY,
+    check_image_size,
+    check_last_interval,
+    consistency_row,
+    velocity_products,
+    velocity_row,
+)
 from marsyard.sim.frames import rigid
-from marsyard.sim.measurements import DescentMeasurements
+from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.streams import Streams
 
 NAN = float("nan")
@@ -49,7 +63,7 @@ class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParam
         return self
 
 
-class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
+class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
     """Velocity estimation from three recorded images of a descent and their measurements."""
 
     name = "measured-velocity"
@@ -62,7 +76,7 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
         """Run one descent."""
         p = self.check_parameters(parameters)
         images = store.load_images(p.cases, p.case)
-        measurements = descent_measurements(p.case, images)
+        measurements = _descent_measurements(p.case, images)
         matches = match_images(images)
         axes = [
             image.camera.transform(RigidTransform.from_rotation(attitude.world_from_body)).boresight()
@@ -110,6 +124,22 @@ class MeasuredVelocityScenario(MeasuredScenario[MeasuredVelocityParameters]):
             return Score(velocity is not None, row, {**products, **agreement_products(images, pairs)}, scored)
 
         return evaluate_case(p, conditions, run, score)
+
+
+def _descent_measurements(case: store.StoredCase, images: tuple[DetectorImage, ...]) -> DescentMeasurements:
+    """Return the inputs of a velocity estimator."""
+    attitudes, altitudes = [], []
+    for item in case.images:
+        attitudes.append(AttitudeMeasurement(item.attitude, item.time_s))
+        time_s = item.time_s if item.altitude_time_s is None else item.altitude_time_s
+        altitudes.append(AltitudeMeasurement(math.nan if item.altitude_m is None else item.altitude_m, time_s))
+    return DescentMeasurements(
+        images=images,
+        attitudes=tuple(attitudes),
+        altitudes=tuple(altitudes),
+        interval_velocities_m_s=np.array(case.interval_velocities_m_s, dtype=np.float64),
+        sun_direction=np.array(case.sun_direction, dtype=np.float64),
+    )
 
 
 def _get_velocity(estimate: VelocityEstimate | None) -> Float64[np.ndarray, "2"] | None:

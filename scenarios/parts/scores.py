@@ -102,7 +102,7 @@ class ScoredLanding(ScoredSite):
 class ScoredRun:
     """A tracker's answers at the stops of a rover's run.
 
-    - outcome: outcome of the run, a name of `marsyard.scenarios.rover.stops.RunOutcome`
+    - outcome: outcome of the run, a name of `marsyard.scenarios.rover.run_state.RunOutcome`
     - target_world: the designated point, world axes, metres
     - world_from_rover: true pose of the rover at each stop
     - point_px: true full-frame pixel (u, v) of the designated point in the left camera at each stop; NaN if the camera

@@ -1,5 +1,5 @@
 """Rover scenario: visual target tracking in a closed loop of driving and imaging.
 
-Reading order: `parameters`, `points`, `world`, `rig`, `vehicle`, `designation`, `stops`, `guides`, `closed_loop`,
+Reading order: `parameters`, `points`, `world`, `vehicle`, `designation`, `run_state`, `guides`, `closed_loop`,
 `score`. `scenario` runs a case; `shared_drive` tracks many targets over the images of one drive.
 """

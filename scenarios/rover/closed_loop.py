@@ -16,7 +16,6 @@ import numpy as np
 from marsyard.algorithms.navigation.planner import NavigationOutcome
 from marsyard.algorithms.navigation.visual_odometry import MotionEstimate, estimate_motion
 from marsyard.algorithms.vtt import GoalCriterion, HandOffOutcome, hand_off
-from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.designation import designate_from_start
 from marsyard.scenarios.rover.flight_software import (
     GOAL_TOLERANCE_M,
@@ -29,9 +28,7 @@ from marsyard.scenarios.rover.guides import Guide, TrackerGuide
 from marsyard.scenarios.rover.navigation_cameras import ODOMETRY_EDGE_RAYS, oracle_heights
 from marsyard.scenarios.rover.parameters import LegParameters, RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
-from marsyard.scenarios.rover.run_state import RoverRun, Setup, Step, is_stuck
-from marsyard.scenarios.rover.stops import RunOutcome, StopView
-from marsyard.scenarios.views import SiteGround
+from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome, Setup, Step, StopView, is_stuck
 from marsyard.sim.dynamics.driving import Drive
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import DriveCommand, StereoMeasurement
@@ -53,11 +50,9 @@ def run_case(p: RoverScenarioParameters, streams: Streams) -> RoverRun:
     return track_target(p, prepare_run(p, streams))
 
 
-def prepare_run(
-    p: RoverScenarioParameters, streams: Streams, load_ground: LoadGround = SiteGround.from_bank
-) -> RoverRun:
+def prepare_run(p: RoverScenarioParameters, streams: Streams) -> RoverRun:
     """Create a run at its start and designate its target; the tracker is not called."""
-    setup = Setup.draw(p, streams, load_ground)
+    setup = Setup.draw(p, streams)
     return RoverRun(setup, designate_from_start(p, setup.world, setup.rig, setup.vehicle.stance))
 
 

@@ -22,8 +22,7 @@ from marsyard.scenarios.isolation.remote import algorithm_time_s, is_remote
 from marsyard.scenarios.rover.designation import triangulate_point
 from marsyard.scenarios.rover.flight_software import TargetEstimate
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run_state import RoverRun
-from marsyard.scenarios.rover.stops import RunOutcome, Stop, StopView
+from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome, Stop, StopView
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.sim.frames import compose
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements

@@ -14,9 +14,8 @@ from scipy.spatial.transform import RigidTransform, Rotation
 from marsyard.algorithms.interface import PixelBox
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.points import build_shadow_caster
-from marsyard.scenarios.rover.rig import Rig
 from marsyard.scenarios.rover.stereo_camera import StereoCamera, cached_rays
-from marsyard.scenarios.rover.vehicle import Vehicle
+from marsyard.scenarios.rover.vehicle import Rig, Vehicle
 from marsyard.scenarios.rover.world import RunWorld
 from marsyard.scenarios.views import CAMERA_MOUNTINGS
 from marsyard.sim.camera import CameraModel

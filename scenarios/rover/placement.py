@@ -34,6 +34,14 @@ def camera_position(mast: MastCalibration, rover_from_head: RigidTransform) -> V
     return np.asarray(rover_from_head.apply(mast.left.c.copy()))
 
 
+def place_on_target(run: RoverRun) -> RoverRun:
+    """Place the instrument on a target that was handed off to the arm; return the run."""
+    target = run.stops[-1].update.position_rover if run.handed_off else None
+    if target is not None:
+        run.placement = auto_place(run.stops[-1].measurements(run.setup.rig.calibrated), np.asarray(target))
+    return run
+
+
 def auto_place(measurements: RoverMeasurements, target_rover: Vector) -> Placement:
     """Measure the surface around the tracked target, and place the instrument on it; rover frame."""
     mast = measurements.mast

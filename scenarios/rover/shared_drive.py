@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -24,22 +24,19 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TrackingState
 from marsyard.algorithms.vtt import VttOptions
-from marsyard.scenarios.base import LoadGround, TerrainScenario
 from marsyard.scenarios.case_evaluation import evaluate_case
 from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.parts.named import SCORE, PartKind
 from marsyard.scenarios.rover.closed_loop import drive_legs
-from marsyard.scenarios.rover.conditions import fixed_conditions, shadow_columns
+from marsyard.scenarios.rover.conditions import Visibility, evaluate_visibility, fixed_conditions, shadow_columns
 from marsyard.scenarios.rover.designation import designate_point
 from marsyard.scenarios.rover.guides import DesignationGuide, TrackerGuide
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.run_state import RoverRun, Setup
-from marsyard.scenarios.rover.stops import RunOutcome, StopView
+from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome, Setup, StopView
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.rover.tracked_run import run_tracker, score_track
-from marsyard.scenarios.rover.visibility import Visibility, evaluate_visibility
 from marsyard.scenarios.rover.world import terrain_parameters
-from marsyard.scenarios.views import SiteGround
+from marsyard.scenarios.terrain_scenario import TerrainScenario
 from marsyard.sim.parameters import Parameters
 from marsyard.sim.streams import Streams
 from marsyard.sim.terrain import TerrainBank
@@ -162,10 +159,10 @@ class SharedDrive:
     viewpoint: Float64[np.ndarray, "3"]
 
 
-def render_drive(key: DriveKey, load_ground: LoadGround = SiteGround.from_bank) -> SharedDrive:
+def render_drive(key: DriveKey) -> SharedDrive:
     """Drive a run and take its images; its random streams depend on the run, not on a case."""
     p, streams = key.drive, Streams(key.seed, f"{key.campaign}: run {key.run}", 0)
-    setup = Setup.draw(p, streams, load_ground)
+    setup = Setup.draw(p, streams)
     world, rig, leg = setup.world, setup.rig, p.legs[0]
     half_circle_rad = np.radians(0.5 * leg.steps * leg.step_deg) if leg.motion == "circle" else 0.0
     sine, cosine = np.sin(half_circle_rad), np.cos(half_circle_rad)
@@ -233,11 +230,9 @@ class SharedDriveScenario(TerrainScenario[SharedDriveParameters]):
     task = TRACKING
     algorithm_table = ("drive",)
     part_keys: Mapping[str, PartKind] = {"drive.scores": SCORE}
-    max_cached_grounds = 4
 
     def __init__(self) -> None:
-        super().__init__()
-        self._drive = lru_cache(maxsize=MAX_DRIVES)(partial(render_drive, load_ground=self.load_ground))
+        self._drive = lru_cache(maxsize=MAX_DRIVES)(render_drive)
         self._visibility = lru_cache(maxsize=MAX_VISIBILITIES)(
             lambda key, point, options: evaluate_drive_visibility(key.drive, self._drive(key), point, options)
         )

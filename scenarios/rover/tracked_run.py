@@ -10,16 +10,14 @@ from typing import cast
 
 from marsyard.scenarios.algorithm_run import AlgorithmRun, run_algorithm
 from marsyard.scenarios.case_evaluation import Score
-from marsyard.scenarios.image_provenance import image_columns
+from marsyard.scenarios.condition_columns import image_columns
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.rover import score
 from marsyard.scenarios.rover.conditions import run_conditions
+from marsyard.scenarios.rover.figures import run_products, run_timeline
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.products import run_products
-from marsyard.scenarios.rover.run_state import RoverRun
-from marsyard.scenarios.rover.stops import RunOutcome
-from marsyard.scenarios.rover.timeline import run_timeline
-from marsyard.scenarios.rover.updates import update_columns
+from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome
+from marsyard.scenarios.rover.score import update_columns
 
 
 @dataclass(frozen=True)

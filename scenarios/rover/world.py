@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import RigidTransform
 
-from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.rover.parameters import MovingSunParameters, RoverScenarioParameters, WorldParameters
 from marsyard.scenarios.rover.points import RockOutline
-from marsyard.scenarios.views import SiteGround, Viewpoint, select_rocks, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, load_ground, select_rocks, site_scene
 from marsyard.sim.dynamics.driven_ground import RockyGround
 from marsyard.sim.render import CloudLayer, PixelRays, Scene
 from marsyard.sim.streams import Streams
@@ -71,9 +70,7 @@ class RunWorld:
     _cached_scene: tuple[int, Scene] | None = field(default=None, repr=False)
 
     @classmethod
-    def from_parameters(
-        cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams, load_ground: LoadGround
-    ) -> RunWorld:
+    def from_parameters(cls, p: RoverScenarioParameters, pixel_rad: float, streams: Streams) -> RunWorld:
         """Create the world of a run."""
         world = p.world
         site_ground = load_ground(site(world.site), terrain_parameters(world), world.bank_seed, world.terrain)

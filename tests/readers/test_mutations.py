@@ -40,9 +40,8 @@ from marsyard.reports.stored import read_run
 from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.image_files import read_counts, read_elevation, read_flat_field
-from marsyard.scenarios.measured.image_table import read_table
 from marsyard.scenarios.measured.layout import VELOCITY as TASK
-from marsyard.scenarios.measured.layout import IngestError, read_ingest_file
+from marsyard.scenarios.measured.layout import IngestError, read_ingest_file, read_table
 from marsyard.scenarios.mesh_files import MeshFileError, read_mesh
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.scenarios.velocity import VELOCITY_FORMAT

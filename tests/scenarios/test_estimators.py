@@ -29,8 +29,7 @@ from marsyard.scenarios.landing_site import LANDING
 from marsyard.scenarios.rover.task import TRACKING
 from marsyard.scenarios.streamed import StreamedEstimator
 from marsyard.scenarios.tasks import Task
-from marsyard.scenarios.velocity import VELOCITY
-from marsyard.scenarios.velocity_columns import consistency_row
+from marsyard.scenarios.velocity import VELOCITY, consistency_row
 
 LIMITS = ExecutableLimits(isolated=False)
 

@@ -14,20 +14,15 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.interface import VelocityOutcome
 from marsyard.scenarios import fieldtest
 from marsyard.scenarios.cameras import camera_optics
-from marsyard.scenarios.fieldtest import imaging
 from marsyard.scenarios.fieldtest import run as run_module
-from marsyard.scenarios.fieldtest.case_order import case_order
-from marsyard.scenarios.fieldtest.elevation_model import simulate_elevation_model
-from marsyard.scenarios.fieldtest.flown_run import RunKey, field_camera
-from marsyard.scenarios.fieldtest.gyros import EarthRotation, InertialTrajectory
-from marsyard.scenarios.fieldtest.imaging import build_start_scene, run_ground, scene_at, sun_at, take_image
+from marsyard.scenarios.fieldtest.attitude import EarthRotation, InertialTrajectory
+from marsyard.scenarios.fieldtest.flight import RunKey, field_camera, sun_direction
+from marsyard.scenarios.fieldtest.images import build_start_scene, run_ground, scene_at, sun_at, take_image
 from marsyard.scenarios.fieldtest.parameters import ElevationParameters, FieldTestParameters, ImageTargetParameters
-from marsyard.scenarios.fieldtest.run import FieldRun, simulate_run
+from marsyard.scenarios.fieldtest.run import FieldRun, simulate_elevation_model, simulate_run
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
-from marsyard.scenarios.fieldtest.sun import sun_direction
-from marsyard.scenarios.fieldtest.target_detection import detect_targets
-from marsyard.scenarios.fieldtest.targets import Targets
-from marsyard.scenarios.fieldtest.triples import Category, find_triples
+from marsyard.scenarios.fieldtest.targets import Targets, detect_targets
+from marsyard.scenarios.fieldtest.triples import Category, case_order, find_triples
 from marsyard.scenarios.parts import ScoredFlight
 from marsyard.scenarios.views import Viewpoint, site_scene
 from marsyard.sim.dynamics import Resting
@@ -202,7 +197,7 @@ def test_targets_are_detected_in_the_images_of_a_pass(run_index: int, monkeypatc
         return take_image(*arguments)
 
     monkeypatch.setattr(run_module, "detect_targets", record_detection)
-    monkeypatch.setattr(imaging, "take_image", record_state)
+    monkeypatch.setattr(run_module, "take_image", record_state)
     parameters = make_parameters(drift={"change_k": 0.0}, targets={"images": 3})
     key = RunKey(parameters, run_index, 6, "test")
     run = simulate_run(key)

@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 
-from marsyard.scenarios.image_provenance import hash_images, image_columns
+from marsyard.scenarios.condition_columns import hash_images, image_columns
 from marsyard.sim.kernel_cache import processor_features
 from marsyard.sim.render.backend import default_backend
 

@@ -21,8 +21,7 @@ from rasterio.warp import transform
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios import terrain_files
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
-from marsyard.scenarios.terrain_files import check_source, grid_north_deg
-from marsyard.scenarios.terrain_model_sites import load_site
+from marsyard.scenarios.terrain_files import check_source, grid_north_deg, load_site
 from marsyard.sim.terrain.rasters import RealTerrain, TerrainFileError, read_rasters
 
 #: Mars, equidistant cylindrical about the equator, in metres (IAU 2000 sphere).

@@ -18,7 +18,7 @@ from marsyard.scenarios.descent.flight import IMU_MARGIN_S, SIMULATED_LEAD_S
 from marsyard.scenarios.descent.images import camera_optics
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.scenario import DescentScenario
-from marsyard.scenarios.fieldtest.flown_run import field_camera
+from marsyard.scenarios.fieldtest.flight import field_camera
 from marsyard.scenarios.fieldtest.scenario import FieldTestScenario
 from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters

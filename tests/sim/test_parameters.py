@@ -5,7 +5,7 @@ from pydantic import ValidationError
 
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.fieldtest.parameters import FieldTestParameters
-from marsyard.scenarios.localisation.detector import LANDER_DETECTOR
+from marsyard.scenarios.localisation.camera import LANDER_DETECTOR
 from marsyard.scenarios.localisation.instruments import RADAR
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.sim.sensor import ImuParameters

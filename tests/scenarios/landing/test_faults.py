@@ -12,8 +12,7 @@ from marsyard.scenarios.landing.faults import (
     draw_received_images,
     stuck_range_m,
 )
-from marsyard.scenarios.landing.helicopter import Transit
-from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.sim.sensor import preset
 from marsyard.sim.streams import Streams

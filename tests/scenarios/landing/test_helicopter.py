@@ -5,8 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from marsyard.scenarios.landing.helicopter import Transit
-from marsyard.scenarios.landing.helicopter_parameters import LandingHelicopterParameters
+from marsyard.scenarios.landing.helicopter import LandingHelicopterParameters, Transit
 from marsyard.scenarios.landing.touchdown import Touchdown, horizontal_distance_m, land
 from marsyard.sim.dynamics.rotorcraft import GroundPatch
 from marsyard.sim.sensor import LaserParameters

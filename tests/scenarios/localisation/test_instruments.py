@@ -6,11 +6,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from marsyard.scenarios.cameras import CalibrationParameters
-from marsyard.scenarios.localisation.camera import LanderCameraParameters, draw_calibrated_camera, true_camera
-from marsyard.scenarios.localisation.detector import HALF_WELL_SNR, LANDER_DETECTOR
+from marsyard.scenarios.localisation.camera import (
+    HALF_WELL_SNR,
+    LANDER_DETECTOR,
+    LanderCameraParameters,
+    draw_calibrated_camera,
+    true_camera,
+)
 from marsyard.scenarios.localisation.flight import LanderFlight
-from marsyard.scenarios.localisation.initial_errors import InitialErrors
-from marsyard.scenarios.localisation.instruments import RADAR, measure_altitudes
+from marsyard.scenarios.localisation.instruments import RADAR, InitialErrors, measure_altitudes
 from marsyard.sim.sensor import Detector, RadarAltimeter
 from marsyard.sim.terrain import Surface
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.localisation.map_parameters import MapParameters
+from marsyard.scenarios.localisation.parameters import MapParameters
 from marsyard.scenarios.localisation.sites import localisation_site, localisation_sites
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.sim.camera import Cahv

@@ -9,10 +9,10 @@ from jaxtyping import Float64
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from marsyard.scenarios.localisation.fields import SmoothField
-from marsyard.scenarios.localisation.map_parameters import MapParameters
 from marsyard.scenarios.localisation.map_product import blur, make_map
 from marsyard.scenarios.localisation.map_rendering import orbital_rays
+from marsyard.scenarios.localisation.map_truth import SmoothField
+from marsyard.scenarios.localisation.parameters import MapParameters
 from marsyard.scenarios.localisation.sites import localisation_site
 from marsyard.scenarios.localisation.world import LocalisationWorld
 from marsyard.scenarios.radiance import add_haze, sun_at

@@ -8,9 +8,9 @@ from marsyard.algorithms.localisation.baselines import InertialEstimator
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate
 from marsyard.scenarios.localisation.camera import LanderCameraParameters, true_camera
 from marsyard.scenarios.localisation.flight import LanderFlight
-from marsyard.scenarios.localisation.image_schedule import ImageSchedule
 from marsyard.scenarios.localisation.instruments import IMAGE_CLOCK
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
+from marsyard.scenarios.localisation.parameters import ImageSchedule
 from marsyard.scenarios.streamed import StreamAnswers, StreamedEstimator
 from marsyard.sim.measurements import AltitudeMeasurement, DetectorCalibration, DetectorImage, ImuIncrements
 from marsyard.sim.sensor import Clock, Imu

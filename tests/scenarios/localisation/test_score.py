@@ -13,11 +13,9 @@ from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.campaigns.store.packed_products import pack_products
 from marsyard.scenarios.declared_columns import row_columns
-from marsyard.scenarios.localisation.estimate_errors import EstimateErrors, compute_errors
-from marsyard.scenarios.localisation.fields import SmoothField
-from marsyard.scenarios.localisation.map_truth import MapTruth
-from marsyard.scenarios.localisation.products import case_products
-from marsyard.scenarios.localisation.score import REQUIRED_M, answer_row
+from marsyard.scenarios.localisation.figures import case_products
+from marsyard.scenarios.localisation.map_truth import MapTruth, SmoothField
+from marsyard.scenarios.localisation.score import REQUIRED_M, EstimateErrors, answer_row, compute_errors
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 

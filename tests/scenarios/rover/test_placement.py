@@ -10,7 +10,7 @@ from marsyard.algorithms.vtt.placement import Placement, PlacementOutcome, measu
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.scenarios.rover.closed_loop import prepare_run, track_target
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
-from marsyard.scenarios.rover.placement import placement_row, placement_truth, sample_surface
+from marsyard.scenarios.rover.placement import place_on_target, placement_row, placement_truth, sample_surface
 from marsyard.scenarios.rover.points import (
     RockOutline,
     enclosing_spheres,
@@ -21,7 +21,7 @@ from marsyard.scenarios.rover.points import (
     spheres_near_line,
 )
 from marsyard.scenarios.rover.run_state import RoverRun
-from marsyard.scenarios.rover.scenario import RoverScenario, place_target
+from marsyard.scenarios.rover.scenario import RoverScenario
 from marsyard.scenarios.rover.shared_drive import SharedDriveParameters, SharedDriveScenario
 from marsyard.sim.streams import Streams
 from tests.scenarios.rover.short_run import SHORT_RUN
@@ -41,7 +41,7 @@ def placed_run() -> tuple[bool, RoverRun]:
     parameters = RoverScenarioParameters.model_validate(SLAB)
     run = prepare_run(parameters, Streams(1, "placement tests", 0))
     placeable = placement_truth(run)["placeable"]
-    return bool(placeable), place_target(track_target(parameters, run))
+    return bool(placeable), place_on_target(track_target(parameters, run))
 
 
 def test_instrument_is_placed_on_the_target(placed_run: tuple[bool, RoverRun]) -> None:
@@ -90,7 +90,7 @@ def test_overlap_of_the_true_rock_is_a_collision(placed_run: tuple[bool, RoverRu
 
 def test_run_without_a_hand_off_is_not_placed() -> None:
     parameters = RoverScenarioParameters.model_validate({**SLAB, "legs": [{"motion": "stay", "steps": 1}]})
-    run = place_target(track_target(parameters, prepare_run(parameters, Streams(1, "placement tests", 0))))
+    run = place_on_target(track_target(parameters, prepare_run(parameters, Streams(1, "placement tests", 0))))
     assert run.placement is None
     assert not placement_row(run)["placed"]
 

@@ -1,19 +1,13 @@
-"""Base classes of scenarios: scenarios with typed parameters, and scenarios on the terrains of a bank."""
+"""Base class of scenarios whose cases use terrains of a bank: the terrains are prepared once and shared by cases."""
 
-from collections.abc import Callable, Mapping
-from functools import lru_cache
-from typing import Any, Generic, Protocol, TypeVar
+from collections.abc import Mapping
+from typing import Any, Protocol
 
 from pydantic import BaseModel
 
 from marsyard.scenarios.parts.named import SCORE, PartKind
-from marsyard.scenarios.views import SiteGround
-from marsyard.sim.terrain import Site, TerrainBank, TerrainParameters
-
-ParametersType = TypeVar("ParametersType", bound=BaseModel)
-
-#: Function that loads a terrain by site, terrain parameters, seed of the bank, and number of the terrain in the bank.
-LoadGround = Callable[[Site, TerrainParameters, int, int], SiteGround]
+from marsyard.scenarios.typed_scenario import ParametersType, TypedScenario
+from marsyard.sim.terrain import TerrainBank
 
 
 class BankLocation(Protocol):
@@ -24,40 +18,20 @@ class BankLocation(Protocol):
     terrain: int
 
 
-class BaseScenario(Generic[ParametersType]):
-    """A scenario with one type of parameters. Subclasses define `name` and `parameters_type`."""
-
-    name: str
-    parameters_type: type[ParametersType]
-
-    def check_parameters(self, parameters: BaseModel) -> ParametersType:
-        """Return the parameters with their type. Raises TypeError for parameters of another scenario."""
-        if not isinstance(parameters, self.parameters_type):
-            expected_name, actual_name = self.parameters_type.__name__, type(parameters).__name__
-            raise TypeError(f"the scenario {self.name} needs {expected_name}, not {actual_name}")
-        return parameters
-
-
-class TerrainScenario(BaseScenario[ParametersType]):
-    """A scenario whose shared inputs are terrains; the most recently used terrains are cached in memory.
+class TerrainScenario(TypedScenario[ParametersType]):
+    """A scenario whose shared inputs are terrains.
 
     `shared_input` is the number of an input that several cases use, one of `Scenario.shared_inputs`.
 
     - max_stored_terrains: largest bank whose terrains can be stored on disk before the cases; each case on a larger
       bank builds its terrain in memory
-    - max_cached_grounds: number of terrains in the memory of a process, those of several campaigns or of a small bank
-      (12 MB each); 0 if the cases do not use `load_ground`
     - algorithm_table: path of the parameter table that selects the algorithms; by default the top level
     - part_keys: parameter keys that select custom parts, and the kind of each part; by default only scores
     """
 
     max_stored_terrains: int = 64
-    max_cached_grounds: int = 0
     algorithm_table: tuple[str, ...] = ()
     part_keys: Mapping[str, PartKind] = {"scores": SCORE}
-
-    def __init__(self) -> None:
-        self.load_ground: LoadGround = lru_cache(maxsize=self.max_cached_grounds)(SiteGround.from_bank)
 
     def location(self, p: ParametersType) -> BankLocation:
         """Return the terrain of the parameters; by default their table `location`."""

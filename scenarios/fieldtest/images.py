@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import UInt16
 
-from marsyard.scenarios.base import LoadGround
 from marsyard.scenarios.cameras import camera_optics
-from marsyard.scenarios.fieldtest.flown_run import FlownRun, RunKey, field_camera
+from marsyard.scenarios.fieldtest.flight import FlownRun, RunKey, field_camera
 from marsyard.scenarios.radiance import add_haze, sunlight_ratio
-from marsyard.scenarios.views import SiteGround, Viewpoint, render_state, site_scene
+from marsyard.scenarios.views import SiteGround, Viewpoint, load_ground, render_state, site_scene
 from marsyard.sim.dynamics import State
 from marsyard.sim.render import Frame, Scene, Sun
 from marsyard.sim.sensor import Detector
@@ -43,7 +42,7 @@ def scene_at(run: FlownRun, start_scene: Scene, ground: SiteGround, time_s: floa
     return start_scene.with_light(sun, ground.photometry(sun))
 
 
-def run_ground(key: RunKey, load_ground: LoadGround = SiteGround.from_bank) -> SiteGround:
+def run_ground(key: RunKey) -> SiteGround:
     """Load the ground of a run."""
     p = key.field_test
     name = p.runs[key.number].site

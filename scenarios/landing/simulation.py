@@ -1,17 +1,40 @@
-"""Create the measurements of a landing algorithm from the images and the true motion."""
+"""Simulated landing case: world, flight, images, ground truth and measurements, which all algorithms use."""
 
-from dataclasses import replace
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from marsyard.scenarios.cameras import draw_calibrated
+from marsyard.scenarios.cameras import camera_optics, draw_calibrated
 from marsyard.scenarios.landing.faults import add_range_faults
 from marsyard.scenarios.landing.flight import LandingFlight
-from marsyard.scenarios.landing.images import Pair
+from marsyard.scenarios.landing.ground_truth import GroundTruth
+from marsyard.scenarios.landing.images import Pair, take_images
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
+from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.sim.measurements import LandingMeasurements
 from marsyard.sim.sensor.ranging import RangingUnit
 from marsyard.sim.streams import Streams
+
+
+@dataclass(frozen=True)
+class RenderedFlight:
+    """A flight with its world, images and ground truth."""
+
+    p: LandingScenarioParameters
+    world: LandingWorld
+    flight: LandingFlight
+    pair: Pair
+    truth: GroundTruth
+
+    @classmethod
+    def simulate(cls, p: LandingScenarioParameters, streams: Streams) -> RenderedFlight:
+        """Simulate the flight of a case and take its images."""
+        world = LandingWorld.from_parameters(p)
+        flight = LandingFlight.from_parameters(p, world.ground.surface, streams)
+        pair = take_images(p, world, flight, camera_optics(p.optics), streams)
+        return cls(p, world, flight, pair, GroundTruth.from_images(world, flight, pair, p.lander.limits))
 
 
 def measure(p: LandingScenarioParameters, flight: LandingFlight, pair: Pair, streams: Streams) -> LandingMeasurements:
