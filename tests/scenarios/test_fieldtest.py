@@ -3,7 +3,7 @@
 import re
 import tomllib
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta, timezone
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 
@@ -67,20 +67,15 @@ def test_sun_position_matches_the_almanac() -> None:
     assert np.degrees(np.arctan2(sun[0], sun[1])) % 360.0 == pytest.approx(194.34024, abs=0.01)
 
 
-def test_equinox_sun_is_over_the_equator() -> None:
-    """Equinox of 23 September 2002, 04:55 UT (United States Naval Observatory)."""
-    sun = sun_direction(datetime(2002, 9, 23, 4, 55, tzinfo=UTC), 90.0, 0.0)
-    assert np.degrees(np.arcsin(sun[2])) == pytest.approx(0.0, abs=0.01)
-
-
 def test_time_without_a_time_zone_is_rejected() -> None:
     with pytest.raises(ValueError, match="time zone"):
         sun_direction(datetime(2002, 9, 23), 0.0, 0.0)
 
 
-def test_attitude_error_without_drift_is_below_0_15_deg() -> None:
+@pytest.mark.parametrize("gyro_bias_deg_h", [1.0, 5.0])
+def test_attitude_error_without_drift_is_below_0_15_deg(gyro_bias_deg_h: float) -> None:
     """A random walk of 0.07 deg/sqrt(h) over 40 min with known ends has 0.03 deg rms at the middle; bound: 5 sigma."""
-    run = make_ivanpah_run(drift={"change_k": 0.0})
+    run = make_ivanpah_run(drift={"change_k": 0.0}, imu={**IMU, "gyro_bias_deg_h": gyro_bias_deg_h})
     assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
 
 
@@ -133,22 +128,9 @@ def test_camera_looks_up_to_45_deg_off_nadir() -> None:
 def test_noise_campaign_has_bursts_in_each_run() -> None:
     parameters = tomllib.loads(CATALOGUE.with_name("dimes-fieldtest-noise.toml").read_text(encoding="utf-8"))
     noise_parameters = FieldTestParameters.model_validate(parameters["parameters"])
-    assert [run.name for run in noise_parameters.runs] == [
-        "Pisgah Run 1",
-        "Kelso Run 1",
-        "Ivanpah Run 1",
-        "Ivanpah Run 2",
-        "Pisgah Run 1, intact cable",
-    ]
     assert all(noise_parameters.run_detector(number).bursts.bursts == 10.0 for number in range(4))
-    without_bursts = make_parameters()
+    # the fifth run has an intact cable
     assert noise_parameters.run_detector(4) == noise_parameters.detector
-    assert without_bursts.run_detector(0) == without_bursts.detector
-
-
-def test_attitude_fit_removes_a_constant_bias() -> None:
-    run = make_ivanpah_run(drift={"change_k": 0.0}, imu={**IMU, "gyro_bias_deg_h": 5.0})
-    assert np.abs(compute_attitude_errors_deg(run)).max() < 0.15
 
 
 def test_attitude_fit_does_not_remove_a_drift_about_the_flight_line() -> None:
@@ -159,21 +141,6 @@ def test_attitude_fit_does_not_remove_a_drift_about_the_flight_line() -> None:
     tilt = compute_attitude_errors_deg(run) @ flight_direction
     assert np.ptp(tilt) > 0.6
     assert np.ptp(compute_attitude_errors_deg(run) @ np.array([-flight_direction[1], flight_direction[0], 0.0])) < 0.2
-
-
-def test_alternating_headings_reduce_the_effect_of_drift() -> None:
-    """If the platform turns with the heading, the effect of the drift changes its sign at each pass.
-
-    The tilt error then changes less between passes in the same direction. The fitted constant bias leaves a rest.
-    """
-    changes_deg = []
-    for turns_with_flight in (False, True):
-        run = make_ivanpah_run(helicopter={"turns_with_flight": turns_with_flight})
-        errors, numbers = compute_attitude_errors_deg(run)[:, :2], run.images.pass_number
-        means = np.array([errors[numbers == number].mean(axis=0) for number in np.unique(numbers)])
-        changes_deg.append(np.linalg.norm(means[2:] - means[:-2], axis=1).max())
-    assert changes_deg[0] > 0.4
-    assert changes_deg[1] < 0.7 * changes_deg[0]
 
 
 @pytest.mark.slow
@@ -306,15 +273,6 @@ def test_flight_contains_the_number_of_triples_of_the_paper(seed: int) -> None:
     counts = {category: len(triples) for category, triples in find_triples(run.images, parameters.triples).items()}
     requested = {Category.SHORT_TIME: 251, Category.SAME_DIRECTION: 306, Category.OPPOSITE_DIRECTION: 286}
     assert all(counts[category] > 1.2 * count for category, count in requested.items()), counts
-
-
-@pytest.mark.slow
-def test_run_is_deterministic() -> None:
-    key = RunKey(make_parameters(), 4, 5, "test")
-    first, second = simulate_run(key), simulate_run(key)
-    assert second is not first
-    assert np.array_equal(second.attitudes.as_quat(), first.attitudes.as_quat())
-    assert second.triples == first.triples
 
 
 def test_sun_moves_while_rocks_are_fixed() -> None:

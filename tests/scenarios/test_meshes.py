@@ -75,13 +75,17 @@ def test_mesh_is_placed_in_the_terrain_period_nearest_to_the_scene(tmp_path: Pat
     assert np.allclose((corners.min(axis=0) + corners.max(axis=0))[:2] / 2.0, [66.0, -4.0])
 
 
-def test_mesh_raises_the_true_heights_of_a_landing(tmp_path: Path, surface: Surface) -> None:
+def raised_m(surface: Surface, file: str) -> np.ndarray:
+    """Return the heights by which a mesh raises the relief; edges of a box lie between grid points."""
     ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
-    # The edges of the box lie between grid points.
-    parameters = MeshParameters(file=write_box(tmp_path), east_m=20.02, north_m=30.02)
+    mesh = MeshParameters(file=file, east_m=20.02, north_m=30.02)
     low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
-    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (parameters,)))
-    height_difference = with_mesh.heights_m - without_mesh.heights_m
+    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (mesh,)))
+    return np.asarray(with_mesh.heights_m - without_mesh.heights_m)
+
+
+def test_mesh_raises_the_true_heights_of_a_landing(tmp_path: Path, surface: Surface) -> None:
+    height_difference = raised_m(surface, write_box(tmp_path))
     assert height_difference.max() == pytest.approx(0.5, abs=1e-6)
     assert np.count_nonzero(height_difference > 0.25) * 0.05**2 == pytest.approx(2.0, rel=0.06)
 
@@ -146,11 +150,7 @@ def test_closed_bodies_are_oriented_outwards(tmp_path: Path, surface: Surface, s
     # Formats with single precision give 7 digits.
     assert volume(file) == pytest.approx(4.0 + ball.volume, rel=1e-5)
     assert len(read_mesh(file).triangles) == 24 + len(ball.faces)
-    ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
-    mesh = MeshParameters(file=export(tmp_path, bodies[0], f"box.{suffix}"), east_m=20.02, north_m=30.02)
-    low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
-    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (mesh,)))
-    assert (with_mesh.heights_m - without_mesh.heights_m).max() == pytest.approx(1.0, abs=1e-6)
+    assert raised_m(surface, export(tmp_path, bodies[0], f"box.{suffix}")).max() == pytest.approx(1.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("inverted", [(), (0,), (1,), (0, 1, 2)])
@@ -190,11 +190,7 @@ def test_open_surfaces_are_two_sided(tmp_path: Path, surface: Surface, suffix: s
     np.testing.assert_allclose(normals.sum(axis=0), 0.0, atol=1e-9)
     # The smooth normals are on the side of their triangle.
     assert np.sum(normals[:, None] * mesh.normals, axis=2).min() > 0.1
-    ground = SiteGround(site("heli-benign"), TerrainParameters(samples=64), surface, None)
-    placed = MeshParameters(file=file, east_m=20.02, north_m=30.02)
-    low, high = np.array([15.0, 25.0]), np.array([25.0, 35.0])
-    without_mesh, with_mesh = (Relief.from_ground(ground, low, high, 0.05, meshes) for meshes in ((), (placed,)))
-    assert (with_mesh.heights_m - without_mesh.heights_m).max() == pytest.approx(1.0, abs=1e-6)
+    assert raised_m(surface, file).max() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_repeated_and_degenerate_triangles_are_removed(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from marsyard.algorithms.dimes import DimesDetails, DimesEstimator, DimesTrack
 from marsyard.algorithms.dimes.views import altitudes_at_images
 from marsyard.scenarios.descent.flight import create_flight, mean_velocities, states_at_images
 from marsyard.scenarios.descent.images import camera_optics, take_exposures
-from marsyard.scenarios.descent.measurement import DescentInstruments, measure
+from marsyard.scenarios.descent.measurements import DescentInstruments, measure
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.sim.dynamics import State
 from marsyard.sim.measurements import DescentMeasurements

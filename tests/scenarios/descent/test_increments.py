@@ -13,7 +13,7 @@ from marsyard.algorithms.interface import VelocityEstimate
 from marsyard.campaigns.running.replay import differing_columns
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, gravity_m_s2
-from marsyard.scenarios.descent.measurement import add_increments
+from marsyard.scenarios.descent.measurements import add_increments
 from marsyard.sim.measurements import AltitudeMeasurement, DescentFrame, DescentMeasurements, ImuIncrements
 from marsyard.sim.sensor import InertialSolution
 from marsyard.sim.sensor.imu import DEG_H, IMUS, MILLI_G, ImuClass
@@ -109,13 +109,6 @@ def test_errors_of_increments_are_those_of_the_class(imu_class: ImuClass) -> Non
     assert low < np.mean(np.square(errors["gyro"])) * rate_hz**2 / biases["gyro"] ** 2 < 20.0 * high
     ratio = np.mean(np.square(errors["accelerometer"])) * rate_hz**2 / biases["accelerometer"] ** 2
     assert low < ratio < 1.2 * high
-
-
-def test_descents_have_no_increments_by_default() -> None:
-    measurements, _ = measure()
-    assert measurements == inputs.descent()
-    assert measurements.increments is None
-    assert all(isinstance(event, DescentFrame) for event in measurements.events())
 
 
 @pytest.mark.parametrize("rate_hz", [-1.0, 1.0, 49.9, 400.1])

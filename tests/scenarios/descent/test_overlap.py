@@ -108,23 +108,21 @@ def make_rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
-def test_correct_answer_cancels_the_velocity() -> None:
-    result = compute_touchdown(IDEAL, TRUE_VELOCITY, TRUE_VELOCITY.copy(), AVAILABLE_S, make_rng())
-    np.testing.assert_allclose(result.with_answer, 0.0, atol=1e-12)
-    np.testing.assert_allclose(result.without_answer, TRUE_VELOCITY)
-
-
-def test_steering_is_limited_by_its_capability() -> None:
-    fast_velocity = 2.0 * TRUE_VELOCITY
-    result = compute_touchdown(IDEAL, fast_velocity, fast_velocity.copy(), AVAILABLE_S, make_rng())
-    # the true speed is 30 m/s
-    np.testing.assert_allclose(np.hypot(*result.with_answer), 30.0 - IDEAL.max_steering_m_s)
-
-
-def test_wrong_answer_increases_the_velocity() -> None:
-    """Steering with the negated velocity doubles the velocity."""
-    result = compute_touchdown(IDEAL, TRUE_VELOCITY, -TRUE_VELOCITY, AVAILABLE_S, make_rng())
-    np.testing.assert_allclose(result.with_answer, 2.0 * TRUE_VELOCITY)
+@pytest.mark.parametrize(
+    ("true_factor", "estimate_factor", "speed_m_s"),
+    [
+        (1.0, 1.0, 0.0),
+        # steering is limited by its capability
+        (2.0, 2.0, 30.0 - IDEAL.max_steering_m_s),
+        # steering with the negated velocity doubles the velocity
+        (1.0, -1.0, 30.0),
+    ],
+)
+def test_burn_is_steered_against_the_estimate(true_factor: float, estimate_factor: float, speed_m_s: float) -> None:
+    true, estimate = true_factor * TRUE_VELOCITY, estimate_factor * TRUE_VELOCITY
+    result = compute_touchdown(IDEAL, true, estimate, AVAILABLE_S, make_rng())
+    np.testing.assert_allclose(result.with_answer, speed_m_s * TRUE_VELOCITY / 15.0, atol=1e-12)
+    np.testing.assert_allclose(result.without_answer, true)
 
 
 @pytest.mark.parametrize(

@@ -20,18 +20,6 @@ def nominal_case() -> CaseResult:
     return run_descent()
 
 
-def _drop_times(row: Any) -> dict[str, Any]:
-    """Return the row without columns whose name contains "time"."""
-    return {name: value for name, value in row.items() if "time" not in name}
-
-
-def test_case_is_deterministic(nominal_case: CaseResult) -> None:
-    second_case = run_descent(1)
-    repeated_case = run_descent()
-    assert _drop_times(repeated_case.row) == _drop_times(nominal_case.row)
-    assert second_case.row["image_hash"] != nominal_case.row["image_hash"]
-
-
 @pytest.mark.slow
 def test_each_catalogue_dispersion_is_reported() -> None:
     """The row has the value of each dispersion in a column that is named by the path or by the end of the path."""
@@ -60,23 +48,18 @@ def test_each_catalogue_dispersion_is_reported() -> None:
     assert dispersed_paths == {*draws, "faults"}
 
 
-@pytest.mark.parametrize("name", ["velocity", "firing_velocity"])
-def test_velocity_error_is_estimate_minus_truth(nominal_case: CaseResult, name: str) -> None:
+def test_velocity_error_is_estimate_minus_truth(nominal_case: CaseResult) -> None:
     row: Any = nominal_case.row
     assert nominal_case.answered
-    for axis in "xy":
-        assert row[f"{name}_error_{axis}_m_s"] == pytest.approx(
-            row[f"{name}_estimated_{axis}_m_s"] - row[f"{name}_true_{axis}_m_s"], abs=1e-12
+    for name in ("velocity", "firing_velocity"):
+        error, estimated, true = (
+            np.array([row[f"{name}_{kind}_{axis}_m_s"] for axis in "xy"]) for kind in ("error", "estimated", "true")
         )
-    assert row[f"{name}_error_m_s"] == pytest.approx(math.hypot(row[f"{name}_error_x_m_s"], row[f"{name}_error_y_m_s"]))
-
-
-def test_figures_use_the_scored_data(nominal_case: CaseResult) -> None:
-    row = nominal_case.row
-    for kind in ("true", "estimated"):
-        row_velocity = [float(row[f"velocity_{kind}_{axis}_m_s"]) for axis in "xy"]
-        np.testing.assert_allclose(nominal_case.products[f"velocity_{kind}_m_s"], row_velocity)
-    assert all(nominal_case.products[f"image_{number}"].shape == (256, 1024) for number in (1, 2, 3))
+        assert error == pytest.approx(estimated - true, abs=1e-12)
+        assert row[f"{name}_error_m_s"] == pytest.approx(np.hypot(*error))
+        if name == "velocity":
+            np.testing.assert_array_equal(nominal_case.products["velocity_true_m_s"], true)
+            np.testing.assert_array_equal(nominal_case.products["velocity_estimated_m_s"], estimated)
 
 
 def test_true_velocity_is_the_mean_camera_velocity() -> None:
@@ -120,16 +103,6 @@ def test_reported_attitude_error_corrects_the_propagation_to_the_firing() -> Non
     assert row["velocity_error_m_s"] < 0.4
     assert row["firing_velocity_error_m_s"] < 0.6
     assert 3.7 * 15.0 * np.deg2rad(tilt_deg) > 0.9  # error of the propagation without the correction, m/s
-
-
-def test_ideal_instruments_are_reported_without_errors(nominal_case: CaseResult) -> None:
-    """Over flat ground the only error is the altitude change between the last altimeter reading and the image."""
-    row = run_descent(**IDEAL_INSTRUMENTS, terrain=FLAT_TERRAIN).row
-    for name in ("attitude_error_common_deg", "attitude_error_independent_deg"):
-        assert float(row[name]) < 1e-4 < float(nominal_case.row[name])
-    # In 0.1 s, an acceleration of 0.3 m/s^2 and a swing velocity of 2 m/s change the altitude of 1400 m by about 0.1 m.
-    assert abs(float(row["altitude_error_common"])) < 1e-4 < abs(float(nominal_case.row["altitude_error_common"]))
-    assert float(row["velocity_change_error_m_s"]) < 1e-3 < float(nominal_case.row["velocity_change_error_m_s"])
 
 
 def test_instrument_errors_have_the_specified_size() -> None:
@@ -218,20 +191,6 @@ def test_feasible_overlap_does_not_depend_on_the_algorithm(nominal_case: CaseRes
     assert nominal_case.row["feasible_overlap"] is True
 
 
-def test_dark_images_give_no_velocity() -> None:
-    result = run_descent(detector={"responsivity_e_s": 1.0})
-    assert result.outcome == "NO_VALID_TRACK"
-    assert not result.answered
-
-
-def test_velocity_over_a_site_is_accurate() -> None:
-    result = run_descent(site="gusev", **IDEAL_INSTRUMENTS)
-    assert result.outcome == "VALID"
-    assert result.row["site"] == "gusev"
-    # Slopes of 2 deg shift a template against the plane below the lander, by at most 1 m/s here.
-    assert float(result.row["velocity_error_m_s"]) < 1.0
-
-
 def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
     """The terrain model from a file, inside the terrain of the site, changes the images."""
     heights = 30.0 * np.sin(np.arange(200) / 9.0)[:, None] * np.cos(np.arange(200) / 7.0)
@@ -247,10 +206,10 @@ def test_imported_terrain_is_rendered(tmp_path: Path) -> None:
     assert float(result.row["velocity_error_m_s"]) < 4.0
 
 
-def test_exact_instruments_have_no_instrument_errors() -> None:
-    row = run_descent(exact_instruments=True).row
+def test_exact_instruments_have_no_instrument_errors(nominal_case: CaseResult) -> None:
+    row, nominal = run_descent(exact_instruments=True).row, nominal_case.row
     for name in ("attitude_error_common_deg", "attitude_error_independent_deg", "velocity_change_error_m_s"):
-        assert float(row[name]) < 1e-6
-    assert abs(float(row["altitude_error_common"])) < 1e-9
-    assert abs(float(row["tag_error_1_s"])) < 1e-12
-    assert abs(float(row["velocity_error_m_s"])) < 0.3
+        assert float(row[name]) < 1e-6 < float(nominal[name])
+    for name, tolerance in (("altitude_error_common", 1e-9), ("tag_error_1_s", 1e-12)):
+        assert abs(float(row[name])) < tolerance < abs(float(nominal[name]))
+    assert float(row["velocity_error_m_s"]) < 0.3

@@ -29,6 +29,18 @@ from marsyard.sim.sensor import preset
 
 SAFE_SITE, UNSAFE_SITE = np.array([-3.0, 0.0, 0.0]), np.array([3.0, 0.0, 0.0])
 SITE_REPORTED, NO_SITE_REPORTED = SiteOutcome.SAFE_SITE, SiteOutcome.NO_SAFE_SITE
+VIEW = CameraView(
+    np.zeros((480, 640), dtype=np.uint16), preset("xc-55").cameras()[0], rigid(Rotation.identity(), np.zeros(3))
+)
+
+
+def make_ground(elevation: ElevationMap, safety: np.ndarray) -> MappedGround:
+    """Return a map without slope and roughness."""
+    zeros = np.zeros(safety.shape)
+    hazards = HazardMaps(zeros, zeros, zeros, safety)
+    return MappedGround(
+        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, hazards, np.zeros(2), None
+    )
 
 
 def make_flight() -> LandingFlight:
@@ -73,23 +85,6 @@ def test_each_flight_is_in_exactly_one_population(n_safe: int, population: str) 
     assert [name for name in populations if row[name]] == [population]
 
 
-@pytest.mark.parametrize(
-    ("outcome", "site", "is_correct"),
-    [
-        (SITE_REPORTED, SAFE_SITE, True),
-        (SITE_REPORTED, UNSAFE_SITE, False),
-        (NO_SITE_REPORTED, None, True),
-        # Without convergence the answer is the a-priori site, which is safe by chance.
-        (SiteOutcome.NO_MOTION, SAFE_SITE, False),
-    ],
-)
-def test_safe_site_or_no_site_is_correct(outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool) -> None:
-    row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(3))
-    assert row["safe_or_no_site_reported"] is is_correct
-    assert row["site_safe"] is (outcome is SITE_REPORTED and site is SAFE_SITE)
-    assert row["descent_target_safe"] is (site is SAFE_SITE)
-
-
 def test_flight_without_landing_has_no_touchdown_score() -> None:
     row = landing_row(None, SiteEstimate(NO_SITE_REPORTED, None), make_flight(), make_truth(3))
     assert row["landed"] is False
@@ -99,23 +94,26 @@ def test_flight_without_landing_has_no_touchdown_score() -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_safe", "outcome", "site", "is_correct"),
+    ("n_safe", "outcome", "site", "is_safe_or_none", "is_correct"),
     [
-        (25, SITE_REPORTED, SAFE_SITE, True),
-        (25, SITE_REPORTED, UNSAFE_SITE, False),
+        (25, SITE_REPORTED, SAFE_SITE, True, True),
+        (25, SITE_REPORTED, UNSAFE_SITE, False, False),
         # refusing is wrong where a safe site with margin exists, and correct where none or only a narrow one exists
-        (25, NO_SITE_REPORTED, None, False),
-        (3, NO_SITE_REPORTED, None, True),
-        (0, NO_SITE_REPORTED, None, True),
-        (0, SITE_REPORTED, UNSAFE_SITE, False),
-        (0, SiteOutcome.NO_MOTION, SAFE_SITE, False),
+        (25, NO_SITE_REPORTED, None, True, False),
+        (3, NO_SITE_REPORTED, None, True, True),
+        (0, NO_SITE_REPORTED, None, True, True),
+        (0, SITE_REPORTED, UNSAFE_SITE, False, False),
+        # without convergence the answer is the a-priori site, which is safe by chance
+        (3, SiteOutcome.NO_MOTION, SAFE_SITE, False, False),
     ],
 )
 def test_answer_is_correct_for_the_true_ground(
-    n_safe: int, outcome: SiteOutcome, site: np.ndarray | None, is_correct: bool
+    n_safe: int, outcome: SiteOutcome, site: np.ndarray | None, is_safe_or_none: bool, is_correct: bool
 ) -> None:
     row = site_row(SiteEstimate(outcome, site), make_flight(), make_truth(n_safe))
-    assert row["answer_correct"] is is_correct
+    assert (row["safe_or_no_site_reported"], row["answer_correct"]) == (is_safe_or_none, is_correct)
+    assert row["site_safe"] is (outcome is SITE_REPORTED and site is SAFE_SITE)
+    assert row["descent_target_safe"] is (site is SAFE_SITE)
 
 
 def test_clearance_is_relative_to_the_farthest_position() -> None:
@@ -149,11 +147,7 @@ def test_relief_error_is_1_for_a_plane_and_0_for_an_exact_map(map_scale: float, 
     exact = truth.relief.average(start[:2] + local, 1.0) - start[2]
     plane = 0.1 * local[..., 0] - 0.05 * local[..., 1] + 3.0
     elevation = replace(cells, elevation_m=map_scale * exact + plane)
-    zeros = np.zeros((8, 8))
-    hazards = HazardMaps(zeros, zeros, zeros, zeros.astype(np.uint8))
-    ground = MappedGround(
-        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, hazards, np.zeros(2), None
-    )
+    ground = make_ground(elevation, np.zeros((8, 8), dtype=np.uint8))
     nothing = np.zeros_like(truth.covered)
     sampled = SampledMap(nothing, nothing, nothing, np.zeros(nothing.shape))
     row = map_errors(ground, flight, sampled, truth)
@@ -171,9 +165,7 @@ def test_matches_are_counted_by_outcome() -> None:
     statuses = np.repeat(np.array(list(MatchStatus), dtype=np.uint8), [50, 4, 3, 2])
     pixels, no_values = np.zeros((59, 2)), np.zeros(59)
     matches = Matches(pixels, pixels, pixels, pixels, no_values, no_values, statuses, np.zeros((50, 3)))
-    camera = preset("xc-55").cameras()[0]
-    view = CameraView(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
-    row = stage_row(HdaDetails((view, view), matches=matches))
+    row = stage_row(HdaDetails((VIEW, VIEW), matches=matches))
     assert row == {
         "points": 50,
         "matched_fraction": 50 / 59,
@@ -189,12 +181,6 @@ def test_unknown_cells_of_a_map_are_counted() -> None:
     elevation = ElevationMap(elevation_m, np.zeros(2), 0.1)
     safety = np.full((20, 30), Safety.SAFE, dtype=np.uint8)
     safety[:5], safety[-3:] = Safety.UNKNOWN, Safety.HAZARD
-    maps = HazardMaps(elevation_m, elevation_m, elevation_m, safety)
-    ground = MappedGround(
-        Rotation.identity(), Rotation.identity(), np.zeros((1, 3)), elevation, maps, np.zeros(2), None
-    )
-    camera = preset("xc-55").cameras()[0]
-    view = CameraView(np.zeros((480, 640), dtype=np.uint16), camera, rigid(Rotation.identity(), np.zeros(3)))
-    row = stage_row(HdaDetails((view, view), ground=ground))
+    row = stage_row(HdaDetails((VIEW, VIEW), ground=make_ground(elevation, safety)))
     assert row["empty_fraction"] == pytest.approx(2 / 20)
     assert row["unknown_fraction"] == pytest.approx(5 / 20)

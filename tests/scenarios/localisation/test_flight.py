@@ -1,14 +1,10 @@
-"""Tests of the lander's flight: profile, exact derivatives, and inertial navigation along it."""
+"""Tests of the lander's flight: profile, exact derivatives, and limits."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from marsyard.scenarios.localisation.flight import BELOW_END_M, LEAD_S, LanderFlight, ProfileParameters
-from marsyard.sim.measurements import ImuIncrements
-from marsyard.sim.sensor import Imu, InertialSolution
-from marsyard.sim.sensor.imu import DEG_H, DEG_SQRT_H, LN200, MILLI_G, true_increments
 
 GROUND_M = -100.0
 GRAVITY_M_S2 = 3.72
@@ -97,53 +93,6 @@ def test_errors_name_the_allowed_values(flight: LanderFlight) -> None:
         LanderFlight.simulate(
             flight.parameters, np.zeros(3), np.random.default_rng(0), ground_height_m=0.0, gravity_m_s2=GRAVITY_M_S2
         )
-
-
-def _navigate(flight: LanderFlight, increments: ImuIncrements) -> np.ndarray:
-    """Propagate the exact initial state; return the position at the last boundary."""
-    start = flight.state(0.0)
-    solution = InertialSolution.propagate(increments, start.attitude, start.velocity_m_s, GRAVITY_M_S2)
-    position: np.ndarray = start.position_m + solution.displacements_m[-1]
-    return position
-
-
-def test_perfect_inertial_navigation_reproduces_the_flight(flight: LanderFlight) -> None:
-    """The exact increments lead to the exact position: to a millimetre after 50 s."""
-    boundaries = np.arange(0.0, flight.end_s, 1.0 / 400.0)
-    angles, velocities = true_increments(flight, boundaries)
-    position = _navigate(flight, ImuIncrements(boundaries, 1.0 / 400.0, angles, velocities))
-    np.testing.assert_allclose(position, flight.state(float(boundaries[-1])).position_m, rtol=0.0, atol=1e-3)
-
-
-def test_inertial_navigation_errors_have_the_predicted_size(flight: LanderFlight) -> None:
-    """The horizontal position error of an LN-200 has the standard deviation of the linear theory.
-
-    After T = 51 s with the specific force f: accelerometer bias b T^2 / 2; misalignment m f T^2 / 2; gyro bias
-    f w T^3 / 6; angular random walk f n sqrt(T^5 / 20); velocity random walk n sqrt(T^3 / 3).
-    """
-    # number of units, time (s) and mean specific force (m/s^2)
-    units, duration, force = 10, flight.end_s, 4.5
-    p = LN200
-    terms = [
-        0.5 * np.hypot(p.accelerometer_bias_mg, p.accelerometer_wander_mg) * MILLI_G * duration**2,
-        0.5e-3 * p.accelerometer_misalignment_mrad * force * duration**2,
-        np.hypot(p.gyro_bias_deg_h, p.gyro_wander_deg_h) * DEG_H * force * duration**3 / 6.0,
-        p.angular_random_walk_deg_sqrt_h * DEG_SQRT_H * force * np.sqrt(duration**5 / 20.0),
-        1e-3 * p.velocity_random_walk_ug_sqrt_hz * MILLI_G * np.sqrt(duration**3 / 3.0),
-    ]
-    expected = float(np.linalg.norm(terms))
-    assert expected == pytest.approx(4.0, abs=0.5)  # m
-    errors = np.empty((units, 2))
-    for unit in range(units):
-        rng = np.random.default_rng(unit)
-        imu = Imu.draw(p, (0.0, duration), rng)
-        increments = imu.increments(flight, 0.0, duration, rng)
-        last = float(imu.boundaries(0.0, duration)[-1])
-        errors[unit] = (_navigate(flight, increments) - flight.state(last).position_m)[:2]
-    # 99.9 % interval of the sum of squares of 20 normal errors, and 10 % for the simplified theory
-    low, high = (float(chi2.ppf(quantile, errors.size)) for quantile in (5e-4, 1.0 - 5e-4))
-    square_sum = float(np.sum(errors**2)) / expected**2
-    assert 0.8 * low < square_sum < 1.2 * high
 
 
 def test_guidance_does_not_change_the_heading(flight: LanderFlight) -> None:

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionOutcome
 from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.running.engine import check_metrics
 from marsyard.scenarios.condition_columns import contrast_columns
 from marsyard.scenarios.interface import CaseResult
-from marsyard.scenarios.localisation.parameters import LocalisationFaults, LocalisationScenarioParameters
+from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisationScenario
 from marsyard.scenarios.localisation.simulation import LEAD_S, LocalisedDescent
 from marsyard.scenarios.systems import catalogue
@@ -63,11 +62,6 @@ def _simulate(**fault: float) -> LocalisedDescent:
     return _simulate_fault(name, size)
 
 
-def _drop_times(row: Any) -> dict[str, Any]:
-    """Remove the columns of run times, which differ between runs."""
-    return {name: value for name, value in row.items() if "_time_" not in name}
-
-
 @cache
 def _nominal() -> CaseResult:
     return _run(compared=("inertial",))
@@ -92,34 +86,17 @@ def test_small_case_is_located_on_the_map() -> None:
     assert row["inertial.fix_after_s"] < 0.6
 
 
-def test_products_belong_to_the_row() -> None:
-    result = _nominal()
-    products, row = result.products, dict[str, Any](result.row)
-    assert products["track"].shape == (5, 7)
-    assert products["outcomes"] == ["NO_COARSE_FIX", "NO_COARSE_FIX", *["VALID"] * 3]
-    np.testing.assert_array_equal(np.isnan(products["track"][:, 0]), [True, True, False, False, False])
-    np.testing.assert_allclose(np.hypot(*products["track"][-1, 1:3]), row["position_error_m"])
-    assert products["inliers"].shape == (5,)
-    assert np.nanmedian(products["inliers"]) == row["inliers_median"]
-    assert (products["true_xy_m"].shape, products["estimated_xy_m"].shape) == ((4, 2), (5, 2))
-    # image 4 is the last one with an estimate before the final one; both refer to the map
-    error = products["estimated_xy_m"][3] - products["true_xy_m"][3]
-    np.testing.assert_allclose(error, products["track"][3, 1:3], atol=0.5)
-    west, east, south, north = products["map_extent_m"]
-    assert (east - west, north - south) == (pytest.approx(448 * 6.0), pytest.approx(448 * 6.0))
-    assert 0.5 * (west + east) == pytest.approx(2048.0)
-    assert products["landmarks_px"].shape == products["landmarks_residual_px"].shape
-    assert np.count_nonzero(products["landmarks_used"]) == products["inliers"][3]
-
-
 def test_case_repeats_after_another_case() -> None:
     """A case depends neither on an earlier case in the same scenario, nor on the other algorithms of the case."""
     scenario, parameters = LocalisationScenario(), _make_parameters()
     other = scenario.run(_make_parameters(algorithm="inertial", **COARSE), Streams(1, "loc tests", 1))
     repeated = scenario.run(parameters, Streams(1, "loc tests", 0))
-    nominal = {name: value for name, value in _drop_times(_nominal().row).items() if not name.startswith("inertial.")}
-    assert _drop_times(repeated.row) == pytest.approx(nominal, abs=0.0, nan_ok=True)
-    assert repeated.row["image_hash"] == nominal["image_hash"] != other.row["image_hash"]
+    row, nominal = (
+        {name: value for name, value in result.row.items() if "_time_" not in name and not name.startswith("inertial.")}
+        for result in (repeated, _nominal())
+    )
+    assert row == pytest.approx(nominal, abs=0.0, nan_ok=True)
+    assert row["image_hash"] != other.row["image_hash"]
     np.testing.assert_array_equal(repeated.products["track"], _nominal().products["track"])
 
 
@@ -155,10 +132,13 @@ def test_initial_error_is_the_drawn_one() -> None:
 
 
 def test_lost_images_are_missing_in_the_measurements() -> None:
-    assert len(_simulate().images) == 4
-    half = _simulate(lost_images=0.5)
+    complete, half = _simulate(), _simulate(lost_images=0.5)
+    assert len(complete.images) == len(half.states) == 4
     assert 0 < len(half.images) < 4
-    assert len(half.states) == 4
+    # losses have a random stream of their own: the remaining images do not change
+    counts = {image.time_s: image.counts for image in complete.images}
+    for image in half.images:
+        np.testing.assert_array_equal(image.counts, counts[image.time_s])
     result = _run(faults={"lost_images": 1.0}, **COARSE)
     row: Any = result.row
     assert (result.outcome, result.answered, result.failure) == ("NO_COARSE_FIX", False, None)
@@ -166,13 +146,6 @@ def test_lost_images_are_missing_in_the_measurements() -> None:
     assert np.isnan(row["position_error_m"])
     assert np.isnan(row["inliers_min"])
     assert result.products["track"].shape == (1, 7)
-
-
-def test_losses_do_not_change_the_remaining_images() -> None:
-    """Losses have a separate random stream."""
-    complete = {image.time_s: image.counts for image in _simulate().images}
-    for image in _simulate(lost_images=0.5).images:
-        np.testing.assert_array_equal(image.counts, complete[image.time_s])
 
 
 def test_black_image_is_delivered_and_causes_no_false_fix() -> None:
@@ -212,7 +185,6 @@ def test_attitude_error_tilts_the_initial_attitude() -> None:
     assert rotation_deg[2] == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_array_equal(tilted.position_m, clean.position_m)
     np.testing.assert_array_equal(tilted.covariance, clean.covariance)
-    assert isinstance(tilted.world_from_body, Rotation)
 
 
 @pytest.mark.slow
@@ -285,23 +257,6 @@ def test_haze_reduces_the_contrast() -> None:
     )
     # the air's transmission over 1600 m is exp(-0.8) = 0.45 at nadir; the noise of the detector remains
     assert hazy < 0.8 * clear
-
-
-def test_dense_haze_gives_no_position() -> None:
-    result = _run(faults={"haze": 3.0})
-    assert result.failure is None
-    assert result.answered is False
-    assert result.row["false_fix"] is False
-
-
-@pytest.mark.parametrize("name", LocalisationFaults.model_fields)
-def test_fault_name_and_size_are_reported(name: str) -> None:
-    size = 1 if LocalisationFaults.model_fields[name].annotation is int else 0.25
-    assert LocalisationFaults.model_validate({name: size}).columns == {
-        "fault": name,
-        "fault_size": size,
-        "fault_free": False,
-    }
 
 
 @pytest.mark.parametrize("name", LOC_CAMPAIGNS)

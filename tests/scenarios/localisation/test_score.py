@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
 from marsyard.campaigns.store.packed_products import pack_products
-from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.localisation.figures import case_products
 from marsyard.scenarios.localisation.map_truth import MapTruth, SmoothField
 from marsyard.scenarios.localisation.score import REQUIRED_M, EstimateErrors, answer_row, compute_errors
@@ -215,12 +214,9 @@ def test_row_of_refusals_has_nan_errors() -> None:
     }
 
 
-def test_rows_have_equal_declared_columns() -> None:
+def test_rows_have_equal_columns() -> None:
     valid, refused, empty = _row(_estimate(6.0, [0.0] * 3)), _row(_refusal(6.0)), _row(_refusal(END_S))
     assert valid.keys() == refused.keys() == empty.keys()
-    declared = row_columns("localisation")
-    for name, value in valid.items():
-        assert declared.has(name, bool if isinstance(value, bool) else float)
 
 
 def test_products_of_valid_and_refused_estimates() -> None:

@@ -142,19 +142,9 @@ def _write_png_with_orientation(path: Path, counts: np.ndarray, orientation: int
 def _write_tiff_with_orientation(path: Path, counts: np.ndarray, orientation: int) -> None:
     """Write an uncompressed TIFF of 8 bits with one strip; entries: tag, type (3 SHORT, 4 LONG), count, value."""
     rows, columns = counts.shape
-    tags = {
-        256: columns,
-        257: rows,
-        258: 8,
-        259: 1,
-        262: 1,
-        273: 200,
-        274: orientation,
-        277: 1,
-        278: rows,
-        279: counts.size,
-    }
-    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    tags = (256, 257, 258, 259, 262, 273, 274, 277, 278, 279)
+    values = (columns, rows, 8, 1, 1, 200, orientation, 1, rows, counts.size)
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in zip(tags, values, strict=True))
     directory = struct.pack("<H", len(tags)) + entries + struct.pack("<I", 0)
     path.write_bytes(
         (b"II*\0" + struct.pack("<I", 8) + directory).ljust(200, b"\0") + counts.astype(np.uint8).tobytes()

@@ -30,11 +30,16 @@ def small_camera() -> Cahvor:
     return Cahvor(np.array([0.5, -0.2, -1.3]), a, h, v, a, np.zeros(3), (32, 32))
 
 
-def write_folder(folder: Path, lines: list[str], parameters: str = "") -> Path:
-    folder.mkdir(exist_ok=True)
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    return folder
+
+
+def write_folder(folder: Path, lines: list[str], parameters: str = "") -> None:
     (folder / "ingest.toml").write_text(f'name = "frames"\ntask = "matching"\n{parameters}[detector]\nbits = 8\n')
     (folder / "images.csv").write_text("\n".join(lines) + "\n")
-    return folder
 
 
 def ingest_cameras(folder: Path, target: Path) -> list[CameraModel]:
@@ -104,9 +109,9 @@ def test_mars_fixed_models_are_in_the_first_image_frame(
         assert np.allclose(first.c, 0.0, atol=1e-6)
 
 
-def test_models_in_a_fixed_frame_are_refused_for_poses_of_the_table(tmp_path: Path, small_camera: Cahvor) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
+def test_models_in_a_fixed_frame_are_refused_for_poses_of_the_table(
+    tmp_path: Path, folder: Path, small_camera: Cahvor
+) -> None:
     pds3_label(folder, small_camera.transform(MARS_FROM_ROVER), "MCMF_FRAME", None, name="0.img")
     write_folder(
         folder,
@@ -118,9 +123,7 @@ def test_models_in_a_fixed_frame_are_refused_for_poses_of_the_table(tmp_path: Pa
 
 
 @pytest.mark.parametrize("other", ["SITE_FRAME", "table"])
-def test_a_case_has_one_frame(tmp_path: Path, small_camera: Cahvor, other: str) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
+def test_a_case_has_one_frame(tmp_path: Path, folder: Path, small_camera: Cahvor, other: str) -> None:
     pds3_label(folder, small_camera.transform(MARS_FROM_ROVER), "MCMF_FRAME", None, name="0.img")
     pds3_label(folder, small_camera, "ROVER_FRAME", name="1.img", clock=101.0)
     quaternion = ",,," if other == "SITE_FRAME" else "1,0,0,0"
@@ -133,9 +136,7 @@ def test_a_case_has_one_frame(tmp_path: Path, small_camera: Cahvor, other: str) 
         ingest(folder, tmp_path / "out")
 
 
-def test_poses_in_different_sites_are_refused(tmp_path: Path, small_camera: Cahvor) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
+def test_poses_in_different_sites_are_refused(tmp_path: Path, folder: Path, small_camera: Cahvor) -> None:
     pds3_label(folder, small_camera, "ROVER_FRAME", name="0.img")
     path = pds3_label(folder, small_camera, "ROVER_FRAME", name="1.img", clock=101.0)
     path.write_bytes(path.read_bytes().replace(b"SYSTEM_INDEX = 194\n", b"SYSTEM_INDEX = 195\n"))
@@ -144,9 +145,7 @@ def test_poses_in_different_sites_are_refused(tmp_path: Path, small_camera: Cahv
         ingest(folder, tmp_path / "out")
 
 
-def test_separate_camera_file_is_in_the_rover_frame(tmp_path: Path, small_camera: Cahvor) -> None:
-    folder = tmp_path / "folder"
-    folder.mkdir()
+def test_separate_camera_file_is_in_the_rover_frame(tmp_path: Path, folder: Path, small_camera: Cahvor) -> None:
     product = pds3_label(folder, small_camera.transform(SITE_FROM_ROVER), "SITE_FRAME", name="0.img")
     pds3_label(folder, small_camera, "ROVER_FRAME", name="1.img", clock=101.0)
     write_cahvor(read_pds3(product)[0], folder / "left.cahvor")

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.scenarios.descent.flight import create_flight
-from marsyard.scenarios.descent.measurement import DescentInstruments
+from marsyard.scenarios.descent.measurements import DescentInstruments
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.parts import InstrumentReadings, InstrumentTruth, MotionInputs, Poses, ScoredDescent
 from marsyard.scenarios.parts.scores import compute_scores

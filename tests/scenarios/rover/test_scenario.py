@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.scenarios.interface import Scalar
+from marsyard.scenarios.interface import CaseResult, Scalar
 from marsyard.scenarios.rover.closed_loop import run_case
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.scenario import RoverScenario
@@ -30,6 +30,11 @@ def make_streams(case: int = 0) -> Streams:
     return Streams(1, "rover tests", case)
 
 
+def drop_times(row: Mapping[str, Scalar]) -> dict[str, Scalar]:
+    """Remove the columns of run times, which differ between runs."""
+    return {name: value for name, value in row.items() if "time" not in name}
+
+
 def test_run_is_tracked_scored_and_deterministic() -> None:
     scenario, parameters = RoverScenario(), make_parameters(score={"stored_updates": 2})
     result = scenario.run(parameters, make_streams())
@@ -47,11 +52,8 @@ def test_run_is_tracked_scored_and_deterministic() -> None:
     assert row["range_end_m"] < row["range_start_m"] < 4.1
     assert abs(row["disparity_error_goal_px"]) <= 0.55
     assert row["update_2_magnification"] == pytest.approx(row["magnification_max"], rel=0.05)
-    repeated_row = dict(scenario.run(parameters, make_streams()).row)
-    time_columns = {name for name in row if "time" in name}
-    assert {name: value for name, value in repeated_row.items() if name not in time_columns} == pytest.approx(
-        {name: value for name, value in row.items() if name not in time_columns}, abs=0.0, nan_ok=True
-    )
+    repeated_row = scenario.run(parameters, make_streams()).row
+    assert drop_times(repeated_row) == pytest.approx(drop_times(row), abs=0.0, nan_ok=True)
     stops = int(row["updates"])
     products = result.products
     assert products["rover_true_m"].shape == (stops, 3)
@@ -130,9 +132,12 @@ def test_targets_can_be_designated_by_position(designation: str) -> None:
     assert np.linalg.norm(run.stops[0].reported_px(run.setup.rig.calibrated) - run.stops[0].point_px) < 3.5
 
 
+def run_custom_tracker(name: str) -> CaseResult:
+    return RoverScenario().run(make_parameters(algorithm=f"tests.scenarios.rover.trackers:{name}"), make_streams())
+
+
 def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
-    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:OffsetTracker")
-    result = RoverScenario().run(parameters, make_streams())
+    result = run_custom_tracker("OffsetTracker")
     assert result.answered
     assert not result.row["tracked"]
     assert not result.row["no_false_track"]
@@ -141,8 +146,7 @@ def test_wrong_target_reported_as_tracked_is_a_false_track() -> None:
 
 
 def test_lost_target_is_not_a_valid_answer() -> None:
-    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:LosingTracker")
-    result = RoverScenario().run(parameters, make_streams())
+    result = run_custom_tracker("LosingTracker")
     assert (result.outcome, result.answered) == ("LOST", False)
     assert np.isnan(result.row["position_error_m"])
     assert result.row["no_false_track"]
@@ -151,18 +155,10 @@ def test_lost_target_is_not_a_valid_answer() -> None:
 
 def test_run_without_stops_remains_in_the_population_of_visible_targets() -> None:
     """A tracker that never aims has lost sight of nothing: its run counts, as a failure."""
-    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:UnaimedTracker")
-    result = RoverScenario().run(parameters, make_streams())
+    result = run_custom_tracker("UnaimedTracker")
     assert not result.answered
     assert (result.row["updates"], result.row["tracked"]) == (0, False)
     assert result.row["point_in_view"]
-
-
-def test_missing_answer_is_a_tracker_error() -> None:
-    parameters = make_parameters(algorithm="tests.scenarios.rover.trackers:SilentTracker")
-    result = RoverScenario().run(parameters, make_streams())
-    assert (result.outcome, result.answered) == ("BAD_ANSWER", False)
-    assert "the answer is a NoneType; allowed: a TargetUpdate" in result.failure.error
 
 
 def test_unknown_trackers_and_cameras_are_rejected() -> None:
@@ -196,7 +192,7 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     assert [result.failure for result in results] == [None, None]
     # A new scenario object without a cached drive gives the same row.
     uncached_row = SharedDriveScenario().run(small_steps, make_streams(0)).row
-    assert drop_time_columns(uncached_row) == drop_time_columns(results[0].row)
+    assert drop_times(uncached_row) == pytest.approx(drop_times(results[0].row), abs=0.0, nan_ok=True)
     # Small and large steps cover the same arc. A target is on the face if no stop exceeds the allowed viewing angle.
     row = results[0].row
     assert [result.row["obliquity_max_deg"] for result in results] == [row["obliquity_max_deg"]] * 2
@@ -217,13 +213,3 @@ def test_trackers_share_the_images_of_a_drive() -> None:
     # The camera circles the centre of the targets at a constant distance.
     ranges = [stop.range_m for stop in second_target.stops]
     assert np.ptp(ranges) < 0.15
-
-
-def drop_time_columns(row: Mapping[str, Scalar]) -> dict[str, str]:
-    return {name: repr(value) for name, value in row.items() if "time" not in name}
-
-
-@pytest.mark.parametrize(("bank", "n_terrains"), [(8, 8), (100_000, 0)])
-def test_only_small_banks_are_built_in_advance(bank: int, n_terrains: int) -> None:
-    parameters = make_parameters(world={**SHORT_RUN["world"], "bank": bank})
-    assert RoverScenario().shared_inputs(parameters) == tuple(range(n_terrains))
