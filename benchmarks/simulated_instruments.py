@@ -12,7 +12,7 @@ from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.scenarios.descent.conditions import instrument_errors
 from marsyard.scenarios.descent.flight import create_flight, states_at_images
 from marsyard.scenarios.descent.images import camera_optics
-from marsyard.scenarios.descent.measurement import DescentInstruments, measure
+from marsyard.scenarios.descent.measurements import DescentInstruments, measure
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.simulation import draw_detector
 from marsyard.scenarios.descent.world import DescentWorld

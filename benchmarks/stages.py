@@ -23,7 +23,7 @@ DESCENT_STAGES: Stages = {
         ("sensor/detector.py", "expose"),
         ("sensor/image_motion.py", "from_camera"),
     ),
-    "instruments": (("descent/measurement.py", "draw"), ("descent/measurement.py", "measure")),
+    "instruments": (("descent/measurements.py", "draw"), ("descent/measurements.py", "measure")),
     "DIMES": (("dimes/estimator.py", "estimate"),),
     "feasible overlap": (("descent/conditions.py", "overlap_row"),),
 }

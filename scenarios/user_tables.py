@@ -1,7 +1,5 @@
 """Comma-separated tables of users: rows as parsed, and one message for each problem."""
 
-from __future__ import annotations
-
 import csv
 import difflib
 import math

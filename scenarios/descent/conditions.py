@@ -11,7 +11,7 @@ from marsyard.algorithms.dimes.views import altitudes_at_images
 from marsyard.scenarios.condition_columns import attitude_rate_deg_s, off_nadir_deg, sun_columns
 from marsyard.scenarios.descent.flight import mean_velocities
 from marsyard.scenarios.descent.images import camera_optics
-from marsyard.scenarios.descent.measurement import DescentInstruments
+from marsyard.scenarios.descent.measurements import DescentInstruments
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.interface import Scalar

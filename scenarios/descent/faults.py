@@ -1,7 +1,5 @@
 """Faults of a descent, and their injection into terrain, clouds, times and measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Descent scenario: simulate a parachute descent and its measurements, run the algorithms, and score them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any

@@ -10,7 +10,7 @@ from marsyard.scenarios.cameras import Optics
 from marsyard.scenarios.case_faults import Images, add_detector_faults, corrupt_images
 from marsyard.scenarios.descent.flight import DescentFlight, create_flight, states_at_images, true_velocity
 from marsyard.scenarios.descent.images import camera_optics, take_exposures
-from marsyard.scenarios.descent.measurement import DescentInstruments, add_increments, measure, measure_exactly
+from marsyard.scenarios.descent.measurements import DescentInstruments, add_increments, measure, measure_exactly
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.scenarios.velocity import Horizontal, Span

@@ -1,7 +1,5 @@
 """Timeline of a descent, for its figure in the report and the exports of `marsyard replay`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from marsyard.algorithms.interface import VelocityEstimate

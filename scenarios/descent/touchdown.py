@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.dimes import propagate_velocity
 from marsyard.algorithms.interface import VelocityEstimate
-from marsyard.scenarios.descent.measurement import DescentInstruments
+from marsyard.scenarios.descent.measurements import DescentInstruments
 from marsyard.scenarios.descent.parameters import TouchdownParameters
 from marsyard.scenarios.velocity import Horizontal
 

@@ -1,4 +1,6 @@
-"""The helicopter field test of DIMES (Johnson, Willson, Goguen, Alexander & Meller, sections III and IV).
+"""The helicopter field test of DIMES.
+
+The paper is Johnson, Willson, Goguen, Alexander & Meller, "Field Testing of the MER DIMES", sections III and IV.
 
 - `parameters`: parameters of campaigns
 - `flight`, `images`: flight of a run with its camera, and the images

@@ -1,7 +1,4 @@
-"""Triple of images of a run, and the measurements of an estimator (paper, III.D).
-
-The paper is Johnson et al., "Field Testing of the MER DIMES".
-"""
+"""Triple of images of a run, and the measurements of an estimator (paper, III.D)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

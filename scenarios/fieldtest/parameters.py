@@ -1,7 +1,4 @@
-"""Parameters of field test campaigns: runs, helicopter, instruments, targets, and selection of triples.
-
-The paper is Johnson et al., "Field Testing of the MER DIMES".
-"""
+"""Parameters of field test campaigns: runs, helicopter, instruments, targets, and selection of triples."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Simulation and processing of a run (paper: Johnson et al., "Field Testing of the MER DIMES")."""
+"""Simulation and processing of a run."""
 
 from dataclasses import dataclass, replace
 

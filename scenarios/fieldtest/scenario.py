@@ -1,7 +1,4 @@
-"""Field test scenario: simulate, measure, estimate and score one triple of images of a run.
-
-The paper is Johnson et al., "Field Testing of the MER DIMES".
-"""
+"""Field test scenario: simulate, measure, estimate and score one triple of images of a run."""
 
 from functools import lru_cache, partial
 from typing import Any

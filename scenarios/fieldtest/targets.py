@@ -4,8 +4,6 @@ The panels are detected as small bright spots: a white top-hat removes the groun
 threshold is a candidate. The prior attitude predicts the pixels of the targets. The common displacement with the most
 pairs of candidates and targets determines which candidates are targets; a rotation fitted to the pairs rejects the
 others. The paper states that the centroids were extracted, not how: all parameters of the detection are assumed.
-
-The paper is Johnson et al., "Field Testing of the MER DIMES", section III.D.2.
 """
 
 from __future__ import annotations

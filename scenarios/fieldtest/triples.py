@@ -1,7 +1,4 @@
-"""Triples of the field test: three images of a run that DIMES receives like those of a landing.
-
-The paper is Johnson et al., "Field Testing of the MER DIMES", section IV.
-"""
+"""Triples of the field test: three images of a run that DIMES receives like those of a landing."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,1 +1,4 @@
-"""A helicopter, or a lander, that selects a landing site in two images (Johnson, Montgomery & Matthies)."""
+"""A helicopter, or a lander, that selects a landing site in two images.
+
+The paper, its sections, figures and tables, is Johnson, Montgomery & Matthies, "Vision Guided Landing".
+"""

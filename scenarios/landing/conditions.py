@@ -1,7 +1,4 @@
-"""Columns of a landing case that do not depend on an algorithm: conditions and measurement errors.
-
-Sections and figures are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
-"""
+"""Columns of a landing case that do not depend on an algorithm: conditions and measurement errors."""
 
 import numpy as np
 
@@ -17,8 +14,6 @@ from marsyard.sim.sensor import height_above_ground
 #: Maximum changes between the images for tracking (section II.A): rotation about the optical axis and about each other
 #: axis, and change of height as a fraction of the range along the optical axis.
 MAX_ROLL_DEG, MAX_TILT_DEG, MAX_HEIGHT_CHANGE_FRACTION = 10.0, 20.0, 0.2
-
-NAN = float("nan")
 
 
 def site_populations(truth: GroundTruth) -> dict[str, Scalar]:
@@ -80,7 +75,7 @@ def conditions(case: RenderedFlight, measurements: LandingMeasurements) -> dict[
         **site_populations(truth),
         "true_safe_fraction": float(truth.safe.sum() / max(int(covered.sum()), 1)),
         "within_limits": bool(within_limits),
-        "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else NAN,
+        "true_slope_median_deg": float(np.degrees(np.median(slopes))) if slopes.size else np.nan,
         "max_slope_deg": float(np.degrees(p.hda.max_slope_rad)),
         "max_roughness_m": p.hda.max_roughness_m,
         "strict_threshold": p.hda.max_roughness_m <= truth.limits.max_roughness_m,

@@ -1,7 +1,4 @@
-"""Arrays and timeline of a landing case, for its figures in the report and the exports of `marsyard replay`.
-
-Sections and figures are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
-"""
+"""Arrays and timeline of a landing case, for its figures in the report and the exports of `marsyard replay`."""
 
 from typing import Any
 

@@ -1,7 +1,4 @@
-"""True states and on-board poses at the two images of a case, from the parameters or chosen from a helicopter flight.
-
-Section V is that of Johnson, Montgomery & Matthies, "Vision Guided Landing".
-"""
+"""True states and on-board poses at the two images of a case: from the parameters, or of a helicopter flight."""
 
 from __future__ import annotations
 

@@ -4,8 +4,6 @@ Slope is the angle of the plane of least absolute deviations over the footprint.
 this plane, upwards or downwards. Like the algorithm's plane of least median of squares (paper, section III), the plane
 is robust against rocks. It is unique, needs no random trials, and is continuous in the heights (docs/adr/0028). Heights
 are those of the terrain and of the rocks' triangles within each footprint, without interpolation between footprints.
-
-The paper is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 from __future__ import annotations

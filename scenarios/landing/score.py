@@ -1,7 +1,4 @@
-"""Result columns of a landing case: answer, map, site and touchdown, compared with the truth.
-
-Sections, figures and tables are those of Johnson, Montgomery & Matthies, "Vision Guided Landing".
-"""
+"""Result columns of a landing case: answer, map, site and touchdown, compared with the truth."""
 
 from __future__ import annotations
 
@@ -42,7 +39,6 @@ MOTION_COLUMNS = (
     "motion_residual_px", "points", "matched_fraction", "map_rows", "map_columns", "cell_m",
     "matches_dissimilar", "matches_out_of_bounds", "matches_inconsistent", "empty_fraction", "unknown_fraction",
 )  # fmt: skip
-NAN = float("nan")
 #: Minimum distance of a site from hazards, as a fraction of the distance of the farthest position.
 MIN_CLEARANCE_FRACTION = 0.5
 #: Columns of the true ground under a lander; their prefix is the name of the position (`site`, `touchdown`).
@@ -164,8 +160,8 @@ def map_errors(
         "elevation_noise_m": noise,
         "relief_error_fraction": noise / relief,
         "elevation_outliers": float(np.mean(np.abs(residuals) > 5.0 * noise)),
-        "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if has_slopes else float("nan"),
-        "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if has_slopes else float("nan"),
+        "slope_error_bias_deg": float(np.degrees(slope_errors.mean())) if has_slopes else np.nan,
+        "slope_error_rms_deg": float(np.degrees(np.sqrt(np.mean(slope_errors**2)))) if has_slopes else np.nan,
     }
 
 
@@ -198,7 +194,7 @@ def true_motion(flight: LandingFlight, pair: Pair) -> RigidTransform:
 
 def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, Scalar]:
     """Compute the columns of tracks and motion errors; NaN for stages that were not reached."""
-    row: dict[str, Scalar] = dict.fromkeys(MOTION_COLUMNS, NAN)
+    row: dict[str, Scalar] = dict.fromkeys(MOTION_COLUMNS, np.nan)
     row["tracked_well"] = False
     if not isinstance(details, HdaDetails):
         return row
@@ -220,9 +216,9 @@ def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, 
             "tracks": accepted,
             "features_in_view": int(in_view.sum()),
             "tracks_correct": int(is_correct.sum()),
-            "tracked_fraction": float(is_correct.sum() / in_view.sum()) if np.any(in_view) else NAN,
+            "tracked_fraction": float(is_correct.sum() / in_view.sum()) if np.any(in_view) else np.nan,
             "tracked_well": bool(np.any(in_view) and is_correct.sum() >= MIN_TRACKED_FRACTION * in_view.sum()),
-            "tracks_outlier_fraction": float(np.mean(~is_correct[tracks.accepted])) if accepted else NAN,
+            "tracks_outlier_fraction": float(np.mean(~is_correct[tracks.accepted])) if accepted else np.nan,
         }
     if details.motion is not None:
         row |= motion_errors(details.motion.second_from_first, true_motion(flight, pair))
@@ -232,7 +228,7 @@ def motion_row(details: object, flight: LandingFlight, pair: Pair) -> dict[str, 
 def times_row(details: object) -> dict[str, Scalar]:
     """Compute the columns of processor times of the stages in Table I; NaN for stages that were not reached."""
     stage_times_s = details.times_s if isinstance(details, HdaDetails) else {}
-    return {f"{stage}_time_s": stage_times_s.get(stage, NAN) for stage in STAGES}
+    return {f"{stage}_time_s": stage_times_s.get(stage, np.nan) for stage in STAGES}
 
 
 def outcome_row(estimate: SiteEstimate) -> dict[str, Scalar]:
@@ -261,7 +257,7 @@ def site_row(estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth) 
     row = _ground_row("site", position, truth)
     is_target_safe, reports_site = bool(row["site_safe"]), estimate.outcome is SiteOutcome.SAFE_SITE
     reports_safe_site, refuses = reports_site and is_target_safe, estimate.outcome is SiteOutcome.NO_SAFE_SITE
-    clearance = truth.clearance_fraction(position) if reports_site and position is not None else NAN
+    clearance = truth.clearance_fraction(position) if reports_site and position is not None else np.nan
     return {
         **row,
         "site_safe": reports_safe_site,
@@ -283,7 +279,7 @@ def _ground_row(name: str, position: np.ndarray | None, truth: GroundTruth) -> d
     columns = [f"{name}_{column}" for column in GROUND_COLUMNS]
     footprint = None if position is None else truth.footprint_at(position)
     if position is None or footprint is None:
-        return {f"{name}_safe": False, **dict.fromkeys(columns, NAN)}
+        return {f"{name}_safe": False, **dict.fromkeys(columns, np.nan)}
     slope_deg, roughness_m = float(np.degrees(footprint.slope_rad[0])), float(footprint.roughness_m[0])
     # smaller of the two relative margins: 0.2 if slope or roughness is at 80 % of its limit
     limits = truth.limits
@@ -310,7 +306,7 @@ def landing_row(
     site = estimate.site_world
     if touchdown is None or site is None:
         columns = (*(f"touchdown_{column}" for column in GROUND_COLUMNS), *TOUCHDOWN_COLUMNS)
-        return {"landed": False, **dict.fromkeys(columns, NAN)}
+        return {"landed": False, **dict.fromkeys(columns, np.nan)}
     position, velocity = touchdown.state.position_m, touchdown.state.velocity_m_s
     ground_row = _ground_row("touchdown", position[:2], truth)
     return {
@@ -334,7 +330,7 @@ def map_row(
     p: LandingScenarioParameters, estimate: SiteEstimate, flight: LandingFlight, truth: GroundTruth
 ) -> dict[str, Scalar]:
     """Compute the columns of map errors and hazard counts; only the relief error, NaN, without a map."""
-    row: dict[str, Scalar] = {"relief_error_fraction": NAN}
+    row: dict[str, Scalar] = {"relief_error_fraction": np.nan}
     if not isinstance(estimate.details, HdaDetails) or estimate.details.ground is None:
         return row
     ground = estimate.details.ground

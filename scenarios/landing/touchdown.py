@@ -4,8 +4,6 @@ The filter's estimate controls the landing, and the filter's errors depend sligh
 solves for both. Each iteration flies with the errors of the previous iteration. It then simulates instruments and
 filter on this flight with the same random numbers. The iterations end when the path converges. The fixed point is
 unique because the filter is causal. The change of the path in the last iteration is reported.
-
-"The paper" is Johnson, Montgomery & Matthies, "Vision Guided Landing".
 """
 
 from dataclasses import dataclass

@@ -1,9 +1,7 @@
 """Arrays and timeline of a localisation case, for its figures in the report and the exports of `marsyard replay`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,13 +26,12 @@ from marsyard.scenarios.timeline import (
 )
 from marsyard.scenarios.timeline_surface import grey_values, surface_from_above
 
-if TYPE_CHECKING:
-    from marsyard.scenarios.localisation.simulation import LocalisedDescent
-
-_NAN = float("nan")
-
 #: Side of the stored map, pixels.
 _THUMBNAIL_PX = 512
+#: Half width of the shown ground divided by the altitude at the start.
+_HALF_WIDTH_RATIO = 1.2
+#: Time between the poses of the true path, s, and maximum side of the shown map, pixels.
+_STEP_S, _MAP_PX = 0.1, 384
 
 
 def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> Mapping[str, Any]:
@@ -72,7 +69,7 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
         "outcomes": [estimate.outcome.name for estimate in estimates],
         "inliers": np.array(
             [
-                _NAN if not isinstance(item, LocalisationDetails) or item.inliers is None else float(item.inliers)
+                np.nan if not isinstance(item, LocalisationDetails) or item.inliers is None else float(item.inliers)
                 for item in details
             ]
         ),
@@ -96,12 +93,6 @@ def case_products(descent: LocalisedDescent, answers: StreamAnswers[PositionEsti
     return values
 
 
-#: Half width of the shown ground divided by the altitude at the start.
-_HALF_WIDTH_RATIO = 1.2
-#: Time between the poses of the true path, s, and maximum side of the shown map, pixels.
-_STEP_S, _MAP_PX = 0.1, 384
-
-
 def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> Timeline:
     """Create the timeline of a descent: images with landmarks, estimates with covariance, map and ground.
 
@@ -116,19 +107,20 @@ def localisation_timeline(descent: LocalisedDescent, answers: StreamAnswers[Posi
     centre = (float(first.position_m[0]), float(first.position_m[1]))
     half_width_m = _HALF_WIDTH_RATIO * descent.p.flight.altitude_start_m
     initial = descent.measurements.initial
+    estimated_path, ellipsoids = _reported_states(descent, answers)
     return Timeline(
         surfaces={
             "ground": surface_from_above(descent.world.scene, centre, half_width_m, descent.p.render.backend),
             "map": _map_surface(descent),
         },
-        paths={"true": Path.from_motion(motion), **_estimated_path(descent, answers)},
+        paths={"true": Path.from_motion(motion), **estimated_path},
         images=_images(descent, answers),
         points={
             "initial position": TimedPoints(
                 np.array([initial.time_s - descent.imu_offset_s]), _to_world(descent, initial.position_m[None])
             )
         },
-        ellipsoids=_covariances(descent, answers),
+        ellipsoids=ellipsoids,
         series={
             "altitude, m": Series(motion.times_s, np.asarray(altitudes)),
             **({} if answers is None else _error_series(descent, answers)),
@@ -142,30 +134,25 @@ def _to_world(descent: LocalisedDescent, positions_m: Float64[np.ndarray, "n 3"]
     return np.column_stack([descent.map_truth.world_position(positions_m[:, :2]), positions_m[:, 2]])
 
 
-def _estimated_path(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> dict[str, Path]:
-    """Return the path through the reported states; empty without one."""
+def _reported_states(
+    descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None
+) -> tuple[dict[str, Path], dict[str, Ellipsoids]]:
+    """Return the path through the reported states, and the positions with their covariances; empty without a state."""
     reported = [
-        (answer.time_s, answer.position_m, answer.world_from_body.as_quat())
+        (answer.time_s, answer.position_m, answer.world_from_body.as_quat(), answer.covariance[:3, :3])
         for answer in (() if answers is None else answers.estimates)
-        if answer.position_m is not None and answer.world_from_body is not None
+        if answer.position_m is not None and answer.world_from_body is not None and answer.covariance is not None
     ]
     if not reported:
-        return {}
-    times, positions, quaternions = (np.array(values, dtype=np.float64) for values in zip(*reported, strict=True))
-    return {"estimated": Path(times - descent.imu_offset_s, _to_world(descent, positions), quaternions)}
-
-
-def _covariances(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate] | None) -> dict[str, Ellipsoids]:
-    """Return the reported positions with their covariances; empty without one."""
-    reported = [
-        (answer.time_s, answer.position_m, answer.covariance[:3, :3])
-        for answer in (() if answers is None else answers.estimates)
-        if answer.position_m is not None and answer.covariance is not None
-    ]
-    if not reported:
-        return {}
-    times, centres, covariances = (np.array(values, dtype=np.float64) for values in zip(*reported, strict=True))
-    return {"estimated position": Ellipsoids(times - descent.imu_offset_s, _to_world(descent, centres), covariances)}
+        return {}, {}
+    tags_s, positions, quaternions, covariances = (
+        np.array(values, dtype=np.float64) for values in zip(*reported, strict=True)
+    )
+    times_s, world_m = tags_s - descent.imu_offset_s, _to_world(descent, positions)
+    return (
+        {"estimated": Path(times_s, world_m, quaternions)},
+        {"estimated position": Ellipsoids(times_s, world_m, covariances)},
+    )
 
 
 def _error_series(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> dict[str, Series]:

@@ -1,7 +1,5 @@
 """Instruments of localisation: radar, clock of the images, and inertial navigation with its initial errors."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Localisation scenario: simulate a descent, its map and its measurements, run the algorithms, and score them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 

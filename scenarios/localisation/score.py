@@ -7,7 +7,6 @@ relative to the world also contains the registration and the distortion of the m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
@@ -23,12 +22,8 @@ from marsyard.scenarios.radiance import sun_at
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.sim.dynamics import State
 
-if TYPE_CHECKING:
-    from marsyard.scenarios.localisation.simulation import LocalisedDescent
 #: Required horizontal accuracy, m, and time after the start in which it is required, s (Mars 2020).
 REQUIRED_M, REQUIRED_S = 40.0, 10.0
-_NAN = float("nan")
-_AXES = ("east", "north", "up")
 
 
 def attitude_error_deg(estimate: Rotation, truth: State) -> float:
@@ -85,21 +80,18 @@ class EstimateErrors:
 
 
 def compute_errors(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimate]) -> list[EstimateErrors | None]:
-    """Compute the errors of each estimate, None for a refusal.
-
-    Estimates have time tags of the inertial unit, whose offset is subtracted for the true time.
-    """
-    first, last = descent.flight.span_s
+    """Compute the errors of each estimate, None for a refusal."""
     return [
-        EstimateErrors.from_estimate(
-            estimate,
-            descent.flight.state(float(np.clip(estimate.time_s - descent.imu_offset_s, first, last))),
-            descent.map_truth,
-        )
+        EstimateErrors.from_estimate(estimate, _true_state(descent, estimate.time_s), descent.map_truth)
         if estimate.outcome is PositionOutcome.VALID
         else None
         for estimate in answers.estimates
     ]
+
+
+def _true_state(descent: LocalisedDescent, tag_s: float) -> State:
+    """Return the true state at a time tag of the inertial unit, whose offset is subtracted for the true time."""
+    return descent.flight.state(float(np.clip(tag_s - descent.imu_offset_s, *descent.flight.span_s)))
 
 
 def conditions(descent: LocalisedDescent) -> dict[str, Scalar]:
@@ -143,18 +135,18 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimat
         if isinstance(item, LocalisationDetails) and item.coarse_position_m is not None
     ]
     return {
-        "coarse_error_m": _coarse_error_m(descent, *coarse[0]) if coarse else _NAN,
-        "fix_after_s": valid[0].time_s if valid else _NAN,
+        "coarse_error_m": _coarse_error_m(descent, *coarse[0]) if coarse else np.nan,
+        "fix_after_s": valid[0].time_s if valid else np.nan,
         "fixed_in_time": bool(early),
         "position_reported": bool(valid),
-        "position_error_at_10_s_m": early[-1].horizontal_m if early else _NAN,
-        "position_error_m": _NAN if final is None else final.horizontal_m,
-        "position_error_max_m": max(horizontal, default=_NAN),
+        "position_error_at_10_s_m": early[-1].horizontal_m if early else np.nan,
+        "position_error_m": np.nan if final is None else final.horizontal_m,
+        "position_error_max_m": max(horizontal, default=np.nan),
         "false_fix": any(error > REQUIRED_M for error in horizontal),
         "valid_images": sum(error is not None for error in errors[:-1]),
         **_final_columns(final),
-        "inliers_median": float(np.median(inliers)) if inliers else _NAN,
-        "inliers_min": float(min(inliers)) if inliers else _NAN,
+        "inliers_median": float(np.median(inliers)) if inliers else np.nan,
+        "inliers_min": float(min(inliers)) if inliers else np.nan,
         "image_time_max_s": max(times_s, default=0.0),
         "image_time_median_s": float(np.median(times_s)) if times_s else 0.0,
     }
@@ -162,28 +154,16 @@ def answer_row(descent: LocalisedDescent, answers: StreamAnswers[PositionEstimat
 
 def _coarse_error_m(descent: LocalisedDescent, time_s: float, position_m: Float64[np.ndarray, "2"]) -> float:
     """Return the horizontal error, relative to the map, of a position at a time of the inertial unit."""
-    first_s, last_s = descent.flight.span_s
-    truth = descent.flight.state(float(np.clip(time_s - descent.imu_offset_s, first_s, last_s)))
-    return float(np.hypot(*(position_m - descent.map_truth.map_position(truth.position_m[:2]))))
+    reference = descent.map_truth.map_position(_true_state(descent, time_s).position_m[:2])
+    return float(np.hypot(*(position_m - reference)))
 
 
 def _final_columns(error: EstimateErrors | None) -> dict[str, Scalar]:
     """Return components and consistency of the final error; NaN without a valid estimate."""
+    names = [f"position_{kind}_{axis}_m" for kind in ("error", "sd") for axis in ("east", "north", "up")]
+    names += ["position_error_world_m", "velocity_error_m_s", "attitude_error_deg", "position_nees"]
     if error is None:
-        row: dict[str, Scalar] = {f"position_{kind}_{name}_m": _NAN for name in _AXES for kind in ("error", "sd")}
-        return row | dict.fromkeys(
-            ("position_error_world_m", "velocity_error_m_s", "attitude_error_deg", "position_nees"), _NAN
-        )
-    row = {
-        f"position_error_{name}_m": float(value)
-        for name, value in zip(("east", "north", "up"), error.position_m, strict=True)
-    }
-    row |= {
-        f"position_sd_{name}_m": float(value) for name, value in zip(("east", "north", "up"), error.sd_m, strict=True)
-    }
-    return row | {
-        "position_error_world_m": float(np.hypot(*error.world_m)),
-        "velocity_error_m_s": error.velocity_m_s,
-        "attitude_error_deg": error.attitude_deg,
-        "position_nees": error.nees,
-    }
+        return dict.fromkeys(names, np.nan)
+    values = [*error.position_m, *error.sd_m, np.hypot(*error.world_m)]
+    values += [error.velocity_m_s, error.attitude_deg, error.nees]
+    return {name: float(value) for name, value in zip(names, values, strict=True)}

@@ -1,7 +1,5 @@
 """Sites of the localisation scenario, from ``sites.toml``, and required size of a DTM in the middle of their ground."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from functools import cache, lru_cache

@@ -9,8 +9,6 @@ from the nearest point of this curve. For two images from one position, the curv
 `MatchingScenario` compares only; the scenarios with an algorithm add the same columns to their rows.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,7 +30,6 @@ from marsyard.sim.camera import CameraModel, camera_pose
 from marsyard.sim.measurements import DetectorImage
 from marsyard.sim.streams import Streams
 
-NAN = float("nan")
 #: Maximum number of features of an image; maximum distance of the best match / second-best match (Lowe, Fig. 11).
 _MAX_FEATURES, _MAX_DISTANCE_RATIO = 4000, 0.8
 #: RANSAC: maximum distance of an inlier from its epipolar line, pixels, and probability of a sample without outlier.
@@ -103,11 +100,11 @@ def agreement_row(pairs: Sequence[PairAgreement]) -> dict[str, Scalar]:
     medians = [float(np.median(pair.residuals_px)) for pair in pairs if pair.residuals_px.size]
     return {
         "matches": int(inliers.sum()),
-        "outlier_fraction": 1.0 - float(inliers.mean()) if inliers.size else NAN,
+        "outlier_fraction": 1.0 - float(inliers.mean()) if inliers.size else np.nan,
         "pairs_matched": len(medians),
-        "residual_median_px": float(np.median(residuals)) if medians else NAN,
-        "residual_90_percent_px": float(np.quantile(residuals, 0.9, method="higher")) if medians else NAN,
-        "residual_worst_pair_px": max(medians, default=NAN),
+        "residual_median_px": float(np.median(residuals)) if medians else np.nan,
+        "residual_90_percent_px": float(np.quantile(residuals, 0.9, method="higher")) if medians else np.nan,
+        "residual_worst_pair_px": max(medians, default=np.nan),
     }
 
 
@@ -225,14 +222,16 @@ def case_row(p: MeasuredParameters, images: Sequence[DetectorImage]) -> dict[str
         "images": len(images),
         "duration_s": images[-1].time_s - images[0].time_s,
         "max_rotation_deg": max(float(np.degrees(step.rotation.magnitude())) for step in steps),
-        "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps) if has_positions else NAN,
+        "max_translation_m": max(float(np.linalg.norm(step.translation)) for step in steps)
+        if has_positions
+        else np.nan,
         "image_hash": hash_images(image.counts for image in images),
     }
 
 
 def distance(first: Float[np.ndarray, "n"] | None, second: Float[np.ndarray, "n"] | None) -> float:
     """Return the distance between two answers; NaN if one is missing."""
-    return NAN if first is None or second is None else float(np.linalg.norm(first - second))
+    return np.nan if first is None or second is None else float(np.linalg.norm(first - second))
 
 
 class MatchingParameters(MeasuredParameters):

@@ -41,7 +41,6 @@ from marsyard.sim.sensor import Detector, DetectorParameters
 from marsyard.sim.sensor.compression import MAX_BITS, MIN_BITS, compress_and_decompress
 from marsyard.sim.streams import Streams
 
-NAN = float("nan")
 #: Largest side of a rendered map, pixels; fewest bits of a simulated detector.
 _MAX_SIDE_PX, _MIN_DETECTOR_BITS = 4096, 8
 #: Smallest height of a camera for which the mesh of the ground is made, m.
@@ -219,7 +218,7 @@ class OverMapScenario(TypedScenario[OverMapParameters]):
         posed = PosedImage.from_detector(image, np.asarray(record.pose.translation), record.attitude)
         sd_m = p.position_sd_m if inliers is None else _REGISTRATION_SD_PX * map_product.pixel_m
         comparison = compare_with_map(posed, map_product, sd_m, p.lvs)
-        row |= {"registration_inliers": NAN if inliers is None else inliers, **_describe(comparison, map_product)}
+        row |= {"registration_inliers": np.nan if inliers is None else inliers, **_describe(comparison, map_product)}
         products |= _products(comparison, "recorded")
         stored_map, detector = p.cases.stored.map, p.cases.stored.detector
         counterpart = render_counterpart(
@@ -275,7 +274,7 @@ def pose_error_px(comparison: MapComparison, true_camera: CameraModel) -> float:
     """
     points = comparison.landmarks.points_m
     found_px, true_px = (camera.project(points)[0] for camera in (comparison.image.world_camera, true_camera))
-    return float(np.median(np.linalg.norm(found_px - true_px, axis=1))) if len(points) else NAN
+    return float(np.median(np.linalg.norm(found_px - true_px, axis=1))) if len(points) else np.nan
 
 
 def _products(comparison: MapComparison, kind: str) -> dict[str, object]:

@@ -43,8 +43,6 @@ from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import AltitudeMeasurement, AttitudeMeasurement, DescentMeasurements, DetectorImage
 from marsyard.sim.streams import Streams
 
-NAN = float("nan")
-
 
 class MeasuredVelocityParameters(AlgorithmSelection, CustomScores, MeasuredParameters):
     """Parameters of velocity estimation from three images of a descent."""
@@ -109,7 +107,7 @@ class MeasuredVelocityScenario(TypedScenario[MeasuredVelocityParameters]):
                 # estimated minus inertial velocity, which has an unknown constant error
                 "inertial_difference_m_s": distance(velocity, measurements.interval_velocities_m_s[1, :2]),
                 # estimated minus inertial velocity change between the intervals, in which this error cancels
-                "pair_discrepancy_m_s": NAN if velocity_pair is None else velocity_pair.discrepancy_m_s,
+                "pair_discrepancy_m_s": np.nan if velocity_pair is None else velocity_pair.discrepancy_m_s,
                 **agreement_row(pairs),
             }
             if true_velocity is not None:

@@ -3,11 +3,7 @@
 A guide points the mast at each stop and estimates the target's position (`marsyard.scenarios.rover.guides`). Visual
 odometry and the navigator's map use rendered stereo pairs. Parameters with values `oracle-...` replace
 these measurements by the truth with errors, which is faster and isolates the causes of failures.
-
-Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
-
-from __future__ import annotations
 
 from collections.abc import Iterable
 

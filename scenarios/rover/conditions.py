@@ -1,7 +1,5 @@
 """Columns of a run's conditions from the simulated objects, with the visibility of the designated point."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -20,8 +18,6 @@ from marsyard.scenarios.rover.run_state import RoverRun, StopView
 from marsyard.scenarios.rover.score import errors_px, finite_max
 from marsyard.scenarios.rover.vehicle import Rig
 from marsyard.scenarios.rover.world import RunWorld
-
-NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,7 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
     slips = np.array([drive.slip for drive in drives])[is_moving]
     distance = float(lengths.sum())
     # range and time at the first and last stop, pose error at the last stop
-    ranges, times, pose_error = (NAN, NAN), (0.0, 0.0), NAN
+    ranges, times, pose_error = (np.nan, np.nan), (0.0, 0.0), np.nan
     if stops:
         ranges, times = (stops[0].range_m, stops[-1].range_m), (stops[0].time_s, stops[-1].time_s)
         position_error = stops[-1].estimated_pose.translation - stops[-1].stance.world_from_rover.translation
@@ -113,7 +109,7 @@ def run_conditions(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scala
         "slip_mean": float(np.sum(slips * lengths[is_moving]) / distance) if distance > 0.0 else 0.0,
         "slip_max": finite_max(slips) if np.any(is_moving) else 0.0,
         "pose_error_m": pose_error,
-        "pose_error_fraction": pose_error / distance if distance > 0.0 else NAN,
+        "pose_error_fraction": pose_error / distance if distance > 0.0 else np.nan,
         "duration_min": times[1] / 60.0,
         **sun_columns(sun[0]),
         "sun_motion_deg": float(np.degrees(np.arccos(np.clip(sun[0] @ sun[1], -1.0, 1.0)))),
@@ -130,7 +126,7 @@ def visibility_columns(p: RoverScenarioParameters, run: RoverRun) -> dict[str, S
     A run without stops has not lost sight of the point: it counts, as a failure, in the population of visible targets.
     """
     if not run.stops:
-        obliquity = {"obliquity_start_deg": NAN, "obliquity_max_deg": NAN}
+        obliquity = {"obliquity_start_deg": np.nan, "obliquity_max_deg": np.nan}
         return {"point_in_view": True, **obliquity, **shadow_columns(p, run, [])}
     heads = [stop.world_from_head for stop in run.stops]
     columns = asdict(evaluate_visibility(run.setup.world, run.setup.rig, run.target.point_world, heads, p.vtt))

@@ -1,9 +1,4 @@
-"""Designation of the target: a point on the rock, selected in the view from the start.
-
-The paper is Kim et al., "Targeted Driving Using Visual Tracking".
-"""
-
-from __future__ import annotations
+"""Designation of the target: a point on the rock, selected in the view from the start."""
 
 from dataclasses import dataclass, replace
 

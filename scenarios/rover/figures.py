@@ -1,7 +1,4 @@
-"""Arrays and timeline of a rover's run, for its figures in the report and the exports of `marsyard replay`.
-
-Figures are those of Kim et al., "Targeted Driving Using Visual Tracking".
-"""
+"""Arrays and timeline of a rover's run, for its figures in the report and the exports of `marsyard replay`."""
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform

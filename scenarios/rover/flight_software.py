@@ -2,8 +2,6 @@
 
 Its inputs are estimated poses, the tracker's target position, and stereo measurements. An import contract forbids
 imports of the modules with the simulated truth. The parameters of a leg are the operators' commands.
-
-Fig. 12 is that of Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from collections.abc import Iterator

@@ -1,7 +1,4 @@
-"""Parameters of the rover scenario: world, target, route, cameras, timing, and tracker.
-
-Sections and tables are those of Kim et al., "Targeted Driving Using Visual Tracking".
-"""
+"""Parameters of the rover scenario: world, target, route, cameras, timing, and tracker."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Placement of the instrument at the end of a run, and its truth: collisions with the rendered rock (section 7.4).
-
-The section is that of Kim et al., "Targeted Driving Using Visual Tracking".
-"""
+"""Placement of the instrument at the end of a run, and its truth: collisions with the rendered rock (section 7.4)."""
 
 import numpy as np
 from scipy.spatial.transform import RigidTransform
@@ -20,7 +17,6 @@ from marsyard.scenarios.rover.points import Vector, enclosing_spheres, ray_dista
 from marsyard.scenarios.rover.run_state import RoverRun
 from marsyard.sim.measurements import MastCalibration, RoverMeasurements
 
-NAN = float("nan")
 #: Maximum distance of the placed instrument from the designated point, metres (section 4.2).
 MAX_ERROR_M = 0.03
 #: Spacing and half width of the true surface's grid of rays at the target, metres.
@@ -86,7 +82,7 @@ def placement_row(run: RoverRun) -> dict[str, Scalar]:
     """
     placement = run.placement
     if placement is None or placement.position_rover is None or placement.normal_rover is None:
-        lengths = dict.fromkeys(("reselection_m", "placement_error_m", "tool_overlap_m"), NAN)
+        lengths = dict.fromkeys(("reselection_m", "placement_error_m", "tool_overlap_m"), np.nan)
         return {"placed": False, "placement_safe": False, **lengths}
     stop = run.stops[-1]
     target, world_from_rover = stop.update.position_rover, stop.stance.world_from_rover
@@ -97,7 +93,7 @@ def placement_row(run: RoverRun) -> dict[str, Scalar]:
     error_m = float(np.linalg.norm(position - run.target.point_world))
     return {
         "placed": True,
-        "reselection_m": float(np.linalg.norm(placement.position_rover - target)) if target is not None else NAN,
+        "reselection_m": float(np.linalg.norm(placement.position_rover - target)) if target is not None else np.nan,
         "placement_error_m": error_m,
         "tool_overlap_m": overlap_m,
         "placement_safe": error_m <= MAX_ERROR_M and overlap_m <= 0.0,

@@ -1,7 +1,5 @@
 """Rover scenario: one run of the closed loop of driving and tracking."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 

@@ -1,7 +1,4 @@
-"""Columns of a run: quantities of its updates, tracking success, and errors.
-
-Table III is that of Kim et al., "Targeted Driving Using Visual Tracking".
-"""
+"""Columns of a run: quantities of its updates, tracking success, and errors."""
 
 from collections.abc import Callable
 
@@ -14,8 +11,6 @@ from marsyard.scenarios.interface import Scalar
 from marsyard.scenarios.parts.scores import ScoredRun
 from marsyard.scenarios.rover.parameters import RoverScenarioParameters
 from marsyard.scenarios.rover.run_state import RoverRun, RunOutcome
-
-NAN = float("nan")
 
 #: Quantities of each update, in the order of the columns of stored updates.
 UPDATE_QUANTITIES = (
@@ -57,13 +52,13 @@ def update_quantities(run: RoverRun) -> dict[str, Float64[np.ndarray, "stops"]]:
             if details.predicted_pixel is not None:
                 row["correction_px"] = float(np.max(np.abs(details.match.pixel - details.predicted_pixel)))
         rows.append(row)
-    return {name: np.array([row.get(name, NAN) for row in rows], dtype=np.float64) for name in UPDATE_QUANTITIES}
+    return {name: np.array([row.get(name, np.nan) for row in rows], dtype=np.float64) for name in UPDATE_QUANTITIES}
 
 
 def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
     """Compute the columns of the first updates (as in Table III), NaN for missing updates."""
     return {
-        f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else NAN
+        f"update_{number + 1}_{name}": float(values[number]) if number < len(values) else np.nan
         for number in range(count)
         for name, values in update_quantities(run).items()
     }
@@ -71,7 +66,7 @@ def update_columns(run: RoverRun, count: int) -> dict[str, Scalar]:
 
 def finite_max(values: Float64[np.ndarray, "n"]) -> float:
     """Return the maximum; NaN without finite values."""
-    return float(np.nanmax(values)) if np.any(np.isfinite(values)) else NAN
+    return float(np.nanmax(values)) if np.any(np.isfinite(values)) else np.nan
 
 
 #: Columns of `tracking_row`: a quantity and its reduction over the updates.
@@ -100,7 +95,7 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
     errors = errors_px(run)
     error_sizes_px = np.hypot(*errors.T)
     is_completed = run.outcome is RunOutcome.COMPLETED
-    last_error_px, error_m, range_error, cross_error = np.full(2, np.nan), np.full(3, np.nan), NAN, NAN
+    last_error_px, error_m, range_error, cross_error = np.full(2, np.nan), np.full(3, np.nan), np.nan, np.nan
     if is_completed:
         # components along the line of sight (positive: too far) and perpendicular to it
         stop, last_error_px = run.stops[-1], errors[-1]
@@ -131,7 +126,7 @@ def score_run(p: RoverScenarioParameters, run: RoverRun) -> dict[str, Scalar]:
         "max_error_px": finite_max(error_sizes_px),
         "track_margin_px": p.score.false_track_px - finite_max(error_sizes_px),
         "losses": ", ".join(loss.name for loss in loss_reasons) or "none",
-        "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), NAN),
+        "lost_range_m": next((stop.range_m for stop in run.stops if not stop.update.tracked), np.nan),
         "handed_off": run.handed_off,
     }
 
@@ -140,7 +135,7 @@ def tracking_row(run: RoverRun) -> dict[str, Scalar]:
     """Compute the columns of tracking: extremes of Table III's quantities, drift, and designation errors."""
     quantities = update_quantities(run)
     tracked_stops = [stop for stop in run.stops if stop.update.tracked]
-    drift_m = designation_error = designation_3_sigma = NAN
+    drift_m = designation_error = designation_3_sigma = np.nan
     if tracked_stops:
         first_stop, last_stop = tracked_stops[0], tracked_stops[-1]
         first_m, last_m = (
@@ -158,7 +153,7 @@ def tracking_row(run: RoverRun) -> dict[str, Scalar]:
         "visual_odometry_failures": run.visual_odometry_failures,
         "autonav_updates": run.autonav_updates,
         **{
-            column: float(reduce(quantities[name])) if np.any(np.isfinite(quantities[name])) else NAN
+            column: float(reduce(quantities[name])) if np.any(np.isfinite(quantities[name])) else np.nan
             for column, (name, reduce) in REDUCTIONS.items()
         },
         "roll_total_deg": float(np.nansum(quantities["roll_change_deg"])),
@@ -166,7 +161,7 @@ def tracking_row(run: RoverRun) -> dict[str, Scalar]:
         "target_motion_m": drift_m,
         "designation_error_m": designation_error,
         "designation_3_sigma_m": designation_3_sigma,
-        "update_time_s": float(np.mean([stop.track_time_s for stop in run.stops])) if run.stops else NAN,
+        "update_time_s": float(np.mean([stop.track_time_s for stop in run.stops])) if run.stops else np.nan,
     }
 
 

@@ -6,8 +6,6 @@ both cameras take subframes that contain the rock and the search windows around 
 images of every (skipped_stops + 1)-th stop; skipping stops makes the steps larger. A campaign has several drives, which
 the parameters call runs: each has its own rock, terrain and sun. A drive depends only on the parameters, the campaign's
 seed and the index of its run.
-
-The paper is Kim et al., "Targeted Driving Using Visual Tracking".
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Run of a tracker as an algorithm of a case: its columns and its score."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Callable
