@@ -130,7 +130,7 @@ def compare_light(quick: bool) -> Iterator[Measure]:
     claim = "light on level ground compared with simulated scattering, maximum difference"
     yield Measure(claim, float(np.abs(total).max()), "", LIGHT_LIMIT, how)
     how = f"the same; from {min(shaded):+.2f} to {max(shaded):+.2f}: the sun's aureole is counted as sunlight"
-    claim = "light in the shadow of a thin body over light beside it, maximum difference from simulated scattering"
+    claim = "light in the shadow of a thin body over that next to it, maximum difference from simulated scattering"
     yield Measure(claim, float(np.abs(shaded).max()), "", None, how)
 
 
