@@ -46,27 +46,16 @@ class CalibrationParameters(Parameters):
     ] = 0.3
 
 
-def add_calibration_error(
-    camera: CameraModel, focal_error: float, centre_error_px: tuple[float, float], distortion_error_px: float
-) -> CameraModel:
-    """Return a camera with calibration errors.
-
-    - focal_error: relative error of the focal length
-    - centre_error_px: error of the image centre, (columns, rows)
-    - distortion_error_px: outward displacement of the corners
-    """
-    recentred = camera.magnify(1.0 + focal_error).recentre(*centre_error_px)
+def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
+    """Return a camera with normally distributed calibration errors; that of the distortion moves corners outwards."""
+    focal, column, row, distortion = rng.standard_normal(4)
+    magnified = camera.magnify(1.0 + p.focal_error * focal)
+    recentred = magnified.recentre(p.centre_error_px * float(column), p.centre_error_px * float(row))
     if isinstance(recentred, Cahv):
         recentred = Cahvor.from_cahv(recentred, r=np.zeros(3))
     # R1 displaces a point outwards by R1 chi^3; chi is the radial coordinate of its ray (`marsyard.sim.camera.models`)
     corner = float(np.hypot(0.5 * (recentred.size[0] - 1), 0.5 * (recentred.size[1] - 1)))
     radial = cast(Cahvor | Cahvore, recentred)
     chi = corner / (recentred.focal_lengths[0] * (1.0 + float(radial.r[0])))
-    return replace(radial, r=radial.r + np.array([0.0, distortion_error_px / recentred.focal_lengths[0] / chi**3, 0.0]))
-
-
-def draw_calibrated(camera: CameraModel, p: CalibrationParameters, rng: np.random.Generator) -> CameraModel:
-    """Return a camera with normally distributed calibration errors."""
-    focal, column, row, distortion = rng.standard_normal(4)
-    centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
-    return add_calibration_error(camera, p.focal_error * focal, centre, p.distortion_error_px * distortion)
+    displacement = p.distortion_error_px * distortion / recentred.focal_lengths[0]
+    return replace(radial, r=radial.r + np.array([0.0, displacement / chi**3, 0.0]))

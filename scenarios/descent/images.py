@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.scenarios.cameras import Optics, add_calibration_error
+from marsyard.scenarios.cameras import Optics, draw_calibrated
 from marsyard.scenarios.cameras import camera_optics as shared_optics
 from marsyard.scenarios.case_faults import HAZE_PATH_M
 from marsyard.scenarios.descent.faults import draw_clouds
@@ -72,12 +72,11 @@ def camera_optics(parameters: DescentCameraParameters) -> Optics:
 def calibrated_camera(parameters: DescentCameraParameters, rng: np.random.Generator) -> CameraModel:
     """Return the calibrated camera: the true camera of `camera_optics` with sampled calibration errors."""
     p = parameters
+    if p.model is not None:
+        return draw_calibrated(p.model.camera(), p, rng)
     focal, column, row, distortion = rng.standard_normal(4)
     centre = (p.centre_error_px * float(column), p.centre_error_px * float(row))
-    focal_error, corner_px = p.focal_error * focal, p.distortion_error_px * distortion
-    if p.model is not None:
-        return add_calibration_error(p.model.camera(), focal_error, centre, corner_px)
-    return _create_camera(p, 1.0 + focal_error, centre, corner_px)
+    return _create_camera(p, 1.0 + p.focal_error * focal, centre, p.distortion_error_px * distortion)
 
 
 def _create_camera(

@@ -9,10 +9,8 @@ import pytest
 from pydantic import ValidationError
 from rasterio.transform import Affine
 from scipy.ndimage import gaussian_filter
-from typer.testing import CliRunner
 
 from marsyard.campaigns.definition.loading import load_campaign
-from marsyard.cli.app import app
 from marsyard.scenarios.localisation.parameters import LocalisationScenarioParameters
 from marsyard.scenarios.localisation.scenario import LocalisationScenario
 from marsyard.scenarios.localisation.simulation import LocalisedDescent
@@ -129,21 +127,6 @@ def test_terrain_and_files_of_a_wrong_size_are_rejected(tmp_path: Path) -> None:
         with pytest.raises(ValidationError, match=message) as caught:
             LocalisationScenarioParameters.model_validate(values)
         assert caught.value.error_count() == 1
-
-
-@pytest.mark.parametrize(("posting_m", "message"), [(None, "no such file"), (2.0, "covers 278 m x 238 m")])
-def test_example_with_an_invalid_file_ends_with_a_message(
-    tmp_path: Path, posting_m: float | None, message: str
-) -> None:
-    example = Path(__file__).parents[3] / "docs" / "examples" / "loc-imported.toml"
-    missing = {name: str(tmp_path / f"{name}.tif") for name in ("dtm", "ortho")}
-    source = missing if posting_m is None else _write_site(tmp_path, posting_m=posting_m)
-    overrides = [word for name, path in source.items() for word in ("--set", f"terrain.source.{name}={path}")]
-    result = CliRunner().invoke(app, ["run", str(example), *overrides, "--out", str(tmp_path / "run")])
-    assert result.exit_code == 2
-    assert message in " ".join(result.output.split())
-    assert "Traceback" not in result.output
-    assert not (tmp_path / "run").exists()
 
 
 def test_example_accepts_a_valid_site(tmp_path: Path) -> None:
