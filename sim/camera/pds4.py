@@ -18,8 +18,7 @@ from marsyard.sim.camera.label_frames import (
     resolve_camera,
     transform_from_label,
 )
-from marsyard.sim.camera.source import MODELS, SUBFRAME, Source, create_camera, linearity_of_type
-from marsyard.sim.camera.xml_files import parse_xml
+from marsyard.sim.camera.source import MODELS, SUBFRAME, Source, create_camera, linearity_of_type, parse_xml
 
 #: Names in the geometry dictionary.
 _PARAMETERS = "Camera_Model_Parameters"
@@ -43,19 +42,13 @@ _FORWARD, _REVERSE = "Forward", "Reverse"
 _IDENTIFIER = re.compile(r"(?P<name>[A-Za-z]\w*?)(?P<indices>(?:_\d+)+)(?:_[A-Za-z]+)?")
 
 
-def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[CameraModel, ...]:
-    """Read every camera model of a PDS4 label (.xml or .lblx), in order.
+def read_pds4(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[FramedCamera, ...]:
+    """Read every camera model of a PDS4 label (.xml or .lblx), in order, in the frames that `read_pds3` chooses.
 
     Raises CameraFileError as `read_pds3` does, also if ground processing cropped or averaged the image. With
     `subframe_folded_in` such images are accepted, and the vectors are assumed to describe the stored image, as in the
-    labels of Mars 2020. Images that the camera itself cropped or averaged on command are always accepted. Models are
-    returned in the frame that `read_pds4_framed` chooses.
+    labels of Mars 2020. Images that the camera itself cropped or averaged on command are always accepted.
     """
-    return tuple(framed.camera for framed in read_pds4_framed(path, subframe_folded_in=subframe_folded_in))
-
-
-def read_pds4_framed(path: str | Path, *, subframe_folded_in: bool = False) -> tuple[FramedCamera, ...]:
-    """Read every camera model as `read_pds4` does, with its frame as `read_pds3_framed` does."""
     source = Source(str(path))
     root = parse_xml(source, "a PDS4 label")
     models = [model for model in _find_elements(root, _PARAMETERS) if _find_child(model, "model_type") is not None]

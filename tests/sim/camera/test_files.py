@@ -20,7 +20,7 @@ from marsyard.sim.camera import (
     read_cahvor,
     read_camera,
     read_cameras,
-    read_pds3,
+    read_pds3_product,
     write_cahvor,
 )
 from marsyard.sim.sensor import CustomCamera, CustomCameraChoice
@@ -187,7 +187,7 @@ def test_subframes_require_subframe_folded_in(tmp_path: Path) -> None:
         path = write_file(tmp_path, "\n".join(lines) + "\n")
         with pytest.raises(CameraFileError, match=f"{field.strip()}: 2.*subframe_folded_in"):
             read_camera(path)
-        assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
+        assert read_camera(path, subframe_folded_in=True).size == (1020, 1024)
 
 
 #: Text of the label that is replaced, its replacement, and the expected message.
@@ -322,7 +322,7 @@ def test_missing_files_and_unknown_formats_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(CameraFileError, match=r"is empty \(0 bytes\)"):
         read_camera(write_file(tmp_path, ""))
     with pytest.raises(CameraFileError, match="PDS_VERSION_ID: missing"):
-        read_pds3(write_file(tmp_path, CMOD_TEXT))
+        read_pds3_product(write_file(tmp_path, CMOD_TEXT))
 
 
 @pytest.mark.slow
@@ -370,8 +370,8 @@ def test_curiosity_subframes_require_subframe_folded_in(tmp_path: Path, old: str
     path = tmp_path / "curiosity.lbl"
     path.write_text(CURIOSITY.replace(old, new))
     with pytest.raises(CameraFileError, match=field):
-        read_pds3(path)
-    assert read_pds3(path, subframe_folded_in=True)[0].size == (1020, 1024)
+        read_camera(path)
+    assert read_camera(path, subframe_folded_in=True).size == (1020, 1024)
 
 
 def test_text_files_without_dimensions_use_the_given_size(tmp_path: Path) -> None:
