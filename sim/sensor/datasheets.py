@@ -1,22 +1,24 @@
-"""Datasheets of detectors: TOML files that define the parameters of a simulated detector.
+"""Detector of a campaign: its values, or changes to those of a camera preset or of a datasheet.
 
-They contain values of the manufacturer (those of EMVA 1288: saturation capacity, temporal dark noise, quantum
-efficiency, dark current, photo response non-uniformity) and the lens in front of the detector: see `Datasheet`.
+Datasheets are TOML files with values of the manufacturer (those of EMVA 1288: saturation capacity, temporal dark noise,
+quantum efficiency, dark current, photo response non-uniformity) and of the lens in front of the detector.
 """
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from marsyard.sim.files import open_regular
-from marsyard.sim.parameters import NonNegative, Parameters, Positive
+from marsyard.sim.parameters import NonNegative, Parameters, Positive, merge_parameters
 from marsyard.sim.sensor.detector import DetectorParameters
 from marsyard.sim.sensor.optics import OpticsParameters
+from marsyard.sim.sensor.presets import preset
 from marsyard.sim.sensor.radiometry import LENS_TRANSMISSION, LightPath, bright_exposure_s
 
 _MAX_BYTES = 1 << 20  #: Maximum size of a datasheet.
@@ -130,3 +132,26 @@ def read_datasheet(path: str | Path) -> Datasheet:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "datasheet"
         raise ValueError(f"{path}: {key}: {first['msg'].removeprefix('Value error, ')}") from error
+
+
+def _resolve_detector(values: object) -> object:
+    """Merge values with those of the selected preset or datasheet, if there is one."""
+    if isinstance(values, str):
+        values = {"file": values} if values.endswith(".toml") else {"preset": values}
+    if not isinstance(values, Mapping) or all(values.get(key) is None for key in ("preset", "file")):
+        return values
+    if set(DetectorParameters.model_fields) <= set(values):  # already resolved: values stored with a campaign
+        return values
+    if {"preset", "file"} <= set(values):
+        raise ValueError("a detector is defined by a preset or by a datasheet file, not both")
+    changes = {key: value for key, value in values.items() if key not in ("preset", "file")}
+    if "file" in values:
+        file = str(values["file"])
+        return merge_parameters({**read_datasheet(file).parameters().model_dump(), "file": file}, changes)
+    return merge_parameters(preset(str(values["preset"])).detector.model_dump(), changes)
+
+
+#: Detector parameters of a campaign, defined by values or by changes to a preset or datasheet:
+#: ``[parameters.detector]`` with ``preset = "mer-descent-field"`` and, for example, ``temperature_c = 23.0``; or
+#: ``file = "sensor.toml"``.
+DetectorChoice = Annotated[DetectorParameters, BeforeValidator(_resolve_detector)]

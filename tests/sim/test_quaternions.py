@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.sim.quaternions import accumulate_quaternions, multiply_quaternions
+from marsyard.sim.frames import accumulate_quaternions, multiply_quaternions
 
 
 def test_quaternion_products_match_rotations() -> None:

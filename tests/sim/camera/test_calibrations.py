@@ -19,7 +19,7 @@ from marsyard.sim.camera import (
     read_camera,
     read_cameras,
 )
-from tests.sim.camera.labels import assert_fault
+from tests.sim.camera.labels import assert_fault, compute_max_opencv_distance_px
 
 #: Written by OpenCV's sample calibration.cpp for a web camera (blog.csdn.net, article of 23 August 2015).
 OPENCV = """%YAML:1.0
@@ -152,19 +152,6 @@ def write_file(folder: Path, text: str, name: str = "calibration.yaml") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def compute_max_opencv_distance_px(
-    camera: CameraModel, matrix: np.ndarray, distortion: list[float], pose: RigidTransform | None = None
-) -> float:
-    """Compute the maximum distance over the frame between the pixels of Marsyard and OpenCV for the same far points."""
-    columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in camera.size)
-    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    points = camera.c + 1e5 * camera.rays(pixels)[1]
-    pose = RigidTransform.identity() if pose is None else pose
-    rotation, translation = pose.rotation.as_rotvec(), np.asarray(pose.translation)
-    expected_px, _ = cv2.projectPoints(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
-    return float(np.max(np.linalg.norm(expected_px.reshape(-1, 2) - pixels, axis=1)))
 
 
 def write_opencv(storage: cv2.FileStorage, matrix: np.ndarray, distortion: np.ndarray) -> None:

@@ -18,8 +18,7 @@ from marsyard.sim.sensor import (
     Sampling,
     height_above_ground,
 )
-from marsyard.sim.sensor.radar import first_return
-from marsyard.sim.sensor.ranging import RangingUnit, range_along
+from marsyard.sim.sensor.altimeters import RangingUnit, first_return, range_along
 from marsyard.sim.terrain import Surface
 from tests.sim.scenes import flat_ground, make_ground
 from tests.sim.sensor.motions import Swaying
