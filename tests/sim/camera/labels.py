@@ -68,6 +68,14 @@ GROUP = GEOMETRIC_CAMERA_MODEL
 END_GROUP = GEOMETRIC_CAMERA_MODEL
 END"""
 
+#: EuRoC's first camera (sensor.yaml), with the fields that are read.
+EUROC = """resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+
 
 def pds3_label(
     folder: Path,

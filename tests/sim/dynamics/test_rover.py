@@ -7,18 +7,11 @@ from jaxtyping import Float64
 from pydantic import ValidationError
 
 from marsyard.sim.dynamics.driven_ground import DrivenGround, RockyGround
-from marsyard.sim.dynamics.rover import MER, ROCKY_8, WHEELS, RoverParameters, compute_wheel_centres, settle
+from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, compute_wheel_centres, settle
 from marsyard.sim.terrain import PlacedRock, RockField, RockParameters, Surface
 from tests.sim.dynamics.grounds import Mounds, Plane, uphill_east
 
 EAST, NORTH = 0.5 * np.pi, 0.0
-
-
-def test_wheel_centres_match_the_parameters() -> None:
-    positions = dict(zip(WHEELS, MER.wheel_centres_m, strict=True))
-    assert positions["left front"] == pytest.approx([0.705, 0.53, 0.125])
-    assert positions["right rear"] == pytest.approx([-0.705, -0.53, 0.125])
-    assert compute_wheel_centres(MER, 0.0, (0.0, 0.0)) == pytest.approx(MER.wheel_centres_m)
 
 
 @pytest.mark.parametrize("rover", [MER, ROCKY_8])
