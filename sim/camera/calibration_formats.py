@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.sim.camera.source import CALIBRATION_FILES, Source, parse_xml
+from marsyard.sim.camera.file_reading import CALIBRATION_FILES, Source, parse_xml
 
 Values = Mapping[str, Any]
 

@@ -31,8 +31,8 @@ from marsyard.sim.camera.calibration_formats import (
     read_opencv_xml,
     read_stereo_pipeline,
 )
+from marsyard.sim.camera.file_reading import CALIBRATION_FILES, Source, is_xml, refuse_foreign, xml_root
 from marsyard.sim.camera.opencv_models import Residual, from_opencv, from_opencv_fisheye
-from marsyard.sim.camera.source import CALIBRATION_FILES, Source, is_xml, refuse_foreign, xml_root
 
 #: Maximum residual of the fitted camera: RMS over the frame, similar to the residual of a calibration (0.1 to 0.5 px);
 #: and at any pixel (the maximum is in a corner).

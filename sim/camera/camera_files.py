@@ -4,11 +4,11 @@ from pathlib import Path
 
 from marsyard.sim.camera.base import CameraModel
 from marsyard.sim.camera.calibrations import HEAD_BYTES, is_calibration, read_calibrations
+from marsyard.sim.camera.file_reading import FORMATS, Source, is_xml, refuse_foreign, xml_root
 from marsyard.sim.camera.jpl_files import read_cahvor
 from marsyard.sim.camera.label_frames import ROVER_FRAME, FramedCamera
 from marsyard.sim.camera.pds3 import is_pds3, read_pds3
 from marsyard.sim.camera.pds4 import read_pds4
-from marsyard.sim.camera.source import FORMATS, Source, is_xml, refuse_foreign, xml_root
 
 #: Start of the names of root elements of PDS4 labels.
 _PDS4_ROOT = "Product_"

@@ -19,6 +19,7 @@ from jaxtyping import UInt16
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.file_reading import MAX_BYTES, MODELS, SUBFRAME, Source, create_camera, linearity_of_type
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     SITE,
@@ -29,7 +30,6 @@ from marsyard.sim.camera.label_frames import (
     resolve_camera,
     transform_from_label,
 )
-from marsyard.sim.camera.source import MAX_BYTES, MODELS, SUBFRAME, Source, create_camera, linearity_of_type
 from marsyard.sim.files import check_regular
 
 #: Group of a camera model, and its two names.

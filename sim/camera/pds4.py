@@ -10,6 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from marsyard.sim.camera.base import CameraModel
+from marsyard.sim.camera.file_reading import MODELS, SUBFRAME, Source, create_camera, linearity_of_type, parse_xml
 from marsyard.sim.camera.label_frames import (
     ROVER_FRAME,
     CoordinateSystem,
@@ -18,7 +19,6 @@ from marsyard.sim.camera.label_frames import (
     resolve_camera,
     transform_from_label,
 )
-from marsyard.sim.camera.source import MODELS, SUBFRAME, Source, create_camera, linearity_of_type, parse_xml
 
 #: Names in the geometry dictionary.
 _PARAMETERS = "Camera_Model_Parameters"

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.optimize import least_squares
 from scipy.spatial.transform import RigidTransform, Rotation
@@ -33,6 +34,7 @@ Metres = Annotated[float, Field(gt=0.0, le=5.0)]
 Vector6 = Float64[np.ndarray, "6"]
 WheelPoints = Float64[np.ndarray, "6 3"]
 Point = Float64[np.ndarray, "2"]
+Coordinates = float | NDArray[np.float64]
 
 #: Names of the wheels, in the order of all arrays.
 WHEELS = ("left front", "left middle", "left rear", "right front", "right middle", "right rear")
@@ -225,7 +227,9 @@ def _rotate_wheels(
     return np.stack([x, np.broadcast_to(y, x.shape), z], axis=-1)
 
 
-def _rotate_about_pivot(x: Any, z: Any, angles: Any, pivot: Point) -> tuple[Any, Any]:
+def _rotate_about_pivot(
+    x: Coordinates, z: Coordinates, angles: NDArray[np.float64], pivot: Point
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Rotate points (x, z) about a pivot (x, z); a positive angle lowers points in front of the pivot."""
     sine, cosine = np.sin(angles), np.cos(angles)
     x, z = x - pivot[0], z - pivot[1]

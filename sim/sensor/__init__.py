@@ -6,8 +6,8 @@ The instruments of rovers are in the modules `mast` and `odometry`.
 from marsyard.sim.sensor.altimeters import LaserParameters, RadarAltimeter, RadarParameters, height_above_ground
 from marsyard.sim.sensor.auto_exposure import AutoExposure, AutoExposureParameters, auto_expose
 from marsyard.sim.sensor.custom_camera import CustomCamera, CustomCameraChoice, NamedOrCustomCamera
-from marsyard.sim.sensor.datasheets import DetectorChoice, read_datasheet
 from marsyard.sim.sensor.detector import Detector, DetectorParameters
+from marsyard.sim.sensor.detector_choice import DetectorChoice, read_datasheet
 from marsyard.sim.sensor.gps import Gps, GpsParameters
 from marsyard.sim.sensor.image_motion import ImageMotion
 from marsyard.sim.sensor.imu import Imu, ImuParameters, WarmUp

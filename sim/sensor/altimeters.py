@@ -27,6 +27,11 @@ from marsyard.sim.terrain import Surface
 #: Nominal direction of an altimeter in body axes: the optical axis of the descent camera.
 DOWN = np.array([0.0, 0.0, -1.0])
 MIN_POINTS = 64  #: Minimum number of points along a laser ray that are compared with the ground.
+#: Step of the coarsest search grid / height, ratio of successive steps, and number of grids.
+COARSEST_STEP, REFINEMENT, GRIDS = 1.0 / 64.0, 5, 3
+#: Assumed: ground around a node is nearer than the node by at most (this value + slope at the node) x step.
+RELIEF_PER_STEP = 0.2
+MAX_SLOPE = 3.0  #: Assumed maximum slope of the ground (rise / run) in the search.
 
 RangeFraction = Annotated[float, Field(ge=0.0, le=0.2)]
 RangeDeviation = Annotated[float, Field(ge=0.0, le=100.0)]
@@ -129,13 +134,6 @@ def range_along(surface: Surface, position_m: Vector, axis: Vector, max_range_m:
 def height_above_ground(surface: Surface, positions_m: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
     """Compute the true altitude: the height above the ground vertically below each position."""
     return np.asarray(positions_m[:, 2] - surface.height(positions_m[:, 0], positions_m[:, 1]))
-
-
-#: Step of the coarsest search grid / height, ratio of successive steps, and number of grids.
-COARSEST_STEP, REFINEMENT, GRIDS = 1.0 / 64.0, 5, 3
-#: Assumed: ground around a node is nearer than the node by at most (this value + slope at the node) x step.
-RELIEF_PER_STEP = 0.2
-MAX_SLOPE = 3.0  #: Assumed maximum slope of the ground (rise / run) in the search.
 
 
 class RadarParameters(RangingParameters):

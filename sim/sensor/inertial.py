@@ -29,6 +29,10 @@ from marsyard.sim.parameters import NonNegative, Parameters, Positive
 from marsyard.sim.sensor.imu import Imu
 from marsyard.sim.sensor.instrument import Times, Vector, Vectors
 
+#: Propagation steps per second: at 2 rpm the relative error of the midpoint rule over the spin is 5e-5.
+STEPS_PER_S = 5.0
+_MEAN_SIN4 = 3.0 / 8.0  #: Mean of sin^4, the assumed profile of the deceleration during entry.
+
 
 @dataclass(frozen=True)
 class NavigationErrors:
@@ -108,11 +112,6 @@ class InertialSolution:
 
 def _cumulative_sums(steps: Vectors) -> Float64[np.ndarray, "m 3"]:
     return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-
-
-#: Propagation steps per second: at 2 rpm the relative error of the midpoint rule over the spin is 5e-5.
-STEPS_PER_S = 5.0
-_MEAN_SIN4 = 3.0 / 8.0  #: Mean of sin^4, the assumed profile of the deceleration during entry.
 
 
 class ApproachParameters(Parameters):

@@ -186,7 +186,12 @@ def assert_fault(
 
 
 def compute_max_opencv_distance_px(
-    camera: CameraModel, matrix: np.ndarray, distortion: list[float] | np.ndarray, pose: RigidTransform | None = None
+    camera: CameraModel,
+    matrix: np.ndarray,
+    distortion: list[float] | np.ndarray,
+    pose: RigidTransform | None = None,
+    *,
+    fisheye: bool = False,
 ) -> float:
     """Compute the maximum distance over the frame between the pixels of Marsyard and OpenCV for the same far points."""
     columns, rows = (np.linspace(-0.5, extent - 0.5, 25) for extent in camera.size)
@@ -194,5 +199,6 @@ def compute_max_opencv_distance_px(
     points = camera.c + 1e5 * camera.rays(pixels)[1]
     pose = RigidTransform.identity() if pose is None else pose
     rotation, translation = pose.rotation.as_rotvec(), np.asarray(pose.translation)
-    expected_px, _ = cv2.projectPoints(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
+    project = cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
+    expected_px, _ = project(points.reshape(-1, 1, 3), rotation, translation, matrix, np.array(distortion))
     return float(np.max(np.linalg.norm(expected_px.reshape(-1, 2) - pixels, axis=1)))

@@ -1,4 +1,4 @@
-"""Camera files of all formats: reading of their bytes, XML, error messages, and cameras from the vectors of a model."""
+"""Common parts of the readers of camera files: bytes, XML, errors, and the camera of a model's vectors."""
 
 import re
 from collections.abc import Mapping, Sequence
