@@ -64,6 +64,9 @@ def test_block_under_the_middle_wheel_rotates_the_bogie() -> None:
     assert stance.pitch_rad == pytest.approx(-nose_down_rad, rel=0.05)
     assert stance.bogies_rad[0] == pytest.approx(stance.bogies_rad[1])
     assert stance.bogies_rad[0] == pytest.approx(-block_m / MER.rear_m - nose_down_rad, rel=0.05)
+    # A block on the left rotates mainly the left bogie, which is the first.
+    left, right = settle(MER, Mounds(((0.0, 0.61, block_m),)), 0.0, 0.0, EAST).bogies_rad
+    assert abs(left) > 3.0 * abs(right)
 
 
 def test_all_wheels_touch_rough_ground() -> None:
