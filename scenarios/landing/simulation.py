@@ -14,7 +14,7 @@ from marsyard.scenarios.landing.images import Pair, take_images
 from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.world import LandingWorld
 from marsyard.sim.measurements import LandingMeasurements
-from marsyard.sim.sensor.ranging import RangingUnit
+from marsyard.sim.sensor.altimeters import RangingUnit
 from marsyard.sim.streams import Streams
 
 

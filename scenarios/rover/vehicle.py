@@ -16,9 +16,8 @@ from marsyard.sim.dynamics.driving import Drive, Soil, drive
 from marsyard.sim.dynamics.rover import MER, ROCKY_8, RoverParameters, Stance, settle
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DriveCommand, MastCalibration
-from marsyard.sim.sensor.mast import Mast, MastState
+from marsyard.sim.sensor.mast import Mast, MastState, StereoHead
 from marsyard.sim.sensor.odometry import Odometer, PoseEstimate
-from marsyard.sim.sensor.stereo_head import StereoHead
 from marsyard.sim.streams import Streams
 
 
