@@ -12,7 +12,7 @@ from typing import Any
 
 from marsyard.algorithms import exchange
 from marsyard.scenarios.imports import import_object, source_files
-from marsyard.scenarios.isolation.remote_description import AlgorithmDescription, describe_in_process
+from marsyard.scenarios.isolation.remote import AlgorithmDescription, describe_in_process
 from marsyard.scenarios.offline_algorithms import is_offline
 from marsyard.scenarios.systems import systems
 

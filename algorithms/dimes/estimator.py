@@ -11,14 +11,13 @@ from jaxtyping import Bool, Float
 
 from marsyard.algorithms.arrays import Vector2, Vector3
 from marsyard.algorithms.dimes import overlap, tilt
-from marsyard.algorithms.dimes.details import DimesDetails, DimesTrack, PairDetails
-from marsyard.algorithms.dimes.ground_tracks import track_grid
-from marsyard.algorithms.dimes.ground_view import pixels_from_ground
+from marsyard.algorithms.dimes.ground_view import pixels_from_ground, zero_phase_pixel
 from marsyard.algorithms.dimes.options import DimesOptions
+from marsyard.algorithms.dimes.products import DimesDetails, DimesTrack, PairDetails
 from marsyard.algorithms.dimes.rectification import rectify_patch
+from marsyard.algorithms.dimes.tilt import track_grid
 from marsyard.algorithms.dimes.validity import failed_checks, rank_combinations, track_metrics
 from marsyard.algorithms.dimes.views import BinnedView, build_views
-from marsyard.algorithms.dimes.zero_phase import zero_phase_pixel
 from marsyard.algorithms.image.correlation import pseudo_normalized_correlation
 from marsyard.algorithms.image.peaks import Peak, biquadratic_offset, highest_peak
 from marsyard.algorithms.interface import VelocityEstimate, VelocityOutcome

@@ -12,9 +12,9 @@ from scipy import ndimage
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
 from marsyard.algorithms.dimes import ground_view, rectification
+from marsyard.algorithms.dimes.ground_view import outside_zero_phase
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.views import BinnedView
-from marsyard.algorithms.dimes.zero_phase import outside_zero_phase
 from marsyard.algorithms.image.interest import harris_interest, structure_tensor
 
 #: Lower limit of the mean signal before division, as a fraction of the full scale.

@@ -12,12 +12,15 @@ from marsyard.algorithms.exchange.files import (
     ImageFormat,
     read_case,
     read_frame,
+    read_mast,
+    read_pose,
+    read_stop,
+    read_target,
     write_case,
     write_frame,
 )
 from marsyard.algorithms.exchange.forms import SITE_FORM, VELOCITY_FORM, AnswerForm, ProgramDetails, answer_time_s
 from marsyard.algorithms.exchange.limits import ExecutableLimits
-from marsyard.algorithms.exchange.rover_files import read_mast, read_pose, read_stop, read_target
 from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 
 __all__ = [

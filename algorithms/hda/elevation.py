@@ -1,13 +1,30 @@
-"""Elevation map of a landing site from points of the ground (section II.D), and filling of its small holes."""
+"""Elevation map of a landing site from points of the ground (section II.D), its small holes, and distances in a map."""
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Num
 
-from marsyard.algorithms.arrays import Points3, Raster, Vector2
+from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector2
 from marsyard.algorithms.hda.kernels import elevation as kernels
-from marsyard.algorithms.hda.morphology import dilate, grassfire
+
+
+def grassfire(mask: Mask) -> Raster:
+    """Grassfire transform (Blum 1973): distance of every cell to the nearest true cell of a mask, in cells.
+
+    Infinite if no cell is true.
+    """
+    if not np.any(mask):
+        return np.full(mask.shape, np.inf)
+    distances = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distances.astype(np.float64))
+
+
+def dilate(mask: Mask, radius_cells: float) -> Mask:
+    """Dilate a mask by a disc: a cell becomes true within `radius_cells` of a true cell."""
+    return np.asarray(mask | (grassfire(mask) <= radius_cells))
+
 
 #: Minimum sum of bilinear weights of a valid cell: the weight of a single point 0.9 cells away along an axis.
 MIN_WEIGHT = 0.1

@@ -93,7 +93,7 @@ class HdaOptions:
       map, in lander diameters. The paper uses 1 for hazards. For cells "near" borders 0.5 is assumed: at a smaller
       distance, part of the lander would be on unmapped ground.
     - check_footprints: Whether the safe landing map is that of a plane fitted to the footprint at each cell, with a
-      margin for the map's resolution (`marsyard.algorithms.hda.footprints.classify_footprints`). The paper interpolates
+      margin for the map's resolution (`marsyard.algorithms.hda.hazards.classify_footprints`). The paper interpolates
       planes and slopes between fixed squares, and enlarges hazards by the lander's diameter. Over curved ground the
       distance from this interpolated surface is half of the distance from a plane.
     - narrowest_hazard: Ratio of base width to height of the narrowest hazard. Rocks have heights of up to 0.65 widths

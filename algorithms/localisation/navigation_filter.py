@@ -23,10 +23,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation import state_updates as updates
-from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
 from marsyard.algorithms.localisation.inertial_state import (
     ERRORS,
     GYRO_BIAS,
+    ImuErrorModel,
     IncrementHistory,
     NavigationState,
     propagate_states,

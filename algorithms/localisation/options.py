@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
+from marsyard.algorithms.localisation.inertial_state import ImuErrorModel
 
 
 @dataclass(frozen=True)

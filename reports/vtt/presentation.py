@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from marsyard.algorithms.vtt.arm_target import HandOffOutcome
+from marsyard.algorithms.vtt.arm import HandOffOutcome
 from marsyard.reports.cell_values import is_true, to_float
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products

@@ -11,7 +11,7 @@ import time
 import weakref
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -168,3 +168,38 @@ def absolute_spec(spec: str) -> str:
 def search_path() -> list[str]:
     """Return the folders in which this process finds modules; the current folder is the last."""
     return [*(folder for folder in sys.path if folder), str(Path.cwd())]
+
+
+@dataclass(frozen=True)
+class AlgorithmDescription:
+    """Description of the class or function that creates a custom algorithm.
+
+    - kind: name of its type
+    - members: names of its public members
+    - version, options: its attributes of these names, for the record of a campaign
+    """
+
+    kind: str
+    is_class: bool
+    is_callable: bool
+    members: frozenset[str]
+    version: str | None
+    options: Mapping[str, Any]
+
+
+@cache
+def describe_in_process(spec: str) -> AlgorithmDescription:
+    """Import a custom algorithm in a process of its own, and describe it. Raises ImportError with the reason."""
+    spec = absolute_spec(spec)
+    command, limits = PythonCommand(spec=spec), ExecutableLimits()
+    try:
+        server = acquire_server(command, limits)
+        request = {"do": "describe", "path": search_path(), "spec": spec}
+        answer, _ = server.send_request(request, limits.loading_s)
+    except AlgorithmError as error:
+        raise ImportError(f"{error.fault.name}: {error}") from error
+    server.child.stop()
+    if "error" in answer or "fault" in answer:
+        raise ImportError(str(answer.get("error", answer.get("message"))))
+    contents = {key: value for key, value in answer.items() if key != "exchange"}
+    return AlgorithmDescription(**{**contents, "members": frozenset(contents["members"])})

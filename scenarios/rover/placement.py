@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.arrays import Points3
-from marsyard.algorithms.vtt.placement import (
+from marsyard.algorithms.vtt.arm import (
     Instrument,
     Placement,
     PlacementOutcome,

@@ -10,13 +10,14 @@ from marsyard.algorithms.dimes import DimesEstimator, DimesOptions
 from marsyard.algorithms.dimes.baselines import (
     DEFAULT_COMMON_OPTIONS,
     BaselineDetails,
+    HomographyEstimator,
     PairPatches,
+    PhaseCorrelationEstimator,
     find_common_square,
+    max_length_change,
     rectify_pair,
 )
 from marsyard.algorithms.dimes.ground_view import inside_frame, square_lattice
-from marsyard.algorithms.dimes.homography import HomographyEstimator, max_length_change
-from marsyard.algorithms.dimes.phase_correlation import PhaseCorrelationEstimator
 from marsyard.algorithms.dimes.views import build_views
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements

@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from marsyard.algorithms.dimes import ground_view, overlap, rectification
+from marsyard.algorithms.dimes.ground_view import zero_phase_pixel
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.views import BinnedView, build_view
-from marsyard.algorithms.dimes.zero_phase import zero_phase_pixel
 from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction
 from marsyard.sim.measurements import DetectorImage

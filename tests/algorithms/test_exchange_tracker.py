@@ -19,7 +19,7 @@ from marsyard.algorithms.exchange import (
     read_stop,
     read_target,
 )
-from marsyard.algorithms.exchange.rover_files import write_mast, write_stop
+from marsyard.algorithms.exchange.files import write_mast, write_stop
 from marsyard.algorithms.exchange.serving import end_idle_programs
 from marsyard.algorithms.exchange.values import encode
 from marsyard.algorithms.faults import AlgorithmError, Fault

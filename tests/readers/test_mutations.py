@@ -37,13 +37,13 @@ from marsyard.campaigns.store.packed_products import load_products, pack_product
 from marsyard.campaigns.store.rows import RowStore, create_store
 from marsyard.campaigns.store.table import read_rows, write_table
 from marsyard.reports.stored import read_run
-from marsyard.scenarios.answer_tables import read_answers
 from marsyard.scenarios.conformance import inputs
 from marsyard.scenarios.measured.image_files import read_counts, read_elevation, read_flat_field
 from marsyard.scenarios.measured.image_table import read_table
 from marsyard.scenarios.measured.layout import VELOCITY as TASK
 from marsyard.scenarios.measured.layout import IngestError, read_ingest_file
 from marsyard.scenarios.mesh_files import MeshFileError, read_mesh
+from marsyard.scenarios.offline_algorithms import read_answers
 from marsyard.scenarios.terrain_files import check_source, grid_north_deg
 from marsyard.scenarios.velocity import VELOCITY_FORMAT
 from marsyard.sim.camera import CameraFileError, read_cameras

@@ -18,9 +18,8 @@ from marsyard.algorithms.hda import (
     TrackSeed,
     hda_products,
 )
-from marsyard.algorithms.hda.essential_matrix import EssentialMatrixEstimator
+from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
-from marsyard.algorithms.hda.semi_global import SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import LandingMeasurements, PoseMeasurement

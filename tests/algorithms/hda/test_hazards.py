@@ -8,11 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marsyard.algorithms.hda import HdaOptions, Safety, hazard_maps, safe_site
-from marsyard.algorithms.hda.elevation import ElevationMap, elevation_map, fill_small_holes
-from marsyard.algorithms.hda.footprints import Resolution, classify_footprints, roughness_limit_m
-from marsyard.algorithms.hda.hazards import safe_landing_map, smooth_surface
+from marsyard.algorithms.hda.elevation import ElevationMap, elevation_map, fill_small_holes, grassfire
+from marsyard.algorithms.hda.hazards import (
+    Resolution,
+    classify_footprints,
+    roughness_limit_m,
+    safe_landing_map,
+    smooth_surface,
+)
 from marsyard.algorithms.hda.kernels.elevation import robust_plane
-from marsyard.algorithms.hda.morphology import grassfire
 
 CELL_M = 0.1
 OPTIONS = HdaOptions(

@@ -10,8 +10,7 @@ from scipy.stats import chi2
 
 from marsyard.algorithms.localisation import inertial_state as inertial
 from marsyard.algorithms.localisation import state_updates as updates
-from marsyard.algorithms.localisation.imu_errors import ImuErrorModel
-from marsyard.algorithms.localisation.inertial_state import IncrementHistory, NavigationState
+from marsyard.algorithms.localisation.inertial_state import ImuErrorModel, IncrementHistory, NavigationState
 from marsyard.algorithms.localisation.interface import InitialState
 from marsyard.algorithms.localisation.matrices import left_jacobian
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter

@@ -17,10 +17,17 @@ from marsyard.algorithms.vtt.accuracy import (
     table_1,
     tracked_approach_error_m,
 )
-from marsyard.algorithms.vtt.arm_target import GoalCriterion, HandOffOutcome, hand_off
+from marsyard.algorithms.vtt.arm import (
+    GoalCriterion,
+    HandOffOutcome,
+    Instrument,
+    PlacementOutcome,
+    hand_off,
+    place_instrument,
+    tool_overlap_m,
+)
 from marsyard.algorithms.vtt.losses import Distances, MatchEvidence, Tolerances, find_losses, next_state, tolerances
 from marsyard.algorithms.vtt.options import VttOptions
-from marsyard.algorithms.vtt.placement import Instrument, PlacementOutcome, place_instrument, tool_overlap_m
 from marsyard.sim.measurements import MastCalibration
 from tests.algorithms.vtt.synthetic_drive import navcam, pancam
 

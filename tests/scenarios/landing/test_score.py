@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.hda import HdaDetails, Matches, MatchStatus, Safety
-from marsyard.algorithms.hda.details import MappedGround
 from marsyard.algorithms.hda.elevation import ElevationMap
 from marsyard.algorithms.hda.hazards import HazardMaps
+from marsyard.algorithms.hda.products import MappedGround
 from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.interface import SiteEstimate, SiteOutcome
 from marsyard.campaigns.definition.loading import load_campaign

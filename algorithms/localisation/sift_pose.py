@@ -1,4 +1,4 @@
-"""SIFT features of a map and of images, and the pose of an image from matched features (perspective-n-point)."""
+"""Pose of an image from its SIFT features, matched with those of a map (perspective-n-point)."""
 
 from __future__ import annotations
 

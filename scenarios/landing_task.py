@@ -1,15 +1,14 @@
-"""Estimators of landing sites: their task, and the format of their answers in tables."""
+"""Task of the estimators of landing sites, and the format of their answers in tables."""
 
 from dataclasses import replace
 from functools import partial
 
 from marsyard.algorithms import exchange
 from marsyard.algorithms.hda import HdaEstimator, HdaOptions
-from marsyard.algorithms.hda.essential_matrix import EssentialMatrixEstimator
+from marsyard.algorithms.hda.baselines import EssentialMatrixEstimator, SemiGlobalEstimator
 from marsyard.algorithms.hda.options import IMPROVEMENTS
-from marsyard.algorithms.hda.semi_global import SemiGlobalEstimator
 from marsyard.algorithms.interface import SiteEstimate, SiteEstimator, SiteOutcome
-from marsyard.scenarios.answer_tables import AnswerFormat
+from marsyard.scenarios.offline_algorithms import AnswerFormat
 from marsyard.scenarios.tasks import Task, variants
 
 #: Format of a table of landing sites.
