@@ -70,14 +70,6 @@ def test_noise_free_velocity_error_is_within_requirement() -> None:
     assert len(track_errors(flights, estimates)) >= 0.9 * 4 * len(flights)
 
 
-def test_published_algorithm_has_the_errors_of_its_peak_fit() -> None:
-    rng = np.random.default_rng(2024)
-    flights = [draw_flight(rng) for _ in range(6)]
-    estimates = [DimesEstimator().estimate(render(flight)) for flight in flights]
-    # The fit is biased by up to 0.12 px of 5.6 m in 3.75 s (0.18 m/s) on each axis.
-    assert 0.03 < compute_rms(track_errors(flights, estimates)) < 0.18
-
-
 @pytest.mark.slow
 def test_velocity_is_accurate_with_flight_camera_noise() -> None:
     rng = np.random.default_rng(2025)
@@ -88,13 +80,6 @@ def test_velocity_is_accurate_with_flight_camera_noise() -> None:
         [valid_velocity(e) - flight.velocities[1, :2] for e, flight in zip(estimates, flights, strict=True)]
     )
     assert compute_rms(np.array(errors)) < 0.06
-
-
-@pytest.mark.parametrize("velocity", [(20.0, 0.0), (0.0, 20.0), (-15.0, 25.0)])
-def test_east_and_north_velocities_are_not_swapped(velocity: tuple[float, float]) -> None:
-    attitudes = (tilt_body(3.0, 0.0, 0.0), tilt_body(5.0, 90.0, 120.0), tilt_body(4.0, 200.0, 250.0))
-    answer = ESTIMATOR.estimate(render(steady_flight(velocity, attitudes)))
-    np.testing.assert_allclose(valid_velocity(answer), velocity, atol=0.1)
 
 
 def test_template_and_match_show_the_same_ground() -> None:
@@ -380,16 +365,6 @@ def test_rectified_lattice_matches_track_pixels(measurements: DescentMeasurement
             pixels = products[f"rectified_{track.pair}_{side}"]
             result = [ndimage.map_coordinates(pixels[..., k], [[row], [column]], order=3)[0] for k in (0, 1)]
             np.testing.assert_allclose(result, pixel, atol=0.1)
-
-
-def test_inputs_are_unchanged_and_estimates_are_deterministic(measurements: DescentMeasurements) -> None:
-    copies = [image.counts.copy() for image in measurements.images]
-    first, second = (dimes_products(get_details(ESTIMATOR.estimate(measurements))) for _ in range(2))
-    for image, copy in zip(measurements.images, copies, strict=True):
-        np.testing.assert_array_equal(image.counts, copy)
-    assert first.keys() == second.keys()
-    for key, value in first.items():
-        np.testing.assert_array_equal(value, second[key])
 
 
 def test_altitude_error_causes_predicted_velocity_error() -> None:

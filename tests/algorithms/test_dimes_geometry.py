@@ -97,13 +97,6 @@ def test_pixel_angle_and_search_geometry_match_the_paper() -> None:
     assert geometry.window_px == OPTIONS.template_px + 2 * geometry.search_px
 
 
-def test_lattice_and_outline_have_the_expected_number_of_points() -> None:
-    assert ground_view.square_lattice(3.0, 4).shape == (16, 2)
-    outline = ground_view.square_outline(3.0, 4)
-    assert outline.shape == (12, 2)
-    assert np.all(np.abs(outline).max(axis=1) == 3.0)
-
-
 def test_nadir_overlap_is_the_smaller_image() -> None:
     first, second = make_views(Rotation.identity(), Rotation.identity())
     polygon = overlap.overlap_polygon(first, second, OPTIONS)

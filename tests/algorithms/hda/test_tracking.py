@@ -14,7 +14,6 @@ from marsyard.algorithms.hda.tracking import (
     eigenvalue_test,
     feature_border_px,
     level_sizes,
-    pyramid,
     select_features,
     track_features,
     window_half_px,
@@ -144,11 +143,6 @@ def test_displacement_along_the_shorter_side_is_tracked(pitch_deg: float) -> Non
     assert is_inside.sum() >= 30
     # from a level at which the template covers most of the image, 0 and 0.6 of the features are tracked
     assert np.mean(is_correct[is_inside]) >= 0.8
-
-
-def test_pyramid_levels_are_block_means(noise: np.ndarray) -> None:
-    levels = pyramid(noise, 3)
-    np.testing.assert_allclose(levels[2], noise.reshape(30, 4, 40, 4).mean(axis=(1, 3)), rtol=1e-6)
 
 
 def test_correlation_peak_matches_shared_operators(noise: np.ndarray) -> None:
