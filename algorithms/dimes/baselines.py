@@ -7,7 +7,7 @@ the two velocities is that of DIMES, with the same threshold. Only the measureme
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import final
 
 import cv2
 import numpy as np
@@ -85,16 +85,8 @@ class BaselineDetails:
 Matcher = Callable[[PairPatches], PairMatch | None]
 
 
-class GroundSquare(NamedTuple):
-    """A square of ground: centre (east, north), metres; side, rectified pixels; metres per rectified pixel."""
-
-    centre: Vector2
-    side_px: int
-    gsd_m: float
-
-
-def find_common_square(first: BinnedView, second: BinnedView, options: CommonOptions) -> GroundSquare | None:
-    """Find the largest square of ground inside both views at zero motion; None if it is too small."""
+def rectify_pair(first: BinnedView, second: BinnedView, options: CommonOptions) -> PairPatches | None:
+    """Rectify both images over the largest square of ground inside both at zero motion; None if it is too small."""
     gsd = float(second.centre[2]) * second.camera.pixel_angle_rad
     max_offset_m = np.tan(options.max_off_nadir_rad) * float(min(first.centre[2], second.centre[2]))
     points_per_side = 2 * int(np.ceil(max_offset_m / (COARSE_STEP_PX * gsd))) + 1
@@ -106,16 +98,12 @@ def find_common_square(first: BinnedView, second: BinnedView, options: CommonOpt
     distances = cv2.distanceTransform(np.pad(visible, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(np.argmax(distances)), distances.shape)
     side = min(2 * (int(distances[row, column]) - 1) * COARSE_STEP_PX, options.max_side_px)
-    return GroundSquare(lattice[row, column], side, gsd) if side >= options.min_side_px else None
-
-
-def rectify_pair(first: BinnedView, second: BinnedView, options: CommonOptions) -> PairPatches | None:
-    """Rectify both images of a pair over their largest common square; None if the square is too small."""
-    square = find_common_square(first, second, options)
-    if square is None:
+    if side < options.min_side_px:
         return None
-    first_patch, second_patch = (rectification.rectify_patch(view, *square) for view in (first, second))
-    return PairPatches(first_patch, second_patch, square.gsd_m)
+    first_patch, second_patch = (
+        rectification.rectify_patch(view, lattice[row, column], side, gsd) for view in (first, second)
+    )
+    return PairPatches(first_patch, second_patch, gsd)
 
 
 def estimate_by_pairs(measurements: DescentMeasurements, matcher: Matcher, options: CommonOptions) -> VelocityEstimate:

@@ -167,3 +167,14 @@ def correct_tilt(answer: VelocityEstimate, sun_direction: Vector3, options: Dime
     if apparent_m_s < options.imu_threshold_m_s:
         return replace(answer, details=details)
     return VelocityEstimate(VelocityOutcome.INCLINED_GROUND, None, details)
+
+
+def propagate_velocity(
+    velocity_m_s: Vector2, inertial_at_estimate_m_s: Vector2, inertial_at_end_m_s: Vector2
+) -> Vector2:
+    """Propagate a horizontal velocity by the IMU, m/s, as to the firing of the thrusters near 100 m (section I).
+
+    `inertial_at_estimate_m_s` is the mean inertial velocity over the interval of the estimate (second pair),
+    `inertial_at_end_m_s` the inertial velocity at the end of the propagation. An error common to both has no effect.
+    """
+    return np.asarray(velocity_m_s + (inertial_at_end_m_s - inertial_at_estimate_m_s))

@@ -4,7 +4,7 @@ Figures are those of Johnson et al., "Field Testing of the MER DIMES".
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -104,20 +104,12 @@ FOOTPRINT_POINTS = 17
 FIGURE_OFF_NADIR_RAD = float(np.deg2rad(60.0))
 
 
-class RectifiedLattice(NamedTuple):
-    """Sampling lattice of the virtual camera's image of a pair, for Figs. 7-9; rows run south.
+def rectified_lattice(pair: PairDetails) -> tuple[Float[np.ndarray, "3"], list[Float[np.ndarray, "n n 2"]]]:
+    """Build the lattice that samples the virtual camera's image of a pair over both footprints, for Figs. 7-9.
 
-    - frame_m: (east, north, step), metres: the upper left point relative to the nadir point, and the spacing
-    - earlier_pixels, later_pixels: pixels (u, v) of both images at the lattice points; NaN if invisible
+    Returns (east, north, step), metres: the upper left point relative to the nadir point, and the spacing; and the
+    pixels (u, v) of the earlier and the later image at the lattice points, NaN if invisible. Rows run south.
     """
-
-    frame_m: Float[np.ndarray, "3"]
-    earlier_pixels: Float[np.ndarray, "n n 2"]
-    later_pixels: Float[np.ndarray, "n n 2"]
-
-
-def rectified_lattice(pair: PairDetails) -> RectifiedLattice:
-    """Build the sampling lattice of a pair over the footprints of both images."""
     footprints = []  # ground points of a lattice of pixels of each image
     for view in pair.views:
         u, v = np.meshgrid(*(np.linspace(0.0, 1.0, FOOTPRINT_POINTS) * (size - 1.0) for size in view.size))
@@ -132,7 +124,7 @@ def rectified_lattice(pair: PairDetails) -> RectifiedLattice:
     for view in pair.views:
         view_pixels, visible = pixels_from_ground(view, ground)
         pixels.append(np.where(visible[..., None], view_pixels, np.nan))
-    return RectifiedLattice(np.array([ground[0, 0, 0], ground[0, 0, 1], step]), *pixels)
+    return np.array([ground[0, 0, 0], ground[0, 0, 1], step]), pixels
 
 
 def dimes_products(details: DimesDetails) -> dict[str, Any]:
@@ -168,7 +160,7 @@ def dimes_products(details: DimesDetails) -> dict[str, Any]:
         products[f"overlap_{number}"] = pair.overlap_polygon
         products[f"zero_phase_{number}"] = pair.zero_phase_pixels
         products[f"gsd_{number}"] = np.array([pair.gsd_m])
-        frame, *lattices = rectified_lattice(pair)
+        frame, lattices = rectified_lattice(pair)
         products[f"rectified_frame_{number}"] = frame
         for side, pixels in enumerate(lattices):
             products[f"rectified_{number}_{side}"] = pixels

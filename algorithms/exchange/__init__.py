@@ -1,6 +1,5 @@
 """External programs as algorithms under test: cases as files, answers as JSON (docs/custom-algorithms.md)."""
 
-from marsyard.algorithms.exchange.command import PREFIXES, Command, parse_command
 from marsyard.algorithms.exchange.executable import (
     SITE_REQUESTS,
     VELOCITY_REQUESTS,
@@ -21,6 +20,7 @@ from marsyard.algorithms.exchange.files import (
 )
 from marsyard.algorithms.exchange.forms import SITE_FORM, VELOCITY_FORM, AnswerForm, ProgramDetails, answer_time_s
 from marsyard.algorithms.exchange.limits import ExecutableLimits
+from marsyard.algorithms.exchange.serving import PREFIXES, Command, parse_command
 from marsyard.algorithms.exchange.streams import VELOCITY_STREAM, StreamForm
 
 __all__ = [

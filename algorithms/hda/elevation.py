@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Num
 
-from marsyard.algorithms.arrays import Mask, Points3, Raster, Vector2
-from marsyard.algorithms.hda.kernels import elevation as kernels
+from marsyard.algorithms.arrays import Mask, Points2, Points3, Raster, Vector, Vector2
 
 
 def grassfire(mask: Mask) -> Raster:
@@ -68,10 +67,27 @@ def elevation_map(points: Points3) -> ElevationMap | None:
     columns, rows = (int(count) for count in np.ceil(extent / cell))
     corner = 0.5 * (low + high) + 0.5 * cell * np.array([-(columns - 1.0), rows - 1.0])
     empty = ElevationMap(np.full((rows, columns), np.nan), corner, cell)
-    row, column = empty.cells(points[:, :2]).T
-    sums, weights = kernels.accumulate_bilinear(row, column, points[:, 2], (rows, columns))
+    sums, weights = _accumulate_bilinear(empty.cells(points[:, :2]), points[:, 2], (rows, columns))
     values = np.divide(sums, weights, out=np.full_like(sums, np.nan), where=weights >= MIN_WEIGHT)
     return ElevationMap(values, corner, cell)
+
+
+def _accumulate_bilinear(cells: Points2, values: Vector, shape: tuple[int, int]) -> tuple[Raster, Raster]:
+    """Distribute values at fractional cells (row, column) to the four nearest cells with bilinear weights.
+
+    Returns the sums of weighted values and of weights per cell.
+    """
+    low = np.floor(cells).astype(np.int64)
+    fractions = cells - low
+    corners = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    near = low[:, np.newaxis] + corners
+    weights = np.where(corners == 1, fractions[:, np.newaxis], 1.0 - fractions[:, np.newaxis]).prod(axis=2)
+    inside = np.all((near >= 0) & (near < shape), axis=2)
+    rows, columns = near[inside].T
+    sums = np.zeros((2, *shape))
+    np.add.at(sums[0], (rows, columns), (weights * values[:, np.newaxis])[inside])
+    np.add.at(sums[1], (rows, columns), weights[inside])
+    return sums[0], sums[1]
 
 
 def fill_small_holes(ground: ElevationMap, width_m: float) -> ElevationMap:

@@ -42,7 +42,7 @@ class HdaOptions:
       I: 11 x 11)
     - window_half_px: Half width w of the search window of a feature. None: the expected displacement of the features
       (section II.A), which the limits of the image pairs and the camera determine
-      (`marsyard.algorithms.hda.tracking.expected_shift_px`). The example of Table I, 81 x 81 px, is 40.
+      (`marsyard.algorithms.hda.tracking.window_half_px`). The example of Table I, 81 x 81 px, is 40.
     - max_baseline_fraction: Limit of the image pairs: baseline divided by range
     - max_tilt_change_rad, max_roll_change_rad, max_height_change_fraction: Limits of the image pairs: rotation about an
       axis in the image plane and about the optical axis, and change of height divided by height. The defaults are those

@@ -54,8 +54,6 @@ class FilterOptions:
 
     - imu: errors of the inertial unit
     - gates: limits of the updates
-    - altitude_sd_m: standard deviation of an altitude including the map's elevation, if the call gives none
-    - pixel_sd: standard deviation of a landmark's pixel per axis, if the call gives none
     - step_s: step of the time grid on which the covariance is propagated. At 0.5 rad/s a step of 0.1 s neglects
       rotations of 0.05 rad in the small terms that `compute_transition` names.
     - memory_s: time for which states and increments are stored for delayed updates
@@ -65,8 +63,6 @@ class FilterOptions:
 
     imu: ImuErrorModel = field(default_factory=ImuErrorModel)
     gates: GateOptions = field(default_factory=GateOptions)
-    altitude_sd_m: float = 10.0
-    pixel_sd: float = 0.5
     step_s: float = 0.1
     memory_s: float = 5.0
     max_extrapolation_s: float = 0.02
@@ -177,9 +173,7 @@ class LocalisationFilter:
         )
         return self._update(time_s, update, StateUpdate(UpdateOutcome.OUTSIDE_HISTORY))
 
-    def update_altitude(
-        self, time_s: float, altitude_m: float, ground_height: GroundModel, sd_m: float | None = None
-    ) -> StateUpdate:
+    def update_altitude(self, time_s: float, altitude_m: float, ground_height: GroundModel, sd_m: float) -> StateUpdate:
         """Update by an altitude above the ground below the body frame's origin.
 
         `ground_height` is the map's height at the estimated position with its slope (east, north), or a function that
@@ -188,11 +182,7 @@ class LocalisationFilter:
         slope's extent, use a slope of zero and the relief's standard deviation.
         """
         update = partial(
-            updates.update_altitude,
-            altitude_m=altitude_m,
-            ground=ground_height,
-            sd_m=self._options.altitude_sd_m if sd_m is None else sd_m,
-            options=self._options.gates,
+            updates.update_altitude, altitude_m=altitude_m, ground=ground_height, sd_m=sd_m, options=self._options.gates
         )
         return self._update(time_s, update, StateUpdate(UpdateOutcome.OUTSIDE_HISTORY))
 
@@ -202,7 +192,7 @@ class LocalisationFilter:
         camera: CameraModel,
         points_world: Float[np.ndarray, "n 3"],
         pixels: Float[np.ndarray, "n 2"],
-        pixel_sd: float | Float[np.ndarray, "n"] | None = None,
+        pixel_sd: float | Float[np.ndarray, "n"],
         point_sd_m: float | Float[np.ndarray, "3"] = 0.0,
         common_sd_m: float | Float[np.ndarray, "3"] = 0.0,
         *,
@@ -226,7 +216,7 @@ class LocalisationFilter:
             camera=camera,
             points_world=points_world,
             pixels=pixels,
-            pixel_sd=np.full(count, self._options.pixel_sd if pixel_sd is None else pixel_sd, dtype=np.float64),
+            pixel_sd=np.full(count, pixel_sd, dtype=np.float64),
             point_sd_m=np.full(3, point_sd_m, dtype=np.float64),
             common_sd_m=np.full(3, common_sd_m, dtype=np.float64),
             is_rigid=is_rigid,

@@ -63,14 +63,11 @@ class LandmarkResult:
 
     - inliers: landmarks that agree with each other and with the state; all False if the points are invalid
     - residuals_px: measured minus expected pixels with the estimated state and common error; NaN if not visible
-    - shift_square: squared length of the whitened correction, about chi-square with 6 degrees of freedom if
-      consistent; after the outcome INCONSISTENT of the test of the rigid motion, the statistic of this test
     """
 
     outcome: UpdateOutcome
     inliers: Bool[np.ndarray, "n"]
     residuals_px: Float[np.ndarray, "n 2"]
-    shift_square: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -210,7 +207,7 @@ def update_landmarks(
     if measurement.is_rigid:
         motion, residuals = _test_rigid_motion(state, measurement, start.visible)
         if not motion < max_shift:
-            return state, LandmarkResult(UpdateOutcome.INCONSISTENT, np.zeros_like(start.visible), residuals, motion)
+            return state, LandmarkResult(UpdateOutcome.INCONSISTENT, np.zeros_like(start.visible), residuals)
     factors = start.jacobian @ problem.factor
     innovation_squares = _normalise(start.residuals, start.noise + factors @ factors.transpose(0, 2, 1))
     candidates = start.visible & (innovation_squares < chdtri(2, options.false_rejection))
@@ -227,14 +224,15 @@ def update_landmarks(
         if np.array_equal(inliers, previous):
             break
     residuals = np.where(solution.linearisation.visible[:, None], solution.residuals, np.nan)
+    # squared length of the whitened correction: about chi-square with 6 degrees of freedom if consistent
     shift = float(whitened @ whitened)
     min_count = max(options.min_landmarks, options.min_fraction * int(start.visible.sum()))
     if int(inliers.sum()) < min_count:
-        return state, LandmarkResult(UpdateOutcome.TOO_FEW, inliers, residuals, shift)
+        return state, LandmarkResult(UpdateOutcome.TOO_FEW, inliers, residuals)
     if not shift < max_shift:
-        return state, LandmarkResult(UpdateOutcome.INCONSISTENT, inliers, residuals, shift)
+        return state, LandmarkResult(UpdateOutcome.INCONSISTENT, inliers, residuals)
     updated = state.correct(problem.errors(whitened), problem.covariance(solution.information))
-    return updated, LandmarkResult(UpdateOutcome.APPLIED, inliers, residuals, shift)
+    return updated, LandmarkResult(UpdateOutcome.APPLIED, inliers, residuals)
 
 
 def _test_rigid_motion(

@@ -15,11 +15,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, cast
 
-from marsyard.algorithms.exchange.command import Command
 from marsyard.algorithms.exchange.forms import read_member
 from marsyard.algorithms.exchange.limits import ExecutableLimits
 from marsyard.algorithms.exchange.process import RunningProgram, temporary_folder
-from marsyard.algorithms.exchange.serving import acquire_server, release_server
+from marsyard.algorithms.exchange.serving import Command, acquire_server, release_server
 from marsyard.algorithms.faults import AlgorithmError, Fault, bad_answer
 from marsyard.algorithms.processes import children, processor_time_s
 from marsyard.algorithms.worker_device import worker_device

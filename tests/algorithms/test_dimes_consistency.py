@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from marsyard.algorithms.dimes.estimator import combine_pairs
+from marsyard.algorithms.dimes.estimator import combine_pairs, propagate_velocity
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.products import DimesTrack, PairDetails
-from marsyard.algorithms.dimes.propagation import propagate_velocity
 from marsyard.algorithms.dimes.validity import (
     TrackMetrics,
     ValidityCheck,

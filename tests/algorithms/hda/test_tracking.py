@@ -12,7 +12,6 @@ from marsyard.algorithms.hda.scene import CameraView
 from marsyard.algorithms.hda.tracking import (
     LevelSize,
     eigenvalue_test,
-    feature_border_px,
     level_sizes,
     select_features,
     track_features,
@@ -65,7 +64,7 @@ def test_best_feature_of_each_block_is_selected() -> None:
     counts = np.random.default_rng(3).integers(0, 256, (150, 200)).astype(np.uint16)
     options = HdaOptions(block_px=40, align=True)
     features = select_features(counts, options)
-    border = feature_border_px(options)
+    border = options.template_half_px + 1
     interest = eigenvalue_test(counts.astype(np.float32), 11, options.min_eigenvalue)
     expected = []
     for top in range(0, 150, 40):

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation import estimator as estimator_module
 from marsyard.algorithms.localisation.baselines import FeatureEstimator, InertialEstimator
-from marsyard.algorithms.localisation.coarse import CoarseFix, CoarseMatches, CoarseRefusal
+from marsyard.algorithms.localisation.coarse import CoarseFix, CoarseRefusal
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.fine import LandmarkMatches
@@ -68,9 +68,7 @@ class Stages:
         result = self.coarse.pop(0)
         if isinstance(result, CoarseRefusal):
             return result
-        points, none = np.empty((0, 2)), np.empty(0)
-        matches = CoarseMatches(np.empty(0, dtype=np.int64), points, points, none, np.empty(0, dtype=bool), none)
-        return CoarseFix(result, 100.0 * np.eye(2), matches, 10.0, 0.0)
+        return CoarseFix(result, 100.0 * np.eye(2))
 
     def match_landmarks(self, image: PosedImage, *_: object) -> LandmarkMatches:
         """Return the exact pixels of a grid of points on the flat map, or no match."""

@@ -316,14 +316,14 @@ def test_updates_outside_the_history_and_invalid_ones_are_ignored(truth: Descent
     navigation.propagate(slice_increments(exact, 0, 4000))
     before = navigation.state_at(10.0)
     flat = (0.0, np.zeros(2))
-    assert navigation.update_altitude(1.0, 3900.0, flat).outcome is UpdateOutcome.OUTSIDE_HISTORY
-    assert navigation.update_altitude(10.5, 3900.0, flat).outcome is UpdateOutcome.OUTSIDE_HISTORY
-    assert navigation.update_altitude(10.0, np.nan, flat).outcome is UpdateOutcome.INVALID
-    assert navigation.update_altitude(10.0, 100.0, flat).outcome is UpdateOutcome.REJECTED
+    assert navigation.update_altitude(1.0, 3900.0, flat, 10.0).outcome is UpdateOutcome.OUTSIDE_HISTORY
+    assert navigation.update_altitude(10.5, 3900.0, flat, 10.0).outcome is UpdateOutcome.OUTSIDE_HISTORY
+    assert navigation.update_altitude(10.0, np.nan, flat, 10.0).outcome is UpdateOutcome.INVALID
+    assert navigation.update_altitude(10.0, 100.0, flat, 10.0).outcome is UpdateOutcome.REJECTED
     none = np.zeros((0, 2))
-    assert navigation.update_landmarks(10.0, CAMERA, np.zeros((0, 3)), none).outcome is UpdateOutcome.TOO_FEW
+    assert navigation.update_landmarks(10.0, CAMERA, np.zeros((0, 3)), none, 0.5).outcome is UpdateOutcome.TOO_FEW
     points, pixels = draw_points(truth, 10.0, 20, np.random.default_rng(4))
-    invalid = navigation.update_landmarks(10.0, CAMERA, points, np.full_like(pixels, np.nan))
+    invalid = navigation.update_landmarks(10.0, CAMERA, points, np.full_like(pixels, np.nan), 0.5)
     assert invalid.outcome is UpdateOutcome.TOO_FEW
     after = navigation.state_at(10.0)
     assert np.array_equal(before.position_m, after.position_m)
@@ -430,8 +430,6 @@ def test_landmarks_of_a_wrong_attitude_are_inconsistent(truth: Descent, exact: I
         return
     assert result.outcome is UpdateOutcome.INCONSISTENT
     assert not result.inliers.any()
-    # far above the chi-square limit of 33
-    assert result.shift_square > 300.0
     np.testing.assert_array_equal(navigation.state_at(2.0).position_m, before.position_m)
 
 

@@ -8,9 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.interface import TargetLoss, TargetTracker, TrackingState
-from marsyard.algorithms.vtt.lucas_kanade import lucas_kanade_tracker
 from marsyard.algorithms.vtt.options import PURE_NCC, VttOptions
-from marsyard.algorithms.vtt.tracker import VisualTargetTracker
+from marsyard.algorithms.vtt.tracker import VisualTargetTracker, lucas_kanade_tracker
 from marsyard.sim.camera import Cahvor
 from marsyard.sim.measurements import MastImage, PixelTarget, RoverTarget, SiteTarget, TargetDesignation
 from tests.algorithms.vtt.synthetic_drive import (

@@ -11,7 +11,7 @@ import pytest
 from marsyard.algorithms.localisation.navigation_filter import LocalisationFilter
 from marsyard.campaigns.running.conformance import create_subject
 from marsyard.scenarios.conformance.candidates import CandidateAlgorithm, check_names, determine_task, subject_kinds
-from marsyard.scenarios.localisation import conformance_inputs as inputs
+from marsyard.scenarios.localisation import conformance as inputs
 from marsyard.sim.measurements import ImuIncrements
 from tests.scenarios import suites
 
