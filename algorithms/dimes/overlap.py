@@ -1,6 +1,6 @@
 """Template candidates in the overlap region of two views, and their selection (section II.A).
 
-Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot (`zero_phase`) is masked.
+Sections are those of Johnson et al., "Field Testing of the MER DIMES". The zero-phase spot (`ground_view`) is masked.
 """
 
 from dataclasses import dataclass

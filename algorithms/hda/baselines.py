@@ -199,5 +199,4 @@ def semi_global_structure(scene: LandingScene, motion: CameraMotion, options: Hd
     statuses[is_accepted] = structure.MatchStatus.ACCEPTED
     points = points_at_depth(coordinates, depths)
     matched_pixels, _ = project_points(second.camera, motion.second_from_first.apply(points))
-    no_scores = np.full(len(pixels), np.nan)
-    return structure.Matches(pixels, starts, ends, matched_pixels, no_scores, depths, statuses, points[is_accepted])
+    return structure.Matches(pixels, starts, ends, matched_pixels, depths, statuses, points[is_accepted])

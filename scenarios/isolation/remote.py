@@ -32,15 +32,15 @@ _MAX_TRACE = 8000
 
 
 class PythonProgram(RunningProgram):
-    """Process of a custom Python algorithm, with the descriptor of its shared memory (`memory`)."""
+    """Process of a custom Python algorithm, with the descriptor of its shared memory (`memory_fd`)."""
 
     def __init__(self, spec: str, limits: ExecutableLimits) -> None:
-        self.memory = os.memfd_create("measurements")
-        weakref.finalize(self, os.close, self.memory)
-        words = (sys.executable, "-P", "-m", "marsyard.scenarios.isolation.host", str(self.memory))
+        self.memory_fd = os.memfd_create("measurements")
+        weakref.finalize(self, os.close, self.memory_fd)
+        words = (sys.executable, "-P", "-m", "marsyard.scenarios.isolation.host", str(self.memory_fd))
         folder = temporary_folder()
         super().__init__(
-            words, limits, folder, working_folder=folder, readable=source_root(spec), descriptors=(self.memory,)
+            words, limits, folder, working_folder=folder, readable=source_root(spec), descriptors=(self.memory_fd,)
         )
 
     @property
@@ -83,7 +83,7 @@ class RemoteAlgorithm:
         self._server = acquire_server(command, limits)
         self._release = weakref.finalize(self, release_server, command, limits, self._server)
         child = cast(PythonProgram, self._server.child)
-        self._sender = Sender(child.memory)
+        self._sender = Sender(child.memory_fd)
         self._process = child.find_algorithm()
         start = {"path": search_path(), "spec": spec, "device": worker_device(limits.devices)}
         child.left_s = math.inf

@@ -1,12 +1,10 @@
 """Tests of external programs as algorithms: exchanged files, answers and program faults."""
 
 import dataclasses
-import json
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -80,7 +78,10 @@ def test_case_files_round_trip(measurements: DescentMeasurements, tmp_path: Path
     for reference, actual in zip(measurements.attitudes, restored_case.attitudes, strict=True):
         # normalising the quaternion again changes the last digits
         assert (reference.world_from_body.inv() * actual.world_from_body).magnitude() < 1e-14
-    assert len(list(tmp_path.glob("*.f64"))) == 1  # one flat field for three images of one camera
+    # one flat field for three images of one camera
+    cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.{image_format}" for k in (1, 2, 3)]
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
 
 
 def test_landing_without_range_round_trips(measurements: DescentMeasurements, tmp_path: Path) -> None:
@@ -98,42 +99,6 @@ def test_landing_without_range_round_trips(measurements: DescentMeasurements, tm
     assert np.isnan(restored_case.slant_range_m)
     np.testing.assert_allclose(restored_case.poses[1].world_from_body.as_matrix(), pose.as_matrix(), atol=1e-15)
     np.testing.assert_array_equal(restored_case.apriori_site_world, landing.apriori_site_world)
-
-
-def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    write_case(tmp_path, measurements)
-    names = sorted(path.name for path in tmp_path.iterdir())
-    cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.pgm" for k in (1, 2, 3)]
-    assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
-    # Each number in the files is a measurement, or an index or size; the true velocity is absent.
-    case = json.loads((tmp_path / "case.json").read_text())
-    numbers = np.array(list(_iterate_numbers(case)))
-    inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
-    indices = {float(k) for k in range(max(512, *measurements.images[0].counts.shape) + 1)}
-    assert set(numbers) <= set(inputs) | indices
-    assert not np.isclose(numbers[:, None], TRUE_VELOCITY, atol=1e-3).any()
-
-
-def _to_plain_values(value: object) -> object:
-    """Convert a measurement to lists and dictionaries, with rotations as quaternions."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: _to_plain_values(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Rotation):
-        return value.as_quat().tolist()
-    if isinstance(value, np.ndarray):
-        return value.ravel().tolist() if value.size < 100 else []
-    return [_to_plain_values(item) for item in value] if isinstance(value, (tuple, list)) else value
-
-
-def _iterate_numbers(value: object) -> Iterator[float]:
-    """Yield all numbers of nested lists and dictionaries."""
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list):
-        for item in value:
-            yield from _iterate_numbers(item)
-    elif isinstance(value, (int, float)):
-        yield float(value)
 
 
 def test_other_format_version_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
@@ -226,21 +191,21 @@ def test_persistent_program_restarts_after_a_crash(measurements: DescentMeasurem
     end_idle_programs()
 
 
-#: A program that answers each case twice: `PAUSE_S` after the request, and again after the same time.
+#: A program that answers each case twice: 0.05 s after the request, and again after the same time.
 DOUBLE_ANSWERS = """
 print(json.dumps({"exchange": 3, "ready": True}), flush=True)
 for number, line in enumerate(sys.stdin):
     request = json.loads(line)
-    time.sleep(PAUSE_S)
+    time.sleep(0.05)
     answer = {"exchange": 3, "id": request["id"], "outcome": "VALID", "velocity_m_s": [number, 0]}
     print(json.dumps(answer), flush=True)
-    time.sleep(PAUSE_S)
+    time.sleep(0.05)
     print(json.dumps(answer), flush=True)
 """
 
 
 def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS.replace('PAUSE_S', '0.05'))}"
+    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS)}"
     first = run_program(spec, measurements).velocity_m_s
     assert first is not None
     time.sleep(0.5)  # the second line is in the pipe
@@ -251,16 +216,6 @@ def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements,
     velocity = run_program(spec, measurements).velocity_m_s
     assert velocity is not None
     assert velocity[0] == 0.0
-    end_idle_programs()
-
-
-def test_answer_to_another_request_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
-    # The second line follows the next request: only its id shows that it answers the previous request.
-    spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS.replace('PAUSE_S', '1.0'))}"
-    run_program(spec, measurements)
-    with pytest.raises(AlgorithmError, match="the answer's id is 1; allowed: 2") as error:
-        run_program(spec, measurements)
-    assert error.value.fault is Fault.BAD_ANSWER
     end_idle_programs()
 
 

@@ -162,27 +162,18 @@ def test_hazards_are_dilated_by_lander_disc(row: int, column: int, growth: float
     np.testing.assert_array_equal((safety == Safety.HAZARD)[unambiguous], expected[unambiguous])
 
 
-def test_cells_near_borders_and_holes_are_unknown() -> None:
+@pytest.mark.parametrize(("diameter_m", "growth"), [(1.0, 0.5), (1.5, 0.61)])
+def test_cells_near_borders_and_holes_are_unknown(diameter_m: float, growth: float) -> None:
     slope = np.zeros((80, 100))
     slope[40, 50] = np.nan
-    safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, OPTIONS)
-    rows, columns = np.indices((80, 100))
-    # Half a diameter is 5 cells; the cells around the map are unknown.
-    from_border = np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns])
-    unknown = (from_border <= 5) | (np.hypot(rows - 40, columns - 50) <= 5.0)
-    np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
-
-
-def test_unknown_region_grows_with_lander_diameter() -> None:
-    slope = np.zeros((80, 100))
-    slope[40, 50] = np.nan
-    options = replace(OPTIONS, lander_diameter_m=1.5, unknown_growth=0.6)
+    options = replace(OPTIONS, lander_diameter_m=diameter_m, unknown_growth=growth)
     safety = safe_landing_map(slope, np.zeros((80, 100)), CELL_M, options)
     rows, columns = np.indices((80, 100))
-    distance = np.hypot(rows - 40, columns - 50)
-    inner = (slice(15, 65), slice(15, 85))
-    unambiguous = (np.abs(distance - 9.0) > 1e-6)[inner]  # 0.6 of 1.5 m are 9 cells
-    np.testing.assert_array_equal((safety == Safety.UNKNOWN)[inner][unambiguous], (distance < 9.0)[inner][unambiguous])
+    # half a diameter is 5 cells, or 0.61 of 1.5 m are 9.15 cells; the cells around the map are unknown
+    near_cells = 10.0 * growth * diameter_m
+    from_border = np.minimum.reduce([rows + 1, columns + 1, 80 - rows, 100 - columns])
+    unknown = (from_border <= near_cells) | (np.hypot(rows - 40, columns - 50) <= near_cells)
+    np.testing.assert_array_equal(safety, np.where(unknown, Safety.UNKNOWN, Safety.SAFE))
 
 
 def test_hazard_takes_precedence_over_unknown() -> None:

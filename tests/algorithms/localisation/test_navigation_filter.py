@@ -83,6 +83,15 @@ def initial_state(truth: Descent, covariance: np.ndarray, errors: np.ndarray | N
     )
 
 
+def start_filter(
+    truth: Descent, exact: ImuIncrements, covariance: np.ndarray = SMALL_COVARIANCE, errors: np.ndarray | None = None
+) -> LocalisationFilter:
+    """Return the filter after 2 s of exact increments, with errors of the initial state."""
+    navigation = LocalisationFilter.from_initial(initial_state(truth, covariance, errors))
+    navigation.propagate(slice_increments(exact, 0, 800))
+    return navigation
+
+
 def state_errors(truth: Descent, state: NavigationState) -> np.ndarray:
     """True minus estimated position, velocity and attitude."""
     true = truth.state(state.time_s)
@@ -382,8 +391,7 @@ def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) 
     rng = np.random.default_rng([seed, 6])
     covariance = np.diag(np.repeat([100.0, 1.0, 0.005], 3) ** 2)
     errors = np.sqrt(np.diag(covariance)) * rng.standard_normal(9)
-    navigation = LocalisationFilter.from_initial(initial_state(truth, covariance, errors))
-    navigation.propagate(slice_increments(exact, 0, 800))
+    navigation = start_filter(truth, exact, covariance, errors)
     points, pixels = draw_points(truth, 2.0, 150, rng)
     pixels += 0.3 * rng.standard_normal(pixels.shape)
     wrong = rng.permutation(150) < 45
@@ -401,8 +409,7 @@ def test_outliers_are_rejected(truth: Descent, exact: ImuIncrements, seed: int) 
 
 def test_systematically_wrong_landmarks_are_inconsistent(truth: Descent, exact: ImuIncrements) -> None:
     """A repetitive pattern: all landmarks agree on a position that is wrong by 400 m, 8 standard deviations."""
-    navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
-    navigation.propagate(slice_increments(exact, 0, 800))
+    navigation = start_filter(truth, exact)
     points, pixels = draw_points(truth, 2.0, 80, np.random.default_rng(7))
     result = navigation.update_landmarks(2.0, CAMERA, points + np.array([400.0, 0.0, 0.0]), pixels, 0.3)
     assert result.outcome in (UpdateOutcome.TOO_FEW, UpdateOutcome.INCONSISTENT)
@@ -419,8 +426,7 @@ def test_landmarks_of_a_wrong_attitude_are_inconsistent(truth: Descent, exact: I
     tilt = np.radians([tilt_deg, 0.0, 0.0])
     height = truth.state(2.0).position_m[2]
     errors = np.concatenate([np.cross(tilt, [0.0, 0.0, height]), np.zeros(3), tilt])
-    navigation = LocalisationFilter.from_initial(initial_state(truth, covariance, errors))
-    navigation.propagate(slice_increments(exact, 0, 800))
+    navigation = start_filter(truth, exact, covariance, errors)
     points, pixels = draw_points(truth, 2.0, 100, np.random.default_rng(7))
     before = navigation.state_at(2.0)
     result = navigation.update_landmarks(2.0, CAMERA, points, pixels, 0.3, 6.0, 10.0, is_rigid=True)
@@ -437,8 +443,7 @@ def test_common_error_limits_the_accuracy_of_one_image(truth: Descent, exact: Im
     """150 landmarks with a common error: the position's standard deviation is not below that of the common error."""
     deviations = []
     for common in (0.0, np.array([6.0, 6.0, 10.0])):
-        navigation = LocalisationFilter.from_initial(initial_state(truth, SMALL_COVARIANCE))
-        navigation.propagate(slice_increments(exact, 0, 800))
+        navigation = start_filter(truth, exact)
         points, pixels = draw_points(truth, 2.0, 150, np.random.default_rng(8))
         result = navigation.update_landmarks(2.0, CAMERA, points, pixels, 0.3, 1.0, common)
         assert result.outcome is UpdateOutcome.APPLIED

@@ -181,11 +181,8 @@ for line in sys.stdin:
     ("body", "problem"),
     [
         ("pass", ""),
-        ("sys.exit('the end' if images == 2 else 0)", "CRASHED: "),
         ("sys.exit('the end')", "CRASHED: it ended with status 1; its standard error ends with: the end"),
         ("time.sleep(60)", "TIMED_OUT: no answer within 0.5 s"),
-        ("answer = {'outcome': 'PROBABLY'}", "BAD_ANSWER: outcome is 'PROBABLY'; allowed: VALID, NO_COARSE_FIX"),
-        ("print('here'); answer = {}", "BAD_ANSWER: "),
     ],
 )
 def test_faults_of_programs_are_reported(tmp_path: Path, body: str, problem: str) -> None:
