@@ -192,12 +192,8 @@ def _text(text: str) -> Callable[[Path], object]:
 
 READERS: Mapping[str, Reader] = {
     **{
-        f"terrain {name}": Reader(name, write, read, TerrainFileError)
-        for name, write in (("dtm.tif", _write_relief), ("dtm.npz", _write_npz))
-        for read in (_read_terrain,)
-    },
-    **{
-        f"rasters {name}": Reader(name, write, _read_rasters, TerrainFileError)
+        f"{kind} {name}": Reader(name, write, read, TerrainFileError)
+        for kind, read in (("terrain", _read_terrain), ("rasters", _read_rasters))
         for name, write in (("dtm.tif", _write_relief), ("dtm.npz", _write_npz))
     },
     **{

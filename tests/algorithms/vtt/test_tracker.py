@@ -114,11 +114,7 @@ def test_scaling_allows_larger_steps_than_pure_ncc() -> None:
 @pytest.mark.parametrize("roll", [True, False])
 def test_tilted_rover_requires_roll_correction(roll: bool) -> None:
     target = np.array([5.0, 0.1, 0.3])
-    drive = Drive(
-        make_scene(make_face(1, target), target, 1), navcam(), VisualTargetTracker(replace(SMALL_WINDOW, roll=roll))
-    )
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 1, replace(SMALL_WINDOW, roll=roll))
     # The body tilts by 25 deg to its right: its image rolls counter-clockwise by about the same angle.
     tilted_pose = pose(0.3, 0.0, tilt=Rotation.from_rotvec([np.deg2rad(25.0), 0.0, 0.0]))
     update = drive.stop(tilted_pose)
@@ -207,10 +203,7 @@ def test_all_three_designations_define_the_same_target() -> None:
 def test_range_of_a_near_target_is_accurate_if_the_mast_centres_both_images() -> None:
     """With `aim_pair` the target is between the centres of both images, so that both contain a target at 2.2 m."""
     target = np.array([2.2, -0.1, 0.3])
-    options = replace(SMALL_WINDOW, aim_pair=True)
-    drive = Drive(make_scene(make_face(6, target), target, 6), pancam(), VisualTargetTracker(options))
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    update = drive.stop(pose(0.0, 0.0))
+    (update,) = start_drive(target, 6, replace(SMALL_WINDOW, aim_pair=True), pancam()).updates
     assert update.position_rover is not None
     np.testing.assert_allclose(update.position_rover, target, atol=0.001)
 
@@ -221,9 +214,7 @@ def test_warp_increases_the_stereo_score_of_a_slanted_face() -> None:
     face = Plane(target, np.array([-np.cos(slant), np.sin(slant), 0.0]))
     scores = {}
     for warp in ("shift", "bend"):
-        drive = Drive(make_scene(face, target, 3), navcam(), VisualTargetTracker(replace(SMALL_WINDOW, warp=warp)))
-        drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-        stereo = get_details(drive.stop(pose(0.0, 0.0))).stereo
+        stereo = get_details(start_drive(target, 3, replace(SMALL_WINDOW, warp=warp), face=face).updates[0]).stereo
         scores[warp] = 0.0 if stereo is None else stereo.score
     assert scores["bend"] > 0.95
     assert scores["shift"] < scores["bend"] - 0.1
@@ -285,11 +276,7 @@ def test_stereo_tolerates_row_offsets_within_the_epipolar_tolerance(row_offset_p
     mast = navcam()
     assert isinstance(mast.right, Cahvor)
     misaligned = replace(mast, right=replace(mast.right, v=mast.right.v + row_offset_px * mast.right.a))
-    drive = Drive(
-        make_scene(make_face(5, target), target, 5), mast, VisualTargetTracker(SMALL_WINDOW), mast_model=misaligned
-    )
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    update = drive.stop(pose(0.0, 0.0))
+    (update,) = start_drive(target, 5, mast=mast, mast_model=misaligned).updates
     assert update.tracked == is_tracked
     if is_tracked:
         # Row errors hardly affect the range: a tenth of a pixel of disparity is 1.5 cm here.
@@ -301,10 +288,7 @@ def test_stereo_tolerates_row_offsets_within_the_epipolar_tolerance(row_offset_p
 def test_spinning_wheels_are_detected() -> None:
     # The estimated drive is 1.5 m of 8 m. The target is still 8 m away, and its image is not magnified.
     target = np.array([8.0, 0.1, 0.2])
-    tracker = VisualTargetTracker(replace(SMALL_WINDOW, search_px=161))
-    drive = Drive(make_scene(make_face(8, target), target, 8), navcam(), tracker)
-    drive.tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 8, replace(SMALL_WINDOW, search_px=161))
     update = drive.stop(pose(0.0, 0.0), pose(1.5, 0.0))
     assert update.state is TrackingState.LOST
 
@@ -368,11 +352,8 @@ def hide_behind_board(scene: Scene) -> Scene:
 )
 def test_occluded_target_is_recovered_or_abandoned(occluded_stops: list[int], expected: list[TrackingState]) -> None:
     target = np.array([6.0, 0.1, 0.2])
-    clear_scene = make_scene(make_face(3, target), target, 3)
-    tracker = VisualTargetTracker(SMALL_WINDOW)
-    drive = Drive(clear_scene, navcam(), tracker)
-    tracker.designate(RoverTarget(target), pose(0.0, 0.0))
-    drive.stop(pose(0.0, 0.0))
+    drive = start_drive(target, 3)
+    tracker, clear_scene = drive.tracker, drive.scene
     states = []
     for stop in (1, 2, 3):
         drive.scene = hide_behind_board(clear_scene) if stop in occluded_stops else clear_scene
