@@ -79,6 +79,11 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration) -
     return HandOff(HandOffOutcome.HANDED_OFF, ArmTarget(position, error))
 
 
+#: Tools on the arm, metres: radius of the contact disc, radius of the disc that contains the tools around it, and
+#: distance of the tools behind the contact disc.
+CONTACT_M, TOOLS_M, CLEARANCE_M = 0.02, 0.05, 0.015
+#: Maximum distance of a re-selected position from the target, metres.
+MAX_RESELECTION_M = 0.008
 #: Spacing of the positions that are checked, metres.
 _SPACING_M = 0.002
 #: Minimum number of surface points on the contact disc.
@@ -94,22 +99,6 @@ class PlacementOutcome(Enum):
     RESELECTED = "the instrument is placed on another position near the target"
     COLLISION = "at all positions near the target the tools would collide with the terrain"
     NO_SURFACE = "stereo measured too few points of the surface"
-
-
-@dataclass(frozen=True)
-class Instrument:
-    """The tools on the arm: a contact disc, and around it a disc of tools that is further back.
-
-    - contact_m: radius of the contact disc
-    - tools_m: radius of the disc that contains the tools
-    - clearance_m: distance of the tools behind the contact disc
-    - max_reselection_m: maximum distance of a re-selected position from the target
-    """
-
-    contact_m: float = 0.02
-    tools_m: float = 0.05
-    clearance_m: float = 0.015
-    max_reselection_m: float = 0.008
 
 
 @dataclass(frozen=True)
@@ -150,16 +139,16 @@ def cylinder_coordinates(
     return heights, np.sqrt(np.maximum(squares, 0.0))
 
 
-def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3, instrument: Instrument) -> float:
+def tool_overlap_m(surface: Points3, position: Vector3, normal: Vector3) -> float:
     """Compute how far the surface protrudes beyond the tools with the contact disc at its median height under the disc.
 
     A positive overlap is a collision; negative values are the remaining clearance. NaN without points at the contact.
     """
     heights, distances = cylinder_coordinates(surface, position, normal)
-    contact = heights[distances <= instrument.contact_m]
+    contact = heights[distances <= CONTACT_M]
     if not contact.size:
         return float("nan")
-    return float(heights[distances <= instrument.tools_m].max() - np.median(contact) - instrument.clearance_m)
+    return float(heights[distances <= TOOLS_M].max() - np.median(contact) - CLEARANCE_M)
 
 
 def fit_plane(points: Points3, viewpoint: Vector3) -> tuple[Vector3, Vector3]:
@@ -169,30 +158,27 @@ def fit_plane(points: Points3, viewpoint: Vector3) -> tuple[Vector3, Vector3]:
     return centre, normal if normal @ (viewpoint - centre) > 0.0 else -normal
 
 
-def place_instrument(
-    surface: Points3, target: Vector3, viewpoint: Vector3, instrument: Instrument | None = None
-) -> Placement:
+def place_instrument(surface: Points3, target: Vector3, viewpoint: Vector3) -> Placement:
     """Place the instrument at the position nearest to the target at which its tools do not collide.
 
     `surface` contains measured points, `viewpoint` is the position of the camera; all in the rover frame, metres.
     """
-    instrument = Instrument() if instrument is None else instrument
-    reach_m = instrument.tools_m + instrument.max_reselection_m
+    reach_m = TOOLS_M + MAX_RESELECTION_M
     nearby = surface[np.linalg.norm(surface - target, axis=1) <= 2.0 * reach_m]
-    around = nearby[np.linalg.norm(nearby - target, axis=1) <= instrument.tools_m]
+    around = nearby[np.linalg.norm(nearby - target, axis=1) <= TOOLS_M]
     if len(around) < _MIN_POINTS:
         return Placement(PlacementOutcome.NO_SURFACE)
     _, across = fit_plane(around, viewpoint)
     is_measured = False
-    for offset in _offsets(across, instrument.max_reselection_m):
+    for offset in _offsets(across, MAX_RESELECTION_M):
         centre = target + offset
-        contact = nearby[cylinder_coordinates(nearby, centre, across)[1] <= instrument.contact_m]
+        contact = nearby[cylinder_coordinates(nearby, centre, across)[1] <= CONTACT_M]
         if len(contact) < _MIN_POINTS:
             continue
         is_measured = True
         point, normal = fit_plane(contact, viewpoint)
         position = centre + ((point - centre) @ normal) / (across @ normal) * across
-        if tool_overlap_m(nearby, position, normal, instrument) <= 0.0:
+        if tool_overlap_m(nearby, position, normal) <= 0.0:
             outcome = PlacementOutcome.PLACED if not np.any(offset) else PlacementOutcome.RESELECTED
             return Placement(outcome, position, normal)
     return Placement(PlacementOutcome.COLLISION if is_measured else PlacementOutcome.NO_SURFACE)
