@@ -206,8 +206,7 @@ for number, line in enumerate(sys.stdin):
 
 def test_late_second_answer_is_not_used_later(measurements: DescentMeasurements, tmp_path: Path) -> None:
     spec = f"serve:{write_program(tmp_path, DOUBLE_ANSWERS)}"
-    first = run_program(spec, measurements).velocity_m_s
-    assert first is not None
+    run_program(spec, measurements)
     time.sleep(0.5)  # the second line is in the pipe
     with pytest.raises(AlgorithmError, match="before the request; expected one line") as error:
         run_program(spec, measurements)
@@ -290,7 +289,6 @@ def test_c_example_estimates_velocity(measurements: DescentMeasurements, tmp_pat
     subprocess.run([compiler, "-O2", "-std=c11", *warnings, "-o", str(executable), source, "-lm"], check=True)
     for spec in (f"exec:{executable}", f"serve:{executable} --serve"):
         result = run_program(spec, measurements)
-        assert result.velocity_m_s is not None
         # Matches are whole pixels of 1.6 m (4 summed rows: 6.5 m) over 3.75 s. The median of 25 matches has a quarter
         # of the error of one match.
         assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
@@ -309,9 +307,7 @@ def test_python_example_estimates_velocity(measurements: DescentMeasurements, mo
     monkeypatch.chdir(EXAMPLES)
     estimator = VELOCITY.make("velocity_estimator:MedianShift", DimesOptions(), ExecutableLimits())
     result = check_velocity(estimator.estimate(measurements))
-    assert result.velocity_m_s is not None
     assert np.hypot(*(result.velocity_m_s - TRUE_VELOCITY)) < 1.0
-    assert result.covariance_m2_s2 is not None
 
 
 def test_program_that_does_not_read_a_long_request_times_out() -> None:

@@ -110,7 +110,6 @@ def test_example_tracks_the_target() -> None:
     assert [update.state for update in updates] == [TrackingState.NORMAL] * 4
     for number, update in enumerate(updates):
         true_position = trackers.pose(0.4 * number).inv().apply(trackers.TARGET_M)
-        assert update.position_rover is not None
         # Half a pixel of disparity at 8 m with a baseline of 0.2 m is 0.13 m in range and 7 mm laterally.
         assert np.abs(update.position_rover - true_position)[0] < 0.27
         assert np.abs(update.position_rover - true_position)[1:].max() < 0.05

@@ -129,7 +129,6 @@ def test_increments_and_altitudes_arrive_in_the_order_of_their_tags() -> None:
     """Altitudes of the first and the last image are missing or too early; the second reading is used twice."""
     measurements = inputs.inertial_descent(5)
     increments = measurements.increments
-    assert increments is not None
     first, second, third, *_, last = measurements.altitudes
     altitudes = (
         replace(first, time_s=0.0),

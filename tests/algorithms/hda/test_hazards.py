@@ -212,7 +212,6 @@ def test_site_has_maximum_distance_to_unsafe_cells() -> None:
     unsafe_cells = np.argwhere(is_unsafe) - 1
     cells = np.moveaxis(np.indices(safety.shape), 0, -1).reshape(-1, 1, 2)
     distances = np.linalg.norm(cells - unsafe_cells, axis=-1).min(axis=1).reshape(safety.shape)
-    assert site is not None
     assert distances[site] == pytest.approx(distances.max())
 
 

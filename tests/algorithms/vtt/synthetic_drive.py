@@ -259,14 +259,12 @@ def start_drive(
 
 
 def get_details(update: TargetUpdate | None) -> VttDetails:
-    assert update is not None
     assert isinstance(update.details, VttDetails)
     return update.details
 
 
 def get_pixel(update: TargetUpdate | None) -> np.ndarray:
     match = get_details(update).match
-    assert match is not None
     return match.pixel
 
 
