@@ -24,13 +24,22 @@ from scipy import optimize, special
 
 from marsyard.algorithms.arrays import Flags, Points2, Vector, Vector2, Vector3
 from marsyard.algorithms.dimes import ground_view, overlap, rectification
-from marsyard.algorithms.dimes.ground_view import outside_zero_phase
 from marsyard.algorithms.dimes.options import DimesOptions
 from marsyard.algorithms.dimes.views import BinnedView
 from marsyard.algorithms.image.registration import WindowSpline, register_template, spline_coefficients
 
 #: Distance of templates from the border of both images, pixels: range of the registration and support of its spline.
 MARGIN_PX = 4
+#: Unknowns of the fit; `Unknowns` names its parts.
+State = Float[np.ndarray, "18"]
+#: Minimum number of tracks in each pair. With fewer tracks outliers cannot be recognised.
+MIN_TRACKS = 8
+#: Residuals of more than this number of standard deviations are outliers.
+OUTLIER_SIGMAS = 3.5
+#: Number of fits: outliers displace the first one, and enlarge the standard deviation of the second one.
+FITS = 3
+#: Probability of the chi-square tests: one correct answer in a thousand is not corrected, or refused.
+ACCEPTED_PROBABILITY = 0.999
 
 
 @dataclass(frozen=True)
@@ -98,20 +107,8 @@ def _is_usable(view: BinnedView, ground: Points2, gsd_m: float, sun_direction: V
     outline = ground_view.square_outline((0.5 * options.grid_template_px + MARGIN_PX) * gsd_m, 3)
     squares = ground[:, None] + outline
     inside = ground_view.inside_frame(view, squares, options.border_px, options.max_off_nadir_rad)
-    outside = outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
+    outside = ground_view.outside_zero_phase(view, squares, sun_direction, options.zero_phase_radius_rad)
     return np.asarray((inside & outside).all(axis=1))
-
-
-#: Unknowns of the fit; `Unknowns` names its parts.
-State = Float[np.ndarray, "18"]
-#: Minimum number of tracks in each pair. With fewer tracks outliers cannot be recognised.
-MIN_TRACKS = 8
-#: Residuals of more than this number of standard deviations are outliers.
-OUTLIER_SIGMAS = 3.5
-#: Number of fits: outliers displace the first one, and enlarge the standard deviation of the second one.
-FITS = 3
-#: Probability of the chi-square tests: one correct answer in a thousand is not corrected, or refused.
-ACCEPTED_PROBABILITY = 0.999
 
 
 @dataclass(frozen=True)

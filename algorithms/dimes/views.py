@@ -12,6 +12,11 @@ from marsyard.sim.camera import CameraModel
 from marsyard.sim.frames import rigid
 from marsyard.sim.measurements import DescentMeasurements, DetectorCalibration, DetectorImage
 
+#: Range of usable camera heights above the ground: from the size of the airbags to above the atmosphere.
+HEIGHT_RANGE_M = (1.0, 1e6)
+#: Number of images of a descent.
+_IMAGE_COUNT = 3
+
 
 def bin_factors(shape: tuple[int, int], binned_size: tuple[int, int]) -> tuple[int, int]:
     """Software binning factors (columns, rows) from a delivered image of `shape` to `binned_size` (columns, rows).
@@ -45,12 +50,6 @@ def bin_mean(image: Raster, columns: int, rows: int) -> Float[np.ndarray, "binne
     """Average blocks of `columns` x `rows` pixels; the image size must be a multiple of the block size."""
     size = (image.shape[1] // columns, image.shape[0] // rows)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-
-
-#: Range of usable camera heights above the ground: from the size of the airbags to above the atmosphere.
-HEIGHT_RANGE_M = (1.0, 1e6)
-#: Number of images of a descent.
-_IMAGE_COUNT = 3
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,8 @@ from marsyard.algorithms.hda.options import HdaOptions
 
 #: Minimum side of the squares for plane fits, cells; a least-median-of-squares fit requires more than a few points.
 MIN_SIDE_CELLS = 3
+#: Number of points for the plane fit per footprint diameter.
+POINTS_PER_DIAMETER = 16
 
 
 class Safety(IntEnum):
@@ -147,10 +149,6 @@ def safe_site(safety: UInt8[np.ndarray, "rows columns"], apriori_cell: Vector2) 
     best_cells = np.argwhere(distances >= farthest - 1e-4)
     nearest = np.argmin(np.hypot(*(best_cells - apriori_cell).T))
     return int(best_cells[nearest, 0]), int(best_cells[nearest, 1])
-
-
-#: Number of points for the plane fit per footprint diameter.
-POINTS_PER_DIAMETER = 16
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ from marsyard.sim.measurements import DetectorImage, LandingMeasurements, PoseMe
 
 #: Lower limit of the flat field before division; dead pixels are below it.
 MIN_RESPONSE = 0.05
+#: Number of random point triples for the robust plane through all points.
+PLANE_TRIALS = 200
 
 
 @dataclass(frozen=True)
@@ -118,10 +120,6 @@ def build_scene(measurements: LandingMeasurements) -> LandingScene:
     body_from_camera = camera_pose(measurements.images[0].camera)
     up_camera = body_from_camera.rotation.inv().apply(np.array(measurements.up_body))
     return LandingScene((first, second), measurements.slant_range_m, up_camera, measurements.apriori_site_world)
-
-
-#: Number of random point triples for the robust plane through all points.
-PLANE_TRIALS = 200
 
 
 def up_direction(first: CameraView, up_camera: Vector3, points: Points3, options: HdaOptions) -> Vector3:

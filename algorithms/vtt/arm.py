@@ -22,6 +22,17 @@ from marsyard.sim.measurements import MastCalibration, RoverMeasurements, Stereo
 
 #: Assumed drift of the tracked point (paper: 2.5 px from 10 m to 2 m).
 DRIFT_PX = 2.5
+#: Tools on the arm, metres: radius of the contact disc, radius of the disc that contains the tools around it, and
+#: distance of the tools behind the contact disc.
+CONTACT_M, TOOLS_M, CLEARANCE_M = 0.02, 0.05, 0.015
+#: Maximum distance of a re-selected position from the target, metres.
+MAX_RESELECTION_M = 0.008
+#: Spacing of the positions that are checked, metres.
+_SPACING_M = 0.002
+#: Minimum number of surface points on the contact disc.
+_MIN_POINTS = 20
+#: Depths of surface points, divided by the target's depth.
+_DEPTHS = (0.7, 1.5)
 
 
 class HandOffOutcome(Enum):
@@ -77,19 +88,6 @@ def hand_off(update: TargetUpdate, goal: GoalCriterion, mast: MastCalibration) -
         drift_error_m(range_m, mast.left.focal_lengths[0], DRIFT_PX),
     )
     return HandOff(HandOffOutcome.HANDED_OFF, ArmTarget(position, error))
-
-
-#: Tools on the arm, metres: radius of the contact disc, radius of the disc that contains the tools around it, and
-#: distance of the tools behind the contact disc.
-CONTACT_M, TOOLS_M, CLEARANCE_M = 0.02, 0.05, 0.015
-#: Maximum distance of a re-selected position from the target, metres.
-MAX_RESELECTION_M = 0.008
-#: Spacing of the positions that are checked, metres.
-_SPACING_M = 0.002
-#: Minimum number of surface points on the contact disc.
-_MIN_POINTS = 20
-#: Depths of surface points, divided by the target's depth.
-_DEPTHS = (0.7, 1.5)
 
 
 class PlacementOutcome(Enum):

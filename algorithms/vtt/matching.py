@@ -21,6 +21,12 @@ from marsyard.algorithms.vtt.prediction import ViewChange, bearing_rad
 from marsyard.sim.camera import CameraModel
 from marsyard.sim.measurements import MastImage
 
+#: Pyramid levels of Lucas-Kanade below full resolution; with templates of 21 px its search range is about that of the
+#: correlation.
+FLOW_LEVELS = 3
+#: Normalisation to the 8-bit images of OpenCV: standard deviation and mean, grey levels.
+SIGMA_GREY, MEAN_GREY = 40.0, 128.0
+
 
 @dataclass(frozen=True)
 class Sighting:
@@ -178,12 +184,6 @@ def match_by_correlation(
     return Match(best.corner[::-1] + half + image.corner, best.score, template)
 
 
-#: Pyramid levels below full resolution; with templates of 21 px the search range is about that of the correlation.
-LEVELS = 3
-#: Normalisation to the 8-bit images of OpenCV: standard deviation and mean, grey levels.
-SIGMA_GREY, MEAN_GREY = 40.0, 128.0
-
-
 def match_by_lucas_kanade(
     sighting: Sighting, image: MastImage, predicted_pixel: Vector2, change: ViewChange, options: VttOptions
 ) -> Match | None:
@@ -209,7 +209,7 @@ def match_by_lucas_kanade(
         start_point,
         predicted_point.copy(),
         winSize=(options.template_px, options.template_px),
-        maxLevel=LEVELS,
+        maxLevel=FLOW_LEVELS,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     pixel = np.asarray(tracked_point, dtype=np.float64).reshape(2) + corner
