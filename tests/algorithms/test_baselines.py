@@ -17,7 +17,15 @@ from marsyard.algorithms.dimes.baselines import (
 from marsyard.algorithms.dimes.views import build_views
 from marsyard.algorithms.interface import VelocityEstimator, VelocityOutcome
 from marsyard.sim.measurements import DescentMeasurements
-from tests.algorithms.synthetic_descent import draw_flight, draw_terrain, make_waves, render, steady_flight, tilt_body
+from tests.algorithms.synthetic_descent import (
+    draw_flight,
+    draw_stripes,
+    draw_terrain,
+    make_waves,
+    render,
+    steady_flight,
+    tilt_body,
+)
 
 ESTIMATORS: dict[str, VelocityEstimator] = {"phase": PhaseCorrelationEstimator(), "homography": HomographyEstimator()}
 #: Run a test for the baselines, or for the baselines and DIMES.
@@ -71,11 +79,6 @@ def test_disagreement_with_imu_rejects_the_velocity(name: str, measurements: Des
 @with_all_estimators
 def test_motion_above_max_speed_is_not_reported(estimator: VelocityEstimator) -> None:
     assert estimator.estimate(render(steady_flight((45.0, 0.0), ATTITUDES))).outcome is not VelocityOutcome.VALID
-
-
-def draw_stripes(counts: np.ndarray) -> np.ndarray:
-    """Set even columns to 0 and odd columns to 4095."""
-    return np.where(np.arange(counts.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(counts)
 
 
 @with_baselines

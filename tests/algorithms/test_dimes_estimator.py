@@ -18,6 +18,7 @@ from tests.algorithms.synthetic_descent import (
     Flight,
     compute_body_rays,
     draw_flight,
+    draw_stripes,
     draw_terrain,
     expose_scene,
     make_calibration,
@@ -197,11 +198,6 @@ def _draw_random_counts(number: int, counts: np.ndarray) -> np.ndarray:
     return np.random.default_rng(number).integers(0, 4096, counts.shape, dtype=np.uint16)
 
 
-def _draw_stripes(_: int, counts: np.ndarray) -> np.ndarray:
-    """Set even columns to 0 and odd columns to 4095."""
-    return np.where(np.arange(counts.shape[1]) % 2 == 0, 0, 4095).astype(np.uint16) + np.zeros_like(counts)
-
-
 @pytest.fixture(scope="module")
 def measurements() -> DescentMeasurements:
     return render(steady_flight((10.0, 5.0)))
@@ -215,7 +211,7 @@ def measurements() -> DescentMeasurements:
         lambda number, counts: np.full_like(counts, 65535),
         _draw_random_counts,
         lambda number, counts: counts if number else np.zeros_like(counts),
-        _draw_stripes,
+        lambda number, counts: draw_stripes(counts),
         lambda number, counts: np.full_like(counts, number),
     ],
 )

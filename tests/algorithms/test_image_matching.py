@@ -90,11 +90,6 @@ def pixel_grid(size: int) -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(float(size)), np.arange(float(size))), axis=-1)
 
 
-def test_patches_at_whole_pixels_equal_the_image() -> None:
-    image = draw_natural_image(3, 60)
-    np.testing.assert_allclose(similarity_patch(image, np.array([31.0, 27.0]), 21), image[17:38, 21:42], atol=1e-8)
-
-
 @pytest.mark.parametrize(
     ("magnification", "roll_deg"), [(1.0, 0.0), (1.13, 0.0), (0.9, 0.0), (1.0, 30.0), (1.1, -12.0)]
 )
