@@ -187,6 +187,8 @@ def test_sites_are_reported_in_map_coordinates(measurements: LandingMeasurements
         )
     )
     np.testing.assert_allclose(get_site(result), map_from_world.apply(get_site(estimate)), atol=1e-6)
+    # the a-priori site is in the same cell of both maps
+    np.testing.assert_allclose(get_ground(result).apriori_cell, get_ground(estimate).apriori_cell, atol=1e-6)
 
 
 def is_apriori_site(result: SiteEstimate, inputs: LandingMeasurements) -> bool:
