@@ -13,8 +13,8 @@ from marsyard.reports.column_selection import driver_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.statistics.difference_tests import correct_holm
 from marsyard.reports.statistics.drivers import Driver, estimate_driver
-from marsyard.reports.statistics.multiple_tests import correct_holm
 from marsyard.reports.wording import coefficient, format_fraction, label, note_text, p_text, percent
 
 #: Maximum number of ranked conditions, and of cases that are used for the ranking.

@@ -19,9 +19,9 @@ from marsyard.reports import figure_style
 from marsyard.reports.column_selection import axis_columns, category_column
 from marsyard.reports.column_values import numbers
 from marsyard.reports.figure_style import BARS, INK, MARKERS, MUTED, REQUIREMENT, SERIES, in_page_style, new_axes
-from marsyard.reports.outcome_counts import answered_outcomes, outcome_counts
 from marsyard.reports.plots import axis_edge, note_beyond
-from marsyard.reports.statistics.ellipse import error_ellipse
+from marsyard.reports.populations import answered_outcomes, outcome_counts
+from marsyard.reports.statistics.error_summary import error_ellipse
 from marsyard.reports.wording import format_fraction, label, magnitude_label, plain_value
 from marsyard.scenarios.columns import split_unit
 

@@ -18,8 +18,7 @@ from marsyard.reports.case_evidence import CaseEvidence
 from marsyard.reports.dispersion_changes import Change, ChangeKind, list_changes
 from marsyard.reports.robustness import change_rates
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.crossing import Crossing, find_crossing
-from marsyard.reports.statistics.weighted import MIN_EFFECTIVE, weighted_rates
+from marsyard.reports.statistics.reweighted_rates import MIN_EFFECTIVE, Crossing, find_crossing, weighted_rates
 from marsyard.reports.verdicts import Verdict
 
 _CONFIDENCE = 0.9

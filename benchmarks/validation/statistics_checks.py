@@ -18,14 +18,13 @@ from benchmarks.validation.nights import (
     count_false_alarms,
 )
 from benchmarks.validation.records import Check, Measure
-from marsyard.reports.history import MAX_EARLIER_NIGHTS
+from marsyard.reports.nightly import MAX_EARLIER_NIGHTS
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.clusters import max_statistic
-from marsyard.reports.statistics.ellipse import error_ellipse
+from marsyard.reports.statistics.clusters import Sizes, event_scores, max_statistic, number_terrains
+from marsyard.reports.statistics.error_summary import error_ellipse
 from marsyard.reports.statistics.proportions import Interval, proportion_lower, proportion_upper
 from marsyard.reports.statistics.samples import mean_interval, quantile_bounds, standard_deviation_interval
 from marsyard.reports.statistics.sequential import confidence_at, planned_looks
-from marsyard.reports.statistics.terrain_sizes import Sizes, event_scores, number_terrains
 from marsyard.reports.validation_rows import Conditions
 
 #: One-sided confidence of the checked bounds.

@@ -12,15 +12,23 @@ import pandas as pd
 from marsyard.reports import populations, rates
 from marsyard.reports.blocks import Quantity, collect_values, flag_rate, rate_block
 from marsyard.reports.column_values import numbers
-from marsyard.reports.empty_cells import drop_empty_columns
 from marsyard.reports.fits import fit_note
-from marsyard.reports.hda.answers import MIN_CURVE_VALUES
 from marsyard.reports.hda.landing_cases import INTERVAL_NOTE, PAPER, landing_rows
+from marsyard.reports.hda.sites_section import MIN_CURVE_VALUES
 from marsyard.reports.plots import cumulative_figure
 from marsyard.reports.rates import CONFIDENCE
-from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values, svg_figure
+from marsyard.reports.section import (
+    Block,
+    Grid,
+    Section,
+    Subject,
+    create_section,
+    drop_empty_columns,
+    has_values,
+    svg_figure,
+)
 from marsyard.reports.statistics.samples import mean_interval
-from marsyard.reports.wording import NOTHING, count, format_fraction, interval, number
+from marsyard.reports.wording import NOTHING, count, format_fraction, interval, note_text, number
 
 #: Three measures of the distance from touchdown to site.
 TOUCHDOWN_ERRORS = (
@@ -29,14 +37,6 @@ TOUCHDOWN_ERRORS = (
     Quantity("touchdown_error_estimated_m", "navigation filter"),
 )
 _DEVIATIONS = ("gps_sd_north_m", "gps_sd_east_m")
-_TOUCHDOWN_NOTE = (
-    "Averaged GPS: from the coordinates of the site to the GPS receiver's averaged positions after landing. True "
-    "touchdown: from the true site to the true touchdown; the true site excludes the navigation error at the first "
-    "image. Navigation filter: from the coordinates of the site to the touchdown that the filter estimates. GPS SD: "
-    "standard deviation that the receiver reports. The site is the reported site. If the algorithm does not converge, "
-    "it is the a-priori site, which is set before the images are processed. After the answer 'no safe site' the "
-    "helicopter does not land."
-)
 
 
 def _create_error_block(landings: pd.DataFrame) -> Block | None:
@@ -88,7 +88,10 @@ def _create_table_2_block(landings: pd.DataFrame) -> Block:
     }
     grid = drop_empty_columns(Grid(head, rows))
     return Block(
-        heading="Distances as in Table II", grid=grid, note=f"{_TOUCHDOWN_NOTE} {fit_note('hda-table-2')}", data=data
+        heading="Distances as in Table II",
+        grid=grid,
+        note=f"{note_text('hda.touchdown')} {fit_note('hda-table-2')}",
+        data=data,
     )
 
 
@@ -144,13 +147,7 @@ def run_times_section(subject: Subject) -> Section | None:
     rows.append(["Total", *totals, NOTHING, NOTHING])
     times_head = ["Paper (s)", "Fraction of total", "Median here (ms)", "Fraction of total", "95 % quantile here (ms)"]
     head = ["Stage", *times_head, "Parameters of the paper", "Parameters here (medians)"]
-    note = (
-        f"CPU time of {count(cases, 'flight')} with a map, on this host. The total is the sum of the medians. The "
-        "paper's processor in Table I is a 400 MHz R12000. The parameters differ, so only the fractions of the total "
-        "are comparable, not the times. Dense matching counts as terrain map generation, interpolation of the map as "
-        "hazard detection, and estimation of the scale as structure from motion. The first case of a worker includes "
-        "the loading of compiled code. `make bench` measures the times with the paper's parameters."
-    )
+    note = note_text("hda.run_times", flights=count(cases, "flight"))
     grid = drop_empty_columns(Grid(head, rows))
     block, section_data = Block(grid=grid, note=note), {"factor": factor, "cases": cases, "stages": data}
     title = "Run time by stage, compared with Table I of the paper"

@@ -15,13 +15,12 @@ from matplotlib.figure import Figure
 
 from marsyard.reports import section
 from marsyard.reports.column_values import numbers
-from marsyard.reports.empty_cells import drop_empty_columns
 from marsyard.reports.figure_style import MUTED, REQUIREMENT, in_page_style
 from marsyard.reports.hda.landing_cases import PAPER, landing_rows
 from marsyard.reports.plots import RateLine, draw_rates
 from marsyard.reports.populations import flag_mask
 from marsyard.reports.rates import CONFIDENCE, PooledRate, pooled_rate, rate_text
-from marsyard.reports.section import Block, Section, Subject, build_grid
+from marsyard.reports.section import Block, Section, Subject, build_grid, drop_empty_columns
 from marsyard.reports.wording import NOTHING, format_fraction, note_text, percent
 
 #: Minimum fraction of tracked features for good tracking.

@@ -10,17 +10,53 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from marsyard.algorithms.interface import TargetLoss
 from marsyard.algorithms.vtt.accuracy import GOAL_M, NAVCAM, PANCAM, drift_error_m, stereo_range_error_m
-from marsyard.reports import rates
+from marsyard.reports import populations, rates
 from marsyard.reports.blocks import distribution_block
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, create_section, has_values
 from marsyard.reports.statistics.samples import quantile_bounds
-from marsyard.reports.vtt.losses import losses_grid, losses_note
-from marsyard.reports.vtt.run_selection import is_closed_loop, selectable_targets
-from marsyard.reports.wording import format_fraction
+from marsyard.reports.vtt.tracking_runs import is_closed_loop, selectable_targets
+from marsyard.reports.wording import NOTHING, format_fraction, note_text
 from marsyard.scenarios.rover.stops import RunOutcome
+
+
+def losses_grid(frame: pd.DataFrame) -> Grid:
+    """Count runs that ended without a tracked target, by outcome and loss criteria."""
+    failed_runs = frame[~populations.flag_mask(frame, "tracked")]
+    has_clouds = "clear_sky" in failed_runs and rates.flag_fraction(failed_runs, "clear_sky", value=False).hits > 0
+    rows = []
+    for (outcome, losses), runs in failed_runs.groupby([failed_runs["outcome"], failed_runs["losses"].fillna(NOTHING)]):
+        azimuth = rates.finite_values(runs, "azimuth_change_max_deg")
+        azimuth_text = f"{azimuth.max():.1f}" if azimuth.size else NOTHING
+        distance_text = rates.median_text(rates.finite_values(runs, "lost_range_m"), 1)
+        loss_text = str(losses).replace("_", " ").lower()
+        row = [str(outcome), loss_text, f"{len(runs):,}", distance_text, azimuth_text]
+        n_cloudy = rates.flag_fraction(runs, "clear_sky", value=False).hits if has_clouds else 0
+        rows.append([*row, f"{n_cloudy:,}"] if has_clouds else row)
+    rows.sort(key=lambda row: -int(row[2].replace(",", "")))
+    head = ["Outcome", "Lost by", "Runs", "Lost at a range of (m)", "Maximum azimuth change (deg)"]
+    return Grid([*head, "With clouds"] if has_clouds else head, rows)
+
+
+def losses_note(frame: pd.DataFrame) -> str:
+    """Describe the table of `losses_grid`, with the meaning of the loss criteria that occur."""
+    occurring = ", ".join(frame.loc[~populations.flag_mask(frame, "tracked"), "losses"].dropna().astype(str)).split(
+        ", "
+    )
+    meanings = [
+        f"{loss.name.replace('_', ' ').capitalize()}: {loss.value}." for loss in TargetLoss if loss.name in occurring
+    ]
+    text = (
+        'The runs ended without the target within 5 px of its true projection at the goal. "Lost by" gives the '
+        "criteria (section 4.6 of the paper) of the first update that lost the target. Ranges are medians, with "
+        "minimum to maximum in brackets. The azimuth change is that of the line of sight in the world between two "
+        "updates with a match."
+    )
+    return " ".join([text, *meanings])
+
 
 #: Maximum position error for the instrument placement (section 4.2), metres, and required quantile of the runs.
 MAX_ERROR_M, QUANTILE = 0.03, 0.99
@@ -41,12 +77,6 @@ _ERRORS: Mapping[str, str] = {
     "Drift, median (px)": "drift_median_px",
     f"Drift, {format_fraction(QUANTILE)} quantile (px)": "drift_quantile_px",
 }
-_RATES_NOTE = (
-    "A target is selectable if the designated point is sunlit, unoccluded and not on the edge of the rock. Completed: "
-    f"{RunOutcome.COMPLETED.value}. False track: an update reports the target farther than 10 px from the true "
-    "projection of the designated point. The intervals are two-sided Clopper-Pearson intervals for independent cases; "
-    "the section Verdict gives one-sided bounds."
-)
 
 
 def _group_by_camera(runs: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -104,7 +134,14 @@ def _create_camera_blocks(runs: pd.DataFrame) -> list[Block]:
         for name, rate in _RATES.items()
     ]
     run_grid = Grid(["Camera", "Result", "Runs", f"{format_fraction(CONFIDENCE)} interval"], rows)
-    blocks = [Block("Runs at selectable targets", grid=run_grid, note=_RATES_NOTE, data={"cameras": cameras})]
+    blocks = [
+        Block(
+            "Runs at selectable targets",
+            grid=run_grid,
+            note=note_text("vtt.goal_rates", completed=RunOutcome.COMPLETED.value),
+            data={"cameras": cameras},
+        )
+    ]
     if any(row["completed"].hits for row in cameras):
         grid, note = _errors_grid(cameras), _describe_errors(cameras)
         blocks.append(Block(heading="Errors of the completed runs at the goal", grid=grid, note=note))

@@ -23,8 +23,8 @@ from marsyard.reports.column_values import numbers
 from marsyard.reports.papers import read_paper
 from marsyard.reports.section import Block, Grid, Section, Subject, build_grid
 from marsyard.reports.vtt.goal import pointing_error_cm
-from marsyard.reports.vtt.run_selection import is_closed_loop, selectable_targets
-from marsyard.reports.wording import NOTHING
+from marsyard.reports.vtt.tracking_runs import is_closed_loop, selectable_targets
+from marsyard.reports.wording import NOTHING, note_text
 
 #: Table I as printed.
 PRINTED = {
@@ -33,26 +33,6 @@ PRINTED = {
 }
 #: Maximum relative deviation of the start and goal distances of a run from those of Table I.
 _MAX_DEVIATION = 0.1
-_COMPUTED_NOTE = (
-    "The table is Table I of the paper (Kim, Nesnas and Bajracharya, visual target tracking), section 4.2. It gives "
-    f"3-sigma errors of a target's position. The target is designated at {START_M:g} m; the goal is at {GOAL_M:g} m. "
-    "N is the drift: the distance in the last image from the tracked to the designated point. The paper assumes a "
-    f"3-sigma disparity error of 1 px, and an odometry error of {100.0 * NAVIGATION_ERROR:g} % of the distance driven. "
-    'Rows "computed": Eqs. 1 to 5 of the paper with the manufacturer\'s pixel pitch of 4.65 µm. As in the paper, each '
-    "result is rounded before the next one is computed."
-)
-_MEASURED_NOTE = (
-    "Measured values are three times the root mean square (rms) of the runs. They are rough for few runs: the relative "
-    "standard error is 22 % with 10 runs. The runs are completed runs at selectable targets. Runs whose first or last "
-    f"range differs by more than {100.0 * _MAX_DEVIATION:g} % from {START_M:g} m or {GOAL_M:g} m are left out, so the "
-    "section Goal can contain more runs. Designation: error of the target's position at the first stop, in the rover "
-    "frame. Without tracking: root sum square of the designation error and the error of the rover's pose at the goal "
-    "(Eq. 3). The runs use the odometry of this campaign, the paper uses visual odometry. With tracking: error of the "
-    "reported position at the goal, in the rover frame. The paper's formula is evaluated with the measured drift. The "
-    "paper counts errors of stereo matching along the line of sight, and of drift across it. The measured errors also "
-    "contain errors of the camera calibration and of the mast's pointing. A pointing error of 0.1 deg is "
-    f"{pointing_error_cm(START_M):.1f} cm at {START_M:g} m and {pointing_error_cm(GOAL_M):.2f} cm at {GOAL_M:g} m."
-)
 
 
 def table_1_section(subject: Subject) -> Section | None:
@@ -75,8 +55,28 @@ def table_1_section(subject: Subject) -> Section | None:
         },
     )
     blocks = [
-        Block(heading="Computed", grid=grid, note=_COMPUTED_NOTE),
-        Block(heading="Measured in this campaign", grid=_measured_grid(accuracy), note=_MEASURED_NOTE),
+        Block(
+            heading="Computed",
+            grid=grid,
+            note=note_text(
+                "vtt.table_1_computed",
+                start=f"{START_M:g}",
+                goal=f"{GOAL_M:g}",
+                odometry=f"{100.0 * NAVIGATION_ERROR:g}",
+            ),
+        ),
+        Block(
+            heading="Measured in this campaign",
+            grid=_measured_grid(accuracy),
+            note=note_text(
+                "vtt.table_1_measured",
+                deviation=f"{100.0 * _MAX_DEVIATION:g}",
+                start=f"{START_M:g}",
+                goal=f"{GOAL_M:g}",
+                start_error=f"{pointing_error_cm(START_M):.1f}",
+                goal_error=f"{pointing_error_cm(GOAL_M):.2f}",
+            ),
+        ),
     ]
     data = {"computed": computed_rows, "printed": PRINTED, "measured": accuracy}
     return Section(

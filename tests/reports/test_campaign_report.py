@@ -16,7 +16,7 @@ from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.hidden_folders import hide_folders
 from marsyard.campaigns.store.machine import describe_machine
 from marsyard.reports.campaign import write_report
-from marsyard.reports.page_scripts import script_hash
+from marsyard.reports.page_environment import script_hash
 from marsyard.reports.report_file import SCHEMA
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows
 

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from marsyard.cli.outcome import evaluate_and_report
 from marsyard.reports.dashboard.site import write_site
-from marsyard.reports.multiplicity import multiplicity_text
+from marsyard.reports.overall import multiplicity_text
 from marsyard.reports.statistics.proportions import proportion_lower
 from marsyard.reports.verdicts import Verdict
 from tests.reports.synthetic_run import VELOCITY, MakeRun, make_rows

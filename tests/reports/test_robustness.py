@@ -23,11 +23,9 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.dispersion_changes import ChangeKind, list_changes
 from marsyard.reports.robustness import ALL_DISPERSIONS, ChangeOutcome, Robustness, evaluate_robustness
-from marsyard.reports.robustness_sentences import reach_text, robustness_text
+from marsyard.reports.robustness_section import reach_text, robustness_text
 from marsyard.reports.sampling_design import read_sampling_design
-from marsyard.reports.statistics.crossing import Crossing, find_crossing
-from marsyard.reports.statistics.divergence import binary_divergence, population_divergence
-from marsyard.reports.statistics.weighted import weighted_rates
+from marsyard.reports.statistics.reweighted_rates import Crossing, find_crossing, population_divergence, weighted_rates
 from marsyard.reports.stored import StoredRun
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import number
@@ -187,15 +185,15 @@ def test_divergence_of_all_dispersions() -> None:
 
     weight = optimize.brentq(excess, 1.0, 50.0)
     worst = weight * rate / (weight * rate + 1.0 - rate)
-    assert binary_divergence(worst, rate) == pytest.approx(radius, rel=1e-6)
+    assert population_divergence(worst, rate, 1.0) == pytest.approx(radius, rel=1e-6)
     rng = np.random.default_rng(2)
     for _ in range(200):  # no other distribution within the ball has a larger rate
         q = p * np.exp(rng.normal(0.0, 0.5, cells))
         q /= q.sum()
         if float(np.sum(q * np.log(q / p))) <= radius:
             assert q[:4].sum() <= worst
-    assert binary_divergence(0.01, 0.02) == 0.0
-    assert binary_divergence(0.01, 0.0) == math.inf
+    assert population_divergence(0.01, 0.02, 1.0) == 0.0
+    assert population_divergence(0.01, 0.0, 1.0) == math.inf
 
 
 def test_divergence_of_a_population_is_smaller_than_that_of_all_cases() -> None:
@@ -209,8 +207,7 @@ def test_divergence_of_a_population_is_smaller_than_that_of_all_cases() -> None:
     tilt = np.linspace(0.0, 5.0, 5001)
     smallest = float((-np.log(np.exp(tilt[:, None] * scores) @ probabilities)).max())
     assert population_divergence(permitted, rate, member) == pytest.approx(smallest, rel=1e-5)
-    assert population_divergence(permitted, rate, member) < 0.51 * binary_divergence(permitted, rate)
-    assert population_divergence(permitted, rate, 1.0) == binary_divergence(permitted, rate)
+    assert population_divergence(permitted, rate, member) < 0.51 * population_divergence(permitted, rate, 1.0)
 
 
 def test_divergence_of_a_population_is_that_of_all_cases(tmp_path: Path) -> None:
@@ -220,14 +217,14 @@ def test_divergence_of_a_population_is_that_of_all_cases(tmp_path: Path) -> None
     verdicts, records, _ = evaluate(tmp_path, 900, 0.95, fails, population="valid", answered=answered)
     item = records[ALL_DISPERSIONS, ChangeKind.DIVERGENCE]
     assert verdicts[0].n == 300
-    assert 0.0 < item.passes_at < 0.34 * binary_divergence(0.05, 1.0 - verdicts[0].lower)
+    assert 0.0 < item.passes_at < 0.34 * population_divergence(0.05, 1.0 - verdicts[0].lower, 1.0)
 
 
 def test_divergence_follows_from_the_bounds_of_the_verdict(tmp_path: Path) -> None:
     verdicts, records, _ = evaluate(tmp_path, 1000, 0.95, lambda first, second, kind: first > 2.0)
     item = records[ALL_DISPERSIONS, ChangeKind.DIVERGENCE]
     assert verdicts[0].status is Status.PASS
-    assert item.passes_at == pytest.approx(binary_divergence(0.05, 1.0 - verdicts[0].lower))
+    assert item.passes_at == pytest.approx(population_divergence(0.05, 1.0 - verdicts[0].lower, 1.0))
     # a shift of one normal dispersion by d has the divergence d^2 / 2: PASS then holds for any direction
     assert item.lower <= records["loads.0", ChangeKind.MEAN_UP].lower
 

@@ -18,18 +18,26 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.reports.column_selection import axis_columns, category_column, driver_columns, primary_metric
 from marsyard.reports.decision import evaluate_requirements
 from marsyard.reports.effects import correlation_text, estimate_effects
-from marsyard.reports.hda.answers import distance_grid
-from marsyard.reports.hda.map_section import MAP_CONDITIONS, MAP_ERRORS
-from marsyard.reports.junit import junit_xml
-from marsyard.reports.outcome_counts import outcome_counts
+from marsyard.reports.hda.sections import MAP_CONDITIONS, MAP_ERRORS
+from marsyard.reports.hda.sites_section import distance_grid
 from marsyard.reports.overall import combine_verdicts
-from marsyard.reports.page import outcome_grid
-from marsyard.reports.page_figures import driver_figures
+from marsyard.reports.page import driver_figures, outcome_grid
+from marsyard.reports.populations import outcome_counts
 from marsyard.reports.rates import fraction_of
-from marsyard.reports.requirement_wording import population_text, requirement_text
 from marsyard.reports.tables import statistics_grid
 from marsyard.reports.terminal_tables import verdict_table
-from marsyard.reports.wording import NOTHING, format_fraction, interval, label, magnitude_label, number, percent
+from marsyard.reports.verdict_files import junit_xml
+from marsyard.reports.wording import (
+    NOTHING,
+    format_fraction,
+    interval,
+    label,
+    magnitude_label,
+    number,
+    percent,
+    population_text,
+    requirement_text,
+)
 from marsyard.scenarios.systems import catalogue
 from tests.reports.synthetic_run import VELOCITY, make_rows
 

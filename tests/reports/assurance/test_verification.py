@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 
 from marsyard.campaigns.errors import CampaignError
+from marsyard.reports.assurance.argument import ElementKind, GoalState, number_elements
 from marsyard.reports.assurance.case import AssuranceCase, build_case
-from marsyard.reports.assurance.elements import ElementKind, GoalState, number_elements
 from marsyard.reports.assurance.package import CASE, MANIFEST, hash_files, read_run_evidence, write_package
 from marsyard.reports.assurance.signature import sign_file
 from marsyard.reports.assurance.verification import verify_package

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from marsyard.reports.case_views import write_case_figures
 from marsyard.reports.dimes.case_figures import MATCH, TEMPLATE, WINDOW, draw_dimes_case, is_dimes_case, read_tracks
 from marsyard.reports.dimes.presentation import view
+from marsyard.reports.presentation import write_case_figures
 from tests.reports.drawn_marks import find_boxes
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from marsyard.reports.statistics.changes import Sample, difference_p_value
-from marsyard.reports.statistics.multiple_tests import correct_holm
+from marsyard.reports.statistics.difference_tests import Sample, correct_holm, difference_p_value
 
 
 def _make_sample(values: np.ndarray, terrains: np.ndarray | None = None) -> Sample:

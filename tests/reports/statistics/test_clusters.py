@@ -10,10 +10,16 @@ from scipy import stats
 
 from marsyard.reports.statistics import clusters
 from marsyard.reports.statistics.clustered_cases import ClusteredCases
-from marsyard.reports.statistics.clusters import TerrainCounts, max_statistic
+from marsyard.reports.statistics.clusters import (
+    Sizes,
+    TailFunction,
+    TerrainCounts,
+    count_sizes,
+    event_scores,
+    max_statistic,
+    number_terrains,
+)
 from marsyard.reports.statistics.proportions import proportion_lower, proportion_upper
-from marsyard.reports.statistics.tail_function import TailFunction
-from marsyard.reports.statistics.terrain_sizes import Sizes, count_sizes, event_scores, number_terrains
 
 #: Designs: 8 terrains of 3 cases, 250 of 4, and unequal numbers of cases.
 DESIGNS: dict[str, Sizes] = {
