@@ -48,11 +48,6 @@ def test_rates_pool_footprints_over_flights() -> None:
     assert rate.lower < 0.1 < rate.upper
 
 
-def test_flights_with_one_footprint_are_pooled() -> None:
-    rate = pooled_rate(pd.DataFrame({"hazardous": [1, 0, 1, 1], "footprints": [1, 1, 2, 0]}), "hazardous", "footprints")
-    assert (rate.hits, rate.total, rate.flights, rate.flights_hit) == (3, 4, 3, 2)
-
-
 def test_pooled_rate_interval_covers_the_true_rate() -> None:
     """90 % intervals cover the true rate of 10 %, although flights have different rates."""
     rng = np.random.default_rng(3)

@@ -14,7 +14,6 @@ from marsyard.reports.statistics.clusters import (
     Sizes,
     TailFunction,
     TerrainCounts,
-    count_sizes,
     event_scores,
     max_statistic,
     number_terrains,
@@ -259,7 +258,3 @@ def test_scores_are_squares_or_rounded_up() -> None:
     assert scores[:4].tolist() == [0, 1, 1, 3]
     assert scores[-1] == 16**2
     assert (np.diff(scores) >= 0).all()
-
-
-def test_sizes_count_terrains() -> None:
-    assert count_sizes(np.array([3, 0, 1, 3])) == ((1, 1), (3, 2))
