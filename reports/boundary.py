@@ -73,25 +73,16 @@ def validate_fit(
     predicted, base_rate = np.empty(target.size), np.empty(target.size)
     for train, test in GroupKFold(FOLDS).split(values, groups=groups):
         base_rate[test] = target[train].mean()
-        has_both_classes = 0.0 < target[train].mean() < 1.0
-        predicted[test] = (
-            fit_probability(values[train], is_violation[train])(values[test])
-            if has_both_classes
-            else target[train].mean()
-        )
+        predicted[test] = base_rate[test]
+        if 0.0 < target[train].mean() < 1.0:
+            predicted[test] = fit_probability(values[train], is_violation[train])(values[test])
     losses, base_losses = (predicted - target) ** 2, (base_rate - target) ** 2
     weights = rates.bootstrap_weights(np.unique(groups, return_inverse=True)[1], np.random.default_rng(0))
     skills = 1.0 - (weights @ losses) / (weights @ base_losses)
     bins = np.array_split(np.argsort(predicted, kind="stable"), CALIBRATION_BINS)
     calibration_error = float(np.mean([abs(predicted[cases].mean() - target[cases].mean()) for cases in bins]))
-    return BoundaryFit(
-        conditions,
-        target.size,
-        int(is_violation.sum()),
-        float(skills[0]),
-        float(np.quantile(skills[1:], 0.05)),
-        calibration_error,
-    )
+    skill, skill_lower = float(skills[0]), float(np.quantile(skills[1:], 0.05))
+    return BoundaryFit(conditions, target.size, int(is_violation.sum()), skill, skill_lower, calibration_error)
 
 
 def fit_probability(values: Float[np.ndarray, "n 2"], is_violation: Bool[np.ndarray, " n"]) -> Any:
@@ -127,21 +118,15 @@ def boundary_section(subject: Subject) -> Section | None:
     columns = list_conditions(subject.run)
     for requirement in subject.run.requirements:
         name = str(requirement.get("id"))
-        fits, figures = _fit_requirement(subject.frame.head(_MAX_CASES), requirement, columns)
+        drawn_fits = _fit_requirement(subject.frame.head(_MAX_CASES), requirement, columns)
+        fits, good_fits = [fit for fit, _ in drawn_fits], [(fit, drawn) for fit, drawn in drawn_fits if drawn]
         if not fits:
             continue
-        rows = [
-            [
-                " and ".join(label(condition) for condition in fit.conditions),
-                f"{fit.cases:,}",
-                f"{fit.violations:,}",
-                number(fit.skill),
-                number(fit.skill_lower),
-                number(fit.calibration_error),
-                "yes" if fit.is_good else "no",
-            ]
-            for fit in fits
-        ]
+        rows = []
+        for fit in fits:
+            counts = [" and ".join(map(label, fit.conditions)), f"{fit.cases:,}", f"{fit.violations:,}"]
+            measures = map(number, (fit.skill, fit.skill_lower, fit.calibration_error))
+            rows.append([*counts, *measures, "yes" if fit.is_good else "no"])
         head = ["Conditions", "Cases", "Violations", "Brier skill", "Lower bound (95 %)", "Calibration error", "Figure"]
         drawn = [
             svg_figure(
@@ -150,7 +135,7 @@ def boundary_section(subject: Subject) -> Section | None:
                 f"Probability that a case violates {name}, by {' and '.join(map(label, fit.conditions))}; the other "
                 "conditions vary as in the campaign. Shading and contours: fitted probability; crosses: violations.",
             )
-            for index, (fit, figure) in enumerate(figures)
+            for index, (fit, figure) in enumerate(good_fits)
         ]
         blocks.append(Block(f"Violations of {name}", figures=drawn, grid=Grid(head, rows)))
         data[name] = [asdict(fit) | {"drawn": fit.is_good} for fit in fits]
@@ -173,32 +158,32 @@ def list_conditions(run: StoredRun) -> list[str]:
 
 def _fit_requirement(
     frame: pd.DataFrame, requirement: Mapping[str, Any], columns: Sequence[str]
-) -> tuple[list[BoundaryFit], list[tuple[BoundaryFit, Figure]]]:
-    """Fit the violations of a requirement over each pair of conditions; also draw the good fits."""
+) -> list[tuple[BoundaryFit, Figure | None]]:
+    """Fit the violations of a requirement over each pair of conditions, with a figure of each good fit."""
     masks = requirement_masks(frame, requirement)
     if masks is None:
-        return [], []
+        return []
     member, success = masks
     rows, is_violation = frame[member].reset_index(drop=True), ~success[member]
-    if min(int(is_violation.sum()), int((~is_violation).sum())) < MIN_CASES_PER_CLASS:
-        return [], []
+    if not _has_enough_cases(is_violation):
+        return []
     drivers = rank_drivers(rows, columns, is_violation.astype(np.float64))
     conditions = [column for column, _, p_value in drivers if p_value <= MAX_P_VALUE][:MAX_CONDITIONS]
     groups = rates.terrain_groups(rows)
     groups = np.arange(len(rows)) if groups is None or np.unique(groups).size < 2 * FOLDS else groups
-    fits: list[BoundaryFit] = []
-    figures: list[tuple[BoundaryFit, Figure]] = []
+    fits: list[tuple[BoundaryFit, Figure | None]] = []
     for pair in itertools.combinations(conditions, 2):
         values = np.stack([numbers(rows, column) for column in pair], axis=1)
         is_known = np.isfinite(values).all(axis=1)
         known_violations = is_violation[is_known]
-        if min(int(known_violations.sum()), int((~known_violations).sum())) < MIN_CASES_PER_CLASS:
-            continue
-        fit = validate_fit(values[is_known], known_violations, groups[is_known], pair)
-        fits.append(fit)
-        if fit.is_good:
-            figures.append((fit, _draw_boundary(values[is_known], known_violations, pair)))
-    return fits, figures
+        if _has_enough_cases(known_violations):
+            fit = validate_fit(values[is_known], known_violations, groups[is_known], pair)
+            fits.append((fit, _draw_boundary(values[is_known], known_violations, pair) if fit.is_good else None))
+    return fits
+
+
+def _has_enough_cases(is_violation: Bool[np.ndarray, " n"]) -> bool:
+    return min(int(is_violation.sum()), int((~is_violation).sum())) >= MIN_CASES_PER_CLASS
 
 
 @in_page_style

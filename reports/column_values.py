@@ -13,11 +13,6 @@ def numbers(frame: pd.DataFrame, column: str) -> Float[np.ndarray, " n"]:
     return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan), dtype=np.float64)
 
 
-def is_varying_number(frame: pd.DataFrame, column: str) -> bool:
-    """Whether a column contains numbers of more than one value."""
-    return is_number(frame, column) and frame[column].nunique() > 1
-
-
 def is_number(frame: pd.DataFrame, column: str) -> bool:
     """Whether a column contains numbers; flags are not numbers."""
     dtype = frame[column].dtype

@@ -127,15 +127,10 @@ def compare_algorithms(
     differences = [
         compare_with_tested(frame, rows, name, metric, bound) for name, rows in frames.items() if metric in rows
     ]
-    success_p, error_p = (
-        correct_holm([difference.success_p for difference in differences]),
-        correct_holm([difference.error_p for difference in differences]),
-    )
-    corrected_p_values = zip(differences, success_p, error_p, strict=True)
-    return results, [
-        replace(difference, success_p=success_p_value, error_p=error_p_value)
-        for difference, success_p_value, error_p_value in corrected_p_values
-    ]
+    success_p = correct_holm([difference.success_p for difference in differences])
+    error_p = correct_holm([difference.error_p for difference in differences])
+    corrected = zip(differences, success_p, error_p, strict=True)
+    return results, [replace(item, success_p=p_success, error_p=p_error) for item, p_success, p_error in corrected]
 
 
 def comparison_section(subject: Subject) -> Section | None:

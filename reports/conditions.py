@@ -18,6 +18,7 @@ from marsyard.reports.column_selection import axis_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject
+from marsyard.reports.statistics.drivers import mean_squares
 from marsyard.reports.statistics.samples import quantile_bounds
 from marsyard.reports.wording import format_fraction, label, note_text, number, percent, plain_value
 from marsyard.scenarios.columns import split_unit
@@ -36,16 +37,10 @@ def terrain_variance(frame: pd.DataFrame, column: str) -> dict[str, Any] | None:
     if groups is None or not finite.any():
         return None
     _, index = np.unique(groups[finite], return_inverse=True)
-    errors, sizes = values[finite], np.bincount(index).astype(np.float64)
-    cases, terrains = errors.size, sizes.size
+    cases, terrains = index.size, int(index.max()) + 1
     if terrains < 2 or cases == terrains:
         return None
-    means = np.bincount(index, weights=errors) / sizes
-    # mean squares; the expectation of `between` is `within` + effective_size * (variance between terrains)
-    within = float(((errors - means[index]) ** 2).sum()) / (cases - terrains)
-    between = float((sizes * (means - errors.mean()) ** 2).sum()) / (terrains - 1)
-    # effective number of cases per terrain, for terrains with unequal numbers of cases
-    effective_size = (cases - float((sizes**2).sum()) / cases) / (terrains - 1)
+    within, between, effective_size = mean_squares(values[finite], index)
     variance_between = max(between - within, 0.0) / effective_size
     p_value = float(stats.f.sf(between / within, terrains - 1, cases - terrains)) if within > 0.0 else float("nan")
     return {

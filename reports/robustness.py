@@ -254,20 +254,13 @@ def _find_change(
         assumed = mean if change.kind in (ChangeKind.MEAN_UP, ChangeKind.MEAN_DOWN) else spread
     step = sign_of(change.kind) * spread
     is_complete = is_choice and crossing.reach == float(change.sizes[-1])
+    unit = "" if is_choice else split_unit(path)[1] if dispersion.unit is None else dispersion.unit
     return Robustness(
-        verdict.requirement_id,
-        path,
-        change.kind,
-        "" if is_choice else split_unit(path)[1] if dispersion.unit is None else dispersion.unit,
-        assumed=assumed,
-        spread=spread,
-        passes_at=assumed + step * crossing.lower,
-        fails_at=assumed + step * crossing.change,
-        confidence=verdict.confidence,
-        outcome=ChangeOutcome.of(crossing, is_complete=is_complete),
-        value=str(dispersion.values[change.value]) if is_choice else "",
-        **asdict(crossing),
-    )
+        verdict.requirement_id, path, change.kind, unit, assumed=assumed, spread=spread,
+        passes_at=assumed + step * crossing.lower, fails_at=assumed + step * crossing.change,
+        confidence=verdict.confidence, outcome=ChangeOutcome.of(crossing, is_complete=is_complete),
+        value=str(dispersion.values[change.value]) if is_choice else "", **asdict(crossing),
+    )  # fmt: skip
 
 
 def _divergence(verdict: Verdict, cases: CaseEvidence) -> Robustness:

@@ -125,7 +125,7 @@ class _Box:
 
 def draw_case(root: Element) -> str:
     """Draw the case as an SVG document."""
-    box = _place(root, 0, _PAD, dict.fromkeys(ElementKind, 0))
+    box = _place(root, 0, _PAD, iter([name for name, _, _ in number_elements(root)]))
     boxes = list(box.walk())
     width = max(item.left for item in boxes) + _WIDTH + _PAD
     height = max(item.top + item.height for item in boxes) + _PAD
@@ -140,14 +140,16 @@ def draw_case(root: Element) -> str:
     )
 
 
-def _place(element: Element, column: int, top: float, numbers: dict[ElementKind, int]) -> _Box:
-    """Place an element below `top`, and its children in the next column; a parent is centred on its children."""
-    numbers[element.kind] += 1
-    name, children, next_top = f"{element.kind}{numbers[element.kind]}", [], top
+def _place(element: Element, column: int, top: float, names: Iterator[str]) -> _Box:
+    """Place an element below `top`, and its children in the next column; a parent is centred on its children.
+
+    names: identifiers in the order of the argument (`number_elements`)
+    """
+    name, children, next_top = next(names), [], top
     lines = [f"{name} {element.kind.name.lower()}: {element.state}" if element.kind is ElementKind.GOAL else name]
     lines += textwrap.wrap(element.text, _CHARACTERS)
     for child in element.children:
-        children.append(_place(child, column + 1, next_top, numbers))
+        children.append(_place(child, column + 1, next_top, names))
         next_top = children[-1].bottom + _ROW_GAP
     height = _LINE * len(lines) + 2 * _PAD
     middle = 0.5 * (children[0].middle + children[-1].middle) if children else 0.0

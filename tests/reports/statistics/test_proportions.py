@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -61,10 +62,10 @@ def test_sample_size_is_the_smallest_that_meets_the_risk(reliability: float, con
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        *((lambda counts=counts: proportion_lower(*counts, 0.9), "successes") for counts in ((-1, 3), (4, 3))),
-        *((lambda value=value: proportion_lower(1, 2, value), "confidence") for value in (0.0, 1.0, -0.1, math.nan)),
-        *((lambda value=value: minimum_sample_size(value, 0.9), "reliability") for value in (0.0, 1.0, 1.5)),
-        (lambda: minimum_sample_size(0.9, 0.9, -1), "failures"),
+        *((partial(proportion_lower, *counts, 0.9), "successes") for counts in ((-1, 3), (4, 3))),
+        *((partial(proportion_lower, 1, 2, confidence), "confidence") for confidence in (0.0, 1.0, -0.1, math.nan)),
+        *((partial(minimum_sample_size, reliability, 0.9), "reliability") for reliability in (0.0, 1.0, 1.5)),
+        (partial(minimum_sample_size, 0.9, 0.9, -1), "failures"),
     ],
 )
 def test_invalid_numbers_are_rejected(call: Callable[[], object], message: str) -> None:
