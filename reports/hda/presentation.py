@@ -12,7 +12,7 @@ import numpy as np
 from marsyard.algorithms.interface import SiteOutcome
 from marsyard.reports.column_values import is_true, to_float
 from marsyard.reports.hda.case_figures import FIGURES, available_figures, drawn_sites, is_unknown_everywhere
-from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
+from marsyard.reports.hda.paper_sections import limits_section, run_times_section, touchdown_section
 from marsyard.reports.hda.products import (
     is_hda_case,
     read_images,
@@ -23,7 +23,6 @@ from marsyard.reports.hda.products import (
 )
 from marsyard.reports.hda.sections import faults_section, map_section, threshold_section
 from marsyard.reports.hda.sites_section import sites_section
-from marsyard.reports.hda.tracking_limits import limits_section
 from marsyard.reports.images import draw_images
 from marsyard.reports.presentation import CaseFigure, CaseKind, CaseView, Cause, Presentation, TableRow
 from marsyard.reports.products import Products

@@ -11,7 +11,13 @@ import pytest
 from marsyard.reports.campaign import write_report
 from marsyard.reports.effects import estimate_effects
 from marsyard.reports.hda.landing_cases import PAPER
-from marsyard.reports.hda.paper_tables import run_times_section, touchdown_section
+from marsyard.reports.hda.paper_sections import (
+    SizeResult,
+    find_knee,
+    run_times_section,
+    touchdown_section,
+    tracking_curves,
+)
 from marsyard.reports.hda.sections import (
     FAULT_OUTCOMES,
     MAP_CONDITIONS,
@@ -29,7 +35,6 @@ from marsyard.reports.hda.sites_section import (
     outcome_counts,
     site_fractions,
 )
-from marsyard.reports.hda.tracking_limits import SizeResult, find_knee, tracking_curves
 from marsyard.reports.rates import PooledRate, pooled_rate
 from marsyard.reports.section import Subject, drop_empty_columns
 from marsyard.reports.stored import StoredRun

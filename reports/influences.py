@@ -1,29 +1,91 @@
-"""Failure boundary: probability that a case violates a requirement as a function of two conditions.
+"""Influence of conditions on errors and failures: ranked drivers, and the failure boundary over two conditions.
 
-For each pair of the most influential conditions, a logistic regression on spline functions is fitted (scikit-learn). It
-is validated by its predictions for terrains that were not used for the fit, and drawn only if they are good.
+For each pair of the most influential conditions, the probability that a case violates a requirement is fitted by a
+logistic regression on spline functions (scikit-learn). The fit is validated by its predictions for terrains that were
+not used for it, and drawn only if they are good.
 """
 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 from matplotlib.figure import Figure
 
-from marsyard.reports import rates
-from marsyard.reports.column_selection import distinct_columns
+from marsyard.reports import populations, rates
+from marsyard.reports.column_selection import distinct_columns, driver_columns
 from marsyard.reports.column_values import numbers
 from marsyard.reports.conditions import CONDITIONS
 from marsyard.reports.decision import requirement_masks
-from marsyard.reports.driver_section import rank_drivers
 from marsyard.reports.figure_style import INK, REQUIREMENT, in_page_style, new_axes
+from marsyard.reports.rates import CONFIDENCE
 from marsyard.reports.section import Block, Grid, Section, Subject, svg_figure
+from marsyard.reports.statistics.difference_tests import correct_holm
+from marsyard.reports.statistics.drivers import Driver, estimate_driver
 from marsyard.reports.stored import StoredRun
-from marsyard.reports.wording import label, note_text, number
+from marsyard.reports.wording import coefficient, format_fraction, label, note_text, number, p_text, percent
+
+#: Maximum number of ranked conditions, and of cases that are used for the ranking.
+_MAX_DRIVERS, _MAX_DRIVER_CASES = 12, 20_000
+
+
+class RankedDriver(NamedTuple):
+    """A condition (a column of the rows) with its effect, and the p-value corrected for the number of conditions."""
+
+    column: str
+    driver: Driver
+    p_value: float
+
+
+def drivers_section(subject: Subject) -> Section | None:
+    """Create the section that ranks drivers by explained variance of errors and of failures; None without drivers."""
+    metric = subject.metric
+    if metric is None:
+        return None
+    frame = subject.frame.head(_MAX_DRIVER_CASES)
+    responses = {"the size of errors": np.abs(numbers(frame, metric))}
+    if subject.bound is not None:
+        responses["failures"] = (~populations.success_mask(frame, metric, subject.bound)).astype(np.float64)
+    columns = driver_columns(frame, metric, _MAX_DRIVERS, subject.run.is_condition)
+    ranked_drivers = {
+        name: drivers for name, response in responses.items() if (drivers := rank_drivers(frame, columns, response))
+    }
+    if not ranked_drivers:
+        return None
+    note = note_text("common.drivers", confidence=format_fraction(CONFIDENCE))
+    headings = ["Condition", "Cases", "Rank correlation", "Interval of the correlation"]
+    headings += ["Fraction of variance", "Interval of the fraction", "p"]
+    blocks = []
+    for name, drivers in ranked_drivers.items():
+        rows = []
+        for column, driver, p_value in drivers:
+            ranks = [coefficient(driver.correlation), f"{coefficient(driver.lower)} to {coefficient(driver.upper)}"]
+            fractions = [percent(driver.fraction), rates.range_text(driver.fraction_lower, driver.fraction_upper)]
+            rows.append([label(column), f"{driver.n:,}", *ranks, *fractions, p_text(p_value)])
+        blocks.append(Block(heading=f"Drivers of {name}", grid=Grid(headings, rows)))
+    data = {
+        name: [{"condition": column, **asdict(driver), "corrected_p": p_value} for column, driver, p_value in drivers]
+        for name, drivers in ranked_drivers.items()
+    }
+    title = "Influence of conditions on errors and failures"
+    return Section("explained", "Influences", title, [*blocks, Block(note=note)], data)
+
+
+def rank_drivers(frame: pd.DataFrame, columns: Sequence[str], response: Float[np.ndarray, " n"]) -> list[RankedDriver]:
+    """Rank columns by the fraction of a response's variance that they explain, largest first; correct the p-values."""
+    groups = rates.terrain_groups(frame)
+    drivers: Mapping[str, Driver] = {
+        column: driver
+        for column in columns
+        if (driver := estimate_driver(numbers(frame, column), response, groups, CONFIDENCE)) is not None
+    }
+    p_values = dict(zip(drivers, correct_holm([driver.p_value for driver in drivers.values()]), strict=True))
+    order = sorted(drivers, key=lambda column: (-drivers[column].fraction, column))
+    return [RankedDriver(column, drivers[column], p_values[column]) for column in order]
+
 
 #: Number of folds of the cross-validation, and of bins of the calibration.
 FOLDS, CALIBRATION_BINS = 5, 5
@@ -104,9 +166,9 @@ def fit_probability(values: Float[np.ndarray, "n 2"], is_violation: Bool[np.ndar
 #: Minimum number of violations, and of other cases, of a requirement.
 MIN_CASES_PER_CLASS = 20
 #: Maximum number of conditions, and maximum corrected p-value of a condition.
-MAX_CONDITIONS, MAX_P_VALUE = 4, 0.05
+_MAX_BOUNDARY_CONDITIONS, _MAX_P_VALUE = 4, 0.05
 #: Maximum number of cases of a fit: the first ones.
-_MAX_CASES = 5000
+_MAX_BOUNDARY_CASES = 5000
 #: Number of grid points of the figure along each axis.
 _GRID_POINTS = 41
 
@@ -118,7 +180,7 @@ def boundary_section(subject: Subject) -> Section | None:
     columns = list_conditions(subject.run)
     for requirement in subject.run.requirements:
         name = str(requirement.get("id"))
-        drawn_fits = _fit_requirement(subject.frame.head(_MAX_CASES), requirement, columns)
+        drawn_fits = _fit_requirement(subject.frame.head(_MAX_BOUNDARY_CASES), requirement, columns)
         fits, good_fits = [fit for fit, _ in drawn_fits], [(fit, drawn) for fit, drawn in drawn_fits if drawn]
         if not fits:
             continue
@@ -142,7 +204,10 @@ def boundary_section(subject: Subject) -> Section | None:
     if not blocks:
         return None
     note = note_text(
-        "common.boundary", conditions=MAX_CONDITIONS, bins=CALIBRATION_BINS, max_error=f"{MAX_CALIBRATION_ERROR:g}"
+        "common.boundary",
+        conditions=_MAX_BOUNDARY_CONDITIONS,
+        bins=CALIBRATION_BINS,
+        max_error=f"{MAX_CALIBRATION_ERROR:g}",
     )
     return Section("boundary", "Failure boundary", "Failure boundary", [*blocks, Block(note=note)], data)
 
@@ -168,7 +233,7 @@ def _fit_requirement(
     if not _has_enough_cases(is_violation):
         return []
     drivers = rank_drivers(rows, columns, is_violation.astype(np.float64))
-    conditions = [column for column, _, p_value in drivers if p_value <= MAX_P_VALUE][:MAX_CONDITIONS]
+    conditions = [column for column, _, p_value in drivers if p_value <= _MAX_P_VALUE][:_MAX_BOUNDARY_CONDITIONS]
     groups = rates.terrain_groups(rows)
     groups = np.arange(len(rows)) if groups is None or np.unique(groups).size < 2 * FOLDS else groups
     fits: list[tuple[BoundaryFit, Figure | None]] = []
