@@ -1,19 +1,93 @@
-"""History of nightly runs in an SQLite file."""
+"""Nightly runs: their history in an SQLite file, the metrics that changed, and the page of a night."""
 
 from __future__ import annotations
 
+import math
 import sqlite3
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
 
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.record import utc_now
-from marsyard.reports.history_changes import MetricChange, NightComparison
-from marsyard.reports.statistics.changes import Metric, Sample
+from marsyard.reports.statistics.difference_tests import Metric, Sample, correct_holm, difference_p_value
+from marsyard.reports.wording import count, format_fraction, number, percent
+
+#: Maximum probability of at least one false alarm in a night in which no metric has changed.
+MAX_FALSE_ALARM_PROBABILITY = 0.01
+#: Significance level of changes. The other half of the probability allows for a second false alarm: after a false
+#: alarm, the only reference is one unusual night (docs/adr/0027).
+_SIGNIFICANCE = 0.5 * MAX_FALSE_ALARM_PROBABILITY
+#: Expected number of permutations that exceed a change at the significance level.
+_MIN_EXCEEDANCES = 10
+
+
+@dataclass(frozen=True)
+class MetricChange:
+    """A changed metric.
+
+    - is_rate: whether the metric is a success rate (larger is better), not an error
+    - before, now: rate or median error in the earlier nights and in this night
+    - p_value: p-value with Holm correction for the number of metrics compared in this night
+    - nights: number of earlier nights
+    """
+
+    campaign: str
+    metric: str
+    is_rate: bool
+    before: float
+    now: float
+    p_value: float
+    nights: int
+
+    @property
+    def is_regression(self) -> bool:
+        """Whether the change is a regression."""
+        return self.now < self.before if self.is_rate else self.now > self.before
+
+
+@dataclass(frozen=True)
+class NightComparison:
+    """A metric of one night, and its samples in earlier nights (`before`)."""
+
+    campaign: str
+    metric: Metric
+    before: Sequence[Sample]
+
+
+def find_changes(comparisons: Sequence[NightComparison]) -> list[MetricChange]:
+    """Find the changed metrics of a night; a false alarm has at most the probability `MAX_FALSE_ALARM_PROBABILITY`."""
+    earlier_samples: list[Sample | None] = []
+    for comparison in comparisons:
+        columns = ([getattr(sample, field) for sample in comparison.before] for field in ("values", "terrains"))
+        earlier_samples.append(Sample(*map(np.concatenate, columns)) if comparison.before else None)
+    # Holm's method compares the smallest p-value with the significance level divided by the number of metrics
+    permutations = math.ceil(_MIN_EXCEEDANCES * len(comparisons) / _SIGNIFICANCE)
+    p_values = correct_holm(
+        [
+            math.nan if sample is None else difference_p_value(comparison.metric.sample, sample, permutations)
+            for comparison, sample in zip(comparisons, earlier_samples, strict=True)
+        ]
+    )
+    return [
+        MetricChange(
+            campaign=comparison.campaign,
+            metric=comparison.metric.name,
+            is_rate=comparison.metric.is_rate,
+            before=replace(comparison.metric, sample=sample).summary,
+            now=comparison.metric.summary,
+            p_value=p_value,
+            nights=len(comparison.before),
+        )
+        for comparison, sample, p_value in zip(comparisons, earlier_samples, p_values, strict=True)
+        if sample is not None and p_value <= _SIGNIFICANCE
+    ]
+
 
 #: Version of the tables, as `PRAGMA user_version`.
 SCHEMA_VERSION = 1
@@ -179,3 +253,55 @@ def list_comparisons(history: History, night: int) -> list[NightComparison]:
         for campaign in history.campaigns(night)
         for metric in history.metrics(night, campaign.name)
     ]
+
+
+def format_night_page(
+    night: Night,
+    earlier: Sequence[Night],
+    campaigns: Sequence[NightCampaign],
+    changes: Sequence[MetricChange],
+    compared: int,
+) -> str:
+    """Format the night's page in Markdown.
+
+    - earlier: previous nights, the latest first
+    - changes: changed metrics
+    - compared: number of compared metrics
+    """
+    regressions = [change for change in changes if change.is_regression]
+    improvements = [change for change in changes if not change.is_regression]
+    verdict_counts = Counter(campaign.verdict for campaign in campaigns)
+    headline, end = night.state.upper(), f"{night.state}: its metrics are excluded from comparisons"
+    if night.state == FINISHED:
+        verdicts = ", ".join(f"{n_campaigns} {verdict}" for verdict, n_campaigns in verdict_counts.items())
+        headline = verdicts + (f", {count(len(regressions), 'regression')}" if regressions else "")
+        end = f"ended {night.finished_utc}"
+    lines = [f"# Night {night.night}: {headline}", ""]
+    lines.append(f"Started {night.started_utc}, {end}; commit {night.git_commit or 'not known'}.")
+    unfinished_nights = list(takewhile(lambda earlier_night: earlier_night.state != FINISHED, earlier))
+    lines += [""] * bool(unfinished_nights)
+    lines += [
+        f"Night {previous.night}, started {previous.started_utc}, was {previous.state}."
+        for previous in unfinished_nights
+    ]
+    lines += ["", "| Campaign | Verdict | |", "|---|---|---|"]
+    lines += [f"| {_escape(run.name)} | {_escape(run.verdict)} | {_escape(run.sentence)} |" for run in campaigns]
+    for title, group_changes in (("Regressions", regressions), ("Improvements", improvements)):
+        if group_changes:
+            lines += ["", f"## {title}", ""]
+        for change in group_changes:
+            before, now = ((percent if change.is_rate else number)(value) for value in (change.before, change.now))
+            values = f"{before} in {count(change.nights, 'earlier night')}, {now} now (p = {change.p_value:.1g})"
+            lines.append(f"- **{_escape(change.campaign)}: {_escape(change.metric)}**: {values}")
+    text = (
+        f"{count(compared, 'metric')} compared with earlier nights; the probability of a false alarm is at most "
+        f"{format_fraction(MAX_FALSE_ALARM_PROBABILITY)}.{'' if changes else ' No metric has changed.'}"
+    )
+    lines += ["", text if compared else "No metric has a history for a comparison yet.", ""]
+    return "\n".join(lines)
+
+
+def _escape(text: str) -> str:
+    """Escape characters with a meaning in Markdown or HTML."""
+    escapes = {letter: f"&#{ord(letter)};" for letter in "&<>|"} | {letter: f"\\{letter}" for letter in "\\`*_[]#"}
+    return "".join(escapes.get(letter, letter) for letter in " ".join(text.split()))

@@ -1,13 +1,17 @@
-"""Traceability matrix: the evidence of a campaign for each requirement (`verification.csv`)."""
+"""Verdicts as files for other programs: traceability matrix (`verification.csv`) and JUnit XML (`junit.xml`)."""
 
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
+from xml.etree import ElementTree as Xml
 
-from marsyard.reports.tested_algorithms import Algorithm
-from marsyard.reports.verdicts import Verdict
+from marsyard.reports.overall import OverallVerdict
+from marsyard.reports.provenance import Algorithm, format_tested_algorithms
+from marsyard.reports.verdicts import Status, Verdict
+from marsyard.reports.wording import count
 
 
 def algorithm_cells(algorithms: Iterable[Algorithm]) -> dict[str, str]:
@@ -68,3 +72,55 @@ def _format_cell(value: Any) -> str:
     text = f"{value:.9g}" if isinstance(value, float) else str(value)
     # the apostrophe prevents spreadsheets from reading a text as a formula
     return f"'{text}" if isinstance(value, str) and text[:1] in "=+-@\t\r" and text else text
+
+
+#: Characters that XML 1.0 does not allow.
+_INVALID_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def junit_xml(
+    campaign: str, verdicts: Sequence[Verdict], overall: OverallVerdict, algorithms: Sequence[Algorithm] = ()
+) -> str:
+    """Format the verdicts as JUnit XML: a test for each requirement, and one for the completion of all cases.
+
+    FAIL is a failure; INSUFFICIENT, MET BY RATE and PASS with a qualification are skipped. Properties of the suite: the
+    tested algorithm.
+    """
+    statuses = [verdict.status for verdict in verdicts]
+    suite = Xml.Element(
+        "testsuite",
+        name=_clean_xml(campaign),
+        tests=str(len(verdicts) + 1),
+        failures=str(statuses.count(Status.FAIL) + bool(overall.crashed)),
+        skipped=str(sum(status not in (Status.PASS, Status.FAIL) for status in statuses)),
+    )
+    cells = {name: value for name, value in algorithm_cells(algorithms).items() if value}
+    if cells:
+        properties = Xml.SubElement(suite, "properties")
+        for name, value in cells.items():
+            Xml.SubElement(properties, "property", name=name, value=_clean_xml(value))
+    tested_names = format_tested_algorithms(algorithms)
+    tested_text = f"Under test: {tested_names}. " if tested_names else ""
+    for verdict in verdicts:
+        test_case = Xml.SubElement(
+            suite, "testcase", classname=_clean_xml(campaign), name=_clean_xml(verdict.requirement_id)
+        )
+        lower = "no lower bound" if math.isnan(verdict.lower) else f"at least {verdict.lower:.6g}"
+        message = _clean_xml(
+            f"{verdict.failures} of {verdict.n} failed; {lower}, required {verdict.probability:g}. {verdict.note}"
+        )
+        if verdict.status is Status.FAIL:
+            Xml.SubElement(test_case, "failure", message=message, type=str(verdict.status))
+        elif verdict.status is not Status.PASS:
+            Xml.SubElement(test_case, "skipped", message=f"{verdict.status}: {message}")
+        Xml.SubElement(test_case, "system-out").text = _clean_xml(f"{tested_text}{verdict.statement} {message}")
+    completion = Xml.SubElement(suite, "testcase", classname=_clean_xml(campaign), name="all cases end")
+    if overall.crashed:
+        Xml.SubElement(completion, "failure", message=f"{count(overall.crashed, 'case')} crashed", type="CRASHED")
+    Xml.indent(suite)
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{Xml.tostring(suite, encoding="unicode")}\n'
+
+
+def _clean_xml(text: str) -> str:
+    """Replace characters that XML does not allow."""
+    return _INVALID_XML.sub("�", text)

@@ -18,11 +18,15 @@ largest weight m = max u, so that it is valid where no case failed. With equal w
 and Pearson, on which verdicts rest.
 """
 
+from __future__ import annotations
+
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int
 from scipy import stats
+from scipy.special import rel_entr
 
 #: Values for each of several changes.
 Changes = Float64[np.ndarray, " changes"]
@@ -96,3 +100,65 @@ def _sum_groups(
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
     return np.add.reduceat(values[:, order], starts, axis=1)
+
+
+#: Rounding error of a rate that is compared with a limit.
+_ROUNDING = 1e-12
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Sizes of a change at which upper bound (`lower`), estimate (`change`) and lower bound (`upper`) reach a limit.
+
+    - lower: `reach` if the upper bound stays below the limit; NaN if it exceeds the limit without a change
+    - change, upper: NaN if they do not reach the limit
+    - reach: largest size with `MIN_EFFECTIVE` effective units; effective_cases: their number at `change`, or at `reach`
+    """
+
+    change: float
+    lower: float
+    upper: float
+    reach: float
+    effective_cases: float
+
+
+def find_crossing(sizes: Changes, rates: WeightedRates, limit: float, *, decides_by_rate: bool = False) -> Crossing:
+    """Find the sizes of a change at which the failure rate reaches a limit, by linear interpolation.
+
+    decides_by_rate: whether `lower` is that of the estimate
+    """
+    # the tolerance is for rounding errors of the largest size
+    is_usable = np.logical_and.accumulate(np.nan_to_num(rates.effective_units) >= MIN_EFFECTIVE * (1.0 - 1e-9))
+    count = int(is_usable.sum())
+    if not count:
+        return Crossing(math.nan, math.nan, math.nan, 0.0, float(rates.effective_units[0]))
+    reach = float(sizes[count - 1])
+    lost, change, shown = (
+        _first_above(sizes[:count], values[:count], limit)
+        for values in (rates.estimate if decides_by_rate else rates.upper, rates.estimate, rates.lower)
+    )
+    lower = math.nan if lost == 0.0 else reach if math.isnan(lost) else lost
+    size = reach if math.isnan(change) else change
+    return Crossing(change, lower, shown, reach, float(np.interp(size, sizes, rates.effective_units)))
+
+
+def _first_above(sizes: Changes, values: Changes, limit: float) -> float:
+    """Find the smallest size whose value exceeds a limit, by linear interpolation; NaN if there is none."""
+    above = np.flatnonzero(values > limit + _ROUNDING)
+    if not above.size:
+        return math.nan
+    last = int(above[0])
+    if last == 0:
+        return 0.0
+    return float(np.interp(limit, values[last - 1 : last + 1], sizes[last - 1 : last + 1]))
+
+
+def population_divergence(rate: float, reference: float, member_rate: float) -> float:
+    """Compute the smallest divergence of the distribution of all cases that changes the failure rate of a population.
+
+    - rate, reference: failure rates in the population after and before the change
+    - member_rate: fraction of all cases that belong to the population, before the change
+    """
+    divergence = 0.0 if rate <= reference else float(rel_entr(rate, reference) + rel_entr(1 - rate, 1 - reference))
+    is_bounded = math.isfinite(divergence) and member_rate < 1.0
+    return -math.log1p(member_rate * math.expm1(-divergence)) if is_bounded else divergence

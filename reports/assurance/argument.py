@@ -1,13 +1,80 @@
-"""Drawing of an assurance case as SVG: a tree from left to right, in the shapes of the Goal Structuring Notation."""
+"""Argument of an assurance case in the Goal Structuring Notation: its elements, and their drawing as SVG."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from html import escape
 
-from marsyard.reports.assurance.elements import Element, ElementKind, GoalState
+
+class ElementKind(StrEnum):
+    """ElementKind of an element, with the prefix of its identifier."""
+
+    GOAL = "G"
+    STRATEGY = "S"
+    SOLUTION = "Sn"
+    CONTEXT = "C"
+    ASSUMPTION = "A"
+    DEFEATER = "D"
+
+
+class GoalState(StrEnum):
+    """GoalState of a goal, from the least to the most severe."""
+
+    SUPPORTED = "supported"
+    CHALLENGED = "supported, with open defeaters"
+    OPEN = "not shown"
+    REFUTED = "refuted"
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of the case with the elements that support it, are its context, or challenge it.
+
+    - evidence: file of the package, relative to its folder; empty without one
+    - own_state: state that the evidence of the element determines; the state of a goal is the worst below it
+    """
+
+    kind: ElementKind
+    text: str
+    children: tuple[Element, ...] = ()
+    evidence: str = ""
+    own_state: GoalState = GoalState.SUPPORTED
+
+    @property
+    def state(self) -> GoalState:
+        """The worst state of this element and those below; an open defeater challenges all goals above it."""
+        order = list(GoalState)
+        return max((self.own_state, *(child.state for child in self.children)), key=order.index)
+
+
+def goal(text: str, *children: Element | None) -> Element:
+    """Create a goal with the elements that exist."""
+    return Element(ElementKind.GOAL, text, tuple(child for child in children if child is not None))
+
+
+def defeater(text: str, evidence: str = "", state: GoalState = GoalState.CHALLENGED) -> Element:
+    """Create an open defeater."""
+    return Element(ElementKind.DEFEATER, text, evidence=evidence, own_state=state)
+
+
+def number_elements(root: Element) -> list[tuple[str, Element, str]]:
+    """List the elements in the order of the argument with their identifiers, and those of their parents."""
+    numbers = dict.fromkeys(ElementKind, 0)
+    listed: list[tuple[str, Element, str]] = []
+
+    def visit(element: Element, parent: str) -> None:
+        numbers[element.kind] += 1
+        name = f"{element.kind}{numbers[element.kind]}"
+        listed.append((name, element, parent))
+        for child in element.children:
+            visit(child, name)
+
+    visit(root, "")
+    return listed
+
 
 #: SVG dash pattern of the box of a defeater.
 _DASHES = 'stroke-dasharray="6 3"'
@@ -58,7 +125,7 @@ class _Box:
 
 def draw_case(root: Element) -> str:
     """Draw the case as an SVG document."""
-    box = _place(root, 0, _PAD, dict.fromkeys(ElementKind, 0))
+    box = _place(root, 0, _PAD, iter([name for name, _, _ in number_elements(root)]))
     boxes = list(box.walk())
     width = max(item.left for item in boxes) + _WIDTH + _PAD
     height = max(item.top + item.height for item in boxes) + _PAD
@@ -73,14 +140,16 @@ def draw_case(root: Element) -> str:
     )
 
 
-def _place(element: Element, column: int, top: float, numbers: dict[ElementKind, int]) -> _Box:
-    """Place an element below `top`, and its children in the next column; a parent is centred on its children."""
-    numbers[element.kind] += 1
-    name, children, next_top = f"{element.kind}{numbers[element.kind]}", [], top
+def _place(element: Element, column: int, top: float, names: Iterator[str]) -> _Box:
+    """Place an element below `top`, and its children in the next column; a parent is centred on its children.
+
+    names: identifiers in the order of the argument (`number_elements`)
+    """
+    name, children, next_top = next(names), [], top
     lines = [f"{name} {element.kind.name.lower()}: {element.state}" if element.kind is ElementKind.GOAL else name]
     lines += textwrap.wrap(element.text, _CHARACTERS)
     for child in element.children:
-        children.append(_place(child, column + 1, next_top, numbers))
+        children.append(_place(child, column + 1, next_top, names))
         next_top = children[-1].bottom + _ROW_GAP
     height = _LINE * len(lines) + 2 * _PAD
     middle = 0.5 * (children[0].middle + children[-1].middle) if children else 0.0
