@@ -1,10 +1,12 @@
 """Tests of external programs as algorithms: exchanged files, answers and program faults."""
 
 import dataclasses
+import json
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +101,42 @@ def test_landing_without_range_round_trips(measurements: DescentMeasurements, tm
     assert np.isnan(restored_case.slant_range_m)
     np.testing.assert_allclose(restored_case.poses[1].world_from_body.as_matrix(), pose.as_matrix(), atol=1e-15)
     np.testing.assert_array_equal(restored_case.apriori_site_world, landing.apriori_site_world)
+
+
+def test_case_files_contain_no_truth(measurements: DescentMeasurements, tmp_path: Path) -> None:
+    write_case(tmp_path, measurements)
+    names = sorted(path.name for path in tmp_path.iterdir())
+    cameras, images = [f"camera_{k}.cahvor" for k in (1, 2, 3)], [f"image_{k}.pgm" for k in (1, 2, 3)]
+    assert names == [*cameras, "case.json", "flat_field_1.f64", *images]
+    # Each number in the files is a measurement, or an index or size; the true velocity is absent.
+    case = json.loads((tmp_path / "case.json").read_text())
+    numbers = np.array(list(_iterate_numbers(case)))
+    inputs = np.array(list(_iterate_numbers(_to_plain_values(measurements))))
+    indices = {float(k) for k in range(max(512, *measurements.images[0].counts.shape) + 1)}
+    assert set(numbers) <= set(inputs) | indices
+    assert not np.isclose(numbers[:, None], TRUE_VELOCITY, atol=1e-3).any()
+
+
+def _to_plain_values(value: object) -> object:
+    """Convert a measurement to lists and dictionaries, with rotations as quaternions."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: _to_plain_values(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Rotation):
+        return value.as_quat().tolist()
+    if isinstance(value, np.ndarray):
+        return value.ravel().tolist() if value.size < 100 else []
+    return [_to_plain_values(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+def _iterate_numbers(value: object) -> Iterator[float]:
+    """Yield all numbers of nested lists and dictionaries."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from _iterate_numbers(item)
+    elif isinstance(value, (int, float)):
+        yield float(value)
 
 
 def test_other_format_version_is_rejected(measurements: DescentMeasurements, tmp_path: Path) -> None:
