@@ -1,4 +1,4 @@
-"""The ray of every pixel, and the pinhole views that contain all rays."""
+"""The rays of a camera's pixels, on the host and on the device, and the pinhole views that contain all of them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from marsyard.sim.frames import rotation_matrix
 from marsyard.sim.render.arrays import Values, to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.cones import Cone
-from marsyard.sim.render.device import Array3f, Array3f64, Float, UInt32
+from marsyard.sim.render.device import Array3f, Array3f64, Float, Matrix3f64, UInt32
 from marsyard.sim.render.pixel_grid import pixel_angles
-from marsyard.sim.render.primary import Rays
 
 #: Sizes of the pinhole views, samples along a side. A camera uses the smallest view that is at least `_SPARE_PX` larger
 #: than its image (or than the quarter of its image that the view covers), otherwise the largest view. For 1024 x 1024
@@ -30,6 +29,46 @@ _SPARE_PX = 16
 MARGIN_PX = 2.0
 #: Maximum angle between a ray and the axis of its view; a wider field of view is divided into quarters.
 MAX_HALF_ANGLE_RAD = np.radians(52.0)
+
+
+@dataclass(eq=False)
+class Ray:
+    """Rays in world axes: origins, metres, and unit directions."""
+
+    origin: Values
+    direction: Values
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Rotation matrix from body to world axes, and world position of the camera's centre of projection."""
+
+    rotation: Values
+    position: Values
+
+    @classmethod
+    def of(cls, rotation: np.ndarray, position: np.ndarray) -> Pose:
+        """Copy a rotation matrix and a position to the device."""
+        return cls(Matrix3f64(*rotation.ravel().tolist()), Array3f64(*position.tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Rays in body axes: unit directions, origins relative to the camera's centre (None: all 0), pixel angles, rad."""
+
+    directions: Values
+    origins: Values | None
+    pixel_angles: Values
+
+    def in_world(self, pose: Pose) -> Ray:
+        """Transform the rays to world axes."""
+        offset = 0.0 if self.origins is None else pose.rotation @ Array3f64(self.origins)
+        return Ray(pose.position + offset, pose.rotation @ Array3f64(self.directions))
+
+    def select(self, index: Values) -> Rays:
+        """Return some of the rays."""
+        origins = None if self.origins is None else dr.gather(Array3f, self.origins, index)
+        return Rays(dr.gather(Array3f, self.directions, index), origins, dr.gather(Float, self.pixel_angles, index))
 
 
 @dataclass(frozen=True)

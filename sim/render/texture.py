@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
 
-from marsyard.sim.render.arrays import Values, larger, smaller, to_device
+from marsyard.sim.render.arrays import Grid, Values, larger, smaller, to_device
 from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_plane, noise_in_space
-from marsyard.sim.render.sunlight import Grid
 from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
 #: Mean square of `noise_in_space`; mean squares of `noise_in_plane` and of its derivative along one axis.
@@ -78,6 +77,23 @@ def log_relative_albedo(
     return dr.while_loop(
         (UInt32(0), first, Float(0.0)), lambda octave, cell, total: (octave < count) & (cell > min_cell), add_octave
     )[2]
+
+
+@dataclass(frozen=True)
+class Texture:
+    """Albedo variation finer than the terrain's samples: octaves of three-dimensional noise, evaluated per pixel.
+
+    - coarsest_m: size of the coarsest octave's cells; each further octave is half as large
+    - amplitudes: amplitude of each octave in the natural logarithm of albedo, coarsest first
+    """
+
+    coarsest_m: float = 1.0
+    amplitudes: tuple[float, ...] = ()
+
+    @property
+    def octaves(self) -> Octaves:
+        """The octaves on the device."""
+        return Octaves.of(self.coarsest_m, self.amplitudes)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from jaxtyping import Int64
 
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, to_host, vectors_to_device, where
 from marsyard.sim.render.device import Array3f, Array3f64, Array4f, Bool, Float, Float64, Int32, UInt32
-from marsyard.sim.render.ground import Ray
+from marsyard.sim.render.rays import Ray
 
 Triangles = FloatArray[np.ndarray, "triangles 3 3"]
 #: Relative margin of bounds and of triangles in single precision, larger than rounding errors.

@@ -13,7 +13,8 @@ from marsyard.sim.render import Objects, Photometry, PixelRays, Renderer, Scene,
 from marsyard.sim.render.arrays import to_device, to_host, vectors_to_device
 from marsyard.sim.render.backend import RenderingError
 from marsyard.sim.render.device import Array3f64, Bool, Float64, Int32
-from marsyard.sim.render.ground import Extent, Ray, first_crossing, skip_empty_blocks
+from marsyard.sim.render.ground import Extent, first_crossing, skip_empty_blocks
+from marsyard.sim.render.rays import Ray
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.terrain import Surface
 from marsyard.sim.terrain.kernels import CEILING_BLOCK

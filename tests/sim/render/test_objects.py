@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
@@ -13,10 +14,9 @@ from marsyard.sim.render import Objects, PixelRays, Sun, process_renderer
 from marsyard.sim.render.arrays import to_device, to_host
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.device import Float64
-from marsyard.sim.render.kernels.views import depth_in_metres
-from marsyard.sim.render.renderer import cell_spans_in_hull, ground_mesh
-from marsyard.sim.render.scene import graded_offsets, shadow_footprint
-from marsyard.sim.render.sunlight import Footprint
+from marsyard.sim.render.mesh import cell_spans_in_hull, graded_offsets, ground_mesh
+from marsyard.sim.render.pinhole import depth_in_metres
+from marsyard.sim.render.shadows import Footprint
 from marsyard.sim.sensor import preset
 from marsyard.sim.terrain import RockParameters, Surface, TerrainParameters, site
 
@@ -103,7 +103,7 @@ def test_too_many_grid_lines_are_rejected() -> None:
 
 def test_mesh_has_no_cracks_and_upward_normals_and_follows_the_ground(terrain: Surface) -> None:
     offsets = graded_offsets(2000.0, 6.0, 65)
-    mesh = ground_mesh(terrain, 120.0 + offsets, -40.0 + offsets)
+    mesh = trimesh.Trimesh(*ground_mesh(terrain, 120.0 + offsets, -40.0 + offsets), process=False)
     assert len(mesh.faces) == 2 * 64 * 64
     assert (mesh.face_normals[:, 2] > 0.0).all()
     # A mesh of n x n cells with diagonals has 3 n^2 + 2 n different edges; a crack would add edges.
@@ -140,7 +140,9 @@ def test_partial_mesh_equals_the_cells_of_the_full_mesh(terrain: Surface) -> Non
     spans = np.zeros((16, 2), dtype=int)
     spans[3:6] = [[2, 5], [7, 9], [0, 16]]
     spans[15] = [15, 16]
-    subset, full = ground_mesh(terrain, lines, lines, spans), ground_mesh(terrain, lines, lines)
+    subset, full = (
+        trimesh.Trimesh(*ground_mesh(terrain, lines, lines, cells), process=False) for cells in (spans, None)
+    )
     expected = [row * 16 + column for row, (first, end) in enumerate(spans) for column in range(first, end)]
     triangles_of_cells = full.triangles.reshape(256, 2, 3, 3)
     np.testing.assert_array_equal(subset.triangles.reshape(-1, 2, 3, 3), triangles_of_cells[expected])
@@ -162,7 +164,7 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
         [rng.uniform(-900.0, 900.0, (40, 2)), rng.uniform(-30.0, 30.0, 40), rng.uniform(0.5, 3.0, 40)]
     )
     sun = direction(rng.uniform(0.0, 6.0), elevation)
-    footprint = shadow_footprint(spheres, sun, -40.0)
+    footprint = Footprint.of(spheres, sun, -40.0)
     # Random points in the spheres, projected along the sun direction to random lower heights, down to -40 m.
     sphere_of_point = np.repeat(spheres, 500, axis=0)
     offset = rng.standard_normal((len(sphere_of_point), 3))
@@ -178,8 +180,8 @@ def test_footprint_contains_every_shaded_position(elevation: float) -> None:
 
 def test_footprint_without_objects_or_sun_is_everywhere() -> None:
     sphere = np.array([[0.0, 0.0, 0.0, 1.0]])
-    assert shadow_footprint(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is None
-    assert shadow_footprint(sphere, direction(0.0, -0.1), 0.0) is None
+    assert Footprint.of(np.empty((0, 4)), direction(0.0, 1.0), 0.0) is None
+    assert Footprint.of(sphere, direction(0.0, -0.1), 0.0) is None
 
 
 def test_footprint_does_not_change_images() -> None:

@@ -12,13 +12,10 @@ from marsyard.sim.camera import Cahv
 from marsyard.sim.frames import direction, rigid
 from marsyard.sim.render import Frame, Objects, Photometry, PixelRays, Renderer, Scene, Sun
 from marsyard.sim.render.arrays import compiled, to_host, vectors_to_device
-from marsyard.sim.render.casters import Casters, are_occluded
+from marsyard.sim.render.casters import Casters, are_occluded, casters_towards
 from marsyard.sim.render.cones import ground_in_cones
 from marsyard.sim.render.device import Array3f64, Bool
-from marsyard.sim.render.ground_shadow import compute_ground_shadow, is_sun_above_slopes, slope_bounds
-from marsyard.sim.render.kernels.sweep import height_range
-from marsyard.sim.render.scene import casters_towards
-from marsyard.sim.render.sunlight import GroundShadow
+from marsyard.sim.render.ground_shadow import GroundShadow, compute_ground_shadow, is_sun_above_slopes, slope_bounds
 from marsyard.sim.terrain import Surface, TerrainParameters, synthesise
 from marsyard.sim.terrain.rocks import RockField, RockParameters
 from tests.sim.scenes import DOWN, LAMBERT, descent_camera, make_ground, rocks_near
@@ -189,7 +186,7 @@ def _grid_values(shadow: GroundShadow) -> np.ndarray:
 def test_shadow_sweep_of_an_area_equals_the_full_sweep(terrain: Surface, azimuth_deg: float) -> None:
     """The area includes the border of the terrain period."""
     sun = Sun(direction(np.radians(azimuth_deg), np.radians(35.0)))
-    heights = height_range(terrain.levels[0])
+    heights = Scene(terrain, (0.0, 0.0), sun, LAMBERT).height_range_m
     area_m = (-40.0, 60.0, 700.0, 760.0)
     full_shadow, area_shadow = (
         compute_ground_shadow(terrain, sun, heights),
@@ -235,11 +232,11 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     # Below this elevation the ground may hide part of the sun; the bounds are infinite.
     assert slope_bounds(terrain, just_below) == (np.inf, np.inf)
     # The sweep finds no shadow; the tolerance covers rounding.
-    shadow = compute_ground_shadow(terrain, just_above, height_range(terrain.levels[0]))
+    scene = Scene(terrain, (0.0, 0.0), just_above, Photometry())
+    shadow = compute_ground_shadow(terrain, just_above, scene.height_range_m)
     assert shadow is not None
     heights = terrain.levels[to_host(shadow.level)[0]][..., 0]
     assert np.all(_grid_values(shadow) < (heights.T if shadow.along_x else heights) + 1e-3)
-    scene = Scene(terrain, (0.0, 0.0), just_above, Photometry())
     assert scene.shadow is None
     below = scene.with_light(just_below, Photometry())
     assert below.shadow is not None
