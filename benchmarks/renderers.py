@@ -26,7 +26,7 @@ from marsyard.scenarios.descent.parameters import DescentCameraParameters
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
 from marsyard.sim.render.mesh import graded_offsets, ground_mesh
-from marsyard.sim.render.rays import VIEW_SIDE_PX
+from marsyard.sim.render.pixel_rays import VIEW_SIDE_PX
 
 #: Side of all frames, pixels.
 SIDE_PX = 1024

@@ -3,7 +3,7 @@
 from marsyard.sim.render.clouds import CloudLayer, CloudParameters
 from marsyard.sim.render.objects import Objects, may_cast_shadow
 from marsyard.sim.render.photometry import Photometry
-from marsyard.sim.render.rays import PixelRays
+from marsyard.sim.render.pixel_rays import PixelRays
 from marsyard.sim.render.renderer import Frame, Renderer, process_renderer
 from marsyard.sim.render.scene import Scene
 from marsyard.sim.render.sky import DustySky, Sun

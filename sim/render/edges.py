@@ -12,9 +12,8 @@ import drjit as dr
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, where
 from marsyard.sim.render.device import Array3f, Array3f64, Bool, Float, Float64, Int32, UInt32
 from marsyard.sim.render.ground import Extent, first_crossing, refine
-from marsyard.sim.render.pixel_grid import PixelGrid
 from marsyard.sim.render.primary import Hits
-from marsyard.sim.render.rays import Pose, Rays
+from marsyard.sim.render.rays import PixelGrid, Pose, Rays
 from marsyard.sim.render.shading import ShadedImage
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.render.triangles import Hierarchy, nearest_hit, no_hit

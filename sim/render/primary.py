@@ -18,7 +18,8 @@ from jaxtyping import Int32 as IntArray
 from marsyard.sim.render.arrays import Values, compiled, larger, smaller, to_device, where
 from marsyard.sim.render.device import Array3f64, Bool, Float, Float64, Int32, Matrix3f64, UInt32
 from marsyard.sim.render.ground import MAX_CHANGE, Extent, refine, search_grazing_ray
-from marsyard.sim.render.rays import PixelRays, Pose, Ray, Rays
+from marsyard.sim.render.pixel_rays import PixelRays
+from marsyard.sim.render.rays import Pose, Ray, Rays
 from marsyard.sim.render.spline import Terrain
 from marsyard.sim.render.triangles import Hierarchy, TriangleHit, intersect, is_inside, nearest_hit, no_hit
 

@@ -33,8 +33,9 @@ from marsyard.sim.render.backend import Backend, RenderingError
 from marsyard.sim.render.device import UInt32, description
 from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
 from marsyard.sim.render.mesh import cell_spans_in_hull, graded_offsets, ground_mesh, lines_between
+from marsyard.sim.render.pixel_rays import VIEW_SIDE_PX, PixelRays
 from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Views, trace_primary_rays
-from marsyard.sim.render.rays import VIEW_SIDE_PX, PixelRays, Pose, Rays
+from marsyard.sim.render.rays import Pose, Rays
 from marsyard.sim.render.scene import Scene
 from marsyard.sim.render.shading import Light, ShadedImage, shade
 from marsyard.sim.render.shadows import visible_sun

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64 as FloatArray
 
 from marsyard.sim.render.arrays import to_device, vectors_to_device
 from marsyard.sim.render.casters import casters_towards
@@ -204,12 +203,18 @@ class Scene:
         """Relief, textures, normals and albedo."""
         objects, surfaces = self.objects, None
         if len(objects) > 0:
+            # dust covers a part of the level faces of rocks
+            covered = self.dust_cover * objects.is_rock
+            dust_albedo = (1.0 - covered) * objects.albedo + covered * self.dust_albedo
+            # only rocks with texture have grain
+            sizes = 0.5 * (objects.bounds[:, 3:5] - objects.bounds[:, :2]).sum(axis=1)
+            sizes *= objects.is_rock & bool(self.object_texture.amplitudes)
             surfaces = ObjectSurfaces(
                 vectors_to_device(Array3f, objects.normals.reshape(-1, 3)),
                 to_device(Int32, objects.body_of_triangle),
                 to_device(Float, objects.albedo),
-                to_device(Float, self._dust_albedo()),
-                to_device(Float, self._grain()),
+                to_device(Float, dust_albedo),
+                to_device(Float, describe_grain(objects.names, sizes)),
             )
         return Materials(
             RoughGround.of(self.relief),
@@ -218,17 +223,6 @@ class Scene:
             self.object_texture.octaves,
             surfaces,
         )
-
-    def _dust_albedo(self) -> FloatArray[np.ndarray, "bodies"]:
-        """Mean albedo of the level faces of each body: dust covers a part of those of rocks."""
-        covered = self.dust_cover * self.objects.is_rock
-        return np.asarray((1.0 - covered) * self.objects.albedo + covered * self.dust_albedo)
-
-    def _grain(self) -> FloatArray[np.ndarray, "bodies 4"]:
-        """Grain of each rock; none without texture."""
-        sizes = 0.5 * (self.objects.bounds[:, 3:5] - self.objects.bounds[:, :2]).sum(axis=1)
-        has_grain = self.objects.is_rock & bool(self.object_texture.amplitudes)
-        return describe_grain(self.objects.names, sizes * has_grain)
 
     def light(self, time_s: float) -> Light:
         """Return the illumination at a time."""

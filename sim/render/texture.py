@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import drjit as dr
 import numpy as np
 from jaxtyping import Float as FloatArray
 from jaxtyping import Float32
+from jaxtyping import Float64 as Float64Array
+from scipy.special import gamma, kv
 
 from marsyard.sim.render.arrays import Grid, Values, larger, smaller, to_device
 from marsyard.sim.render.device import Float, Float64, UInt32
@@ -17,6 +20,8 @@ from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
 
 #: Mean square of `noise_in_space`; mean squares of `noise_in_plane` and of its derivative along one axis.
 NOISE_VARIANCE, HEIGHT_VARIANCE, SLOPE_VARIANCE = 0.0732, 0.0464, 0.3886
+#: Median frequency of the power of `noise_in_plane`, cycles per cell; size of the finest cells of relief, metres.
+WAVES_PER_CELL, FINEST_M = 0.61, 0.001
 #: A pixel averages over its area: a wave of f cycles per footprint keeps the fraction sinc(f) of its amplitude. (The
 #: detector model applies the blur of the optics.) Noise with cells of c footprints has a median frequency of 0.53
 #: cycles per cell, its slopes of 0.61; ``(1 - FADING / c^2)^2`` approximates its sinc to 0.02 down to the Nyquist
@@ -190,3 +195,31 @@ def smith_shadowing(cosine: Values, variance: Values) -> Values:
     a = smaller(cosine / dr.sqrt(larger(2.0 * variance * (1.0 - cosine * cosine), 1e-30)), 1.6)
     numerator = 3.535 * a + 2.181 * a * a
     return dr.select(a < 1.6, numerator / (numerator + 1.0 - 1.259 * a + 0.396 * a * a), 1.0)
+
+
+@cache
+def octave_heights(
+    hurst: float, slope_rad: float, baseline_m: float, outer_scale_m: float, spacing_m: float
+) -> tuple[float, Float64Array[np.ndarray, "octaves"]]:
+    """Compute the cell size of the coarsest octave and the amplitude of each octave of height noise, metres.
+
+    The ground's power spectral density is ``(k**2 + k0**2)**-(H + 1)`` (`landforms.ground.Spectrum`) with the Hurst
+    exponent H and the wavenumber k0 of the outer scale. Its correlation function c is Matérn's. Its variance follows
+    from the slope over the baseline L: ``(tan(slope) L)**2 = 2 variance (1 - c(L))``. An octave from k1 = k / sqrt(2)
+    to k2 = k sqrt(2) around the wavenumber k has the fraction ``(1 + (k1 / k0)**2)**-H - (1 + (k2 / k0)**2)**-H`` of
+    this variance.
+    """
+    k0 = 2.0 * np.pi / outer_scale_m
+    scaled_lag = k0 * baseline_m
+    correlation = 2.0 ** (1.0 - hurst) / gamma(hurst) * scaled_lag**hurst * kv(hurst, scaled_lag)
+    variance = (np.tan(slope_rad) * baseline_m) ** 2 / (2.0 * (1.0 - correlation))
+    # the median frequency of the coarsest octave is the Nyquist frequency of the samples
+    coarsest = WAVES_PER_CELL * 2.0 * spacing_m
+    octaves = max(int(np.log2(coarsest / FINEST_M)) + 1, 0)
+    wavenumber = 2.0 * np.pi * WAVES_PER_CELL / (coarsest * 0.5 ** np.arange(octaves))
+    fraction_above_k1, fraction_above_k2 = (
+        (1.0 + (wavenumber * factor / k0) ** 2) ** -hurst for factor in (np.sqrt(0.5), np.sqrt(2.0))
+    )
+    heights = np.sqrt(variance * (fraction_above_k1 - fraction_above_k2) / HEIGHT_VARIANCE)
+    heights.setflags(write=False)
+    return coarsest, heights
