@@ -55,33 +55,23 @@ def test_subset_contains_the_selected_bodies() -> None:
     assert len(objects.select(np.zeros(4, dtype=bool))) == 0
 
 
-def test_cone_selects_facing_triangles_of_bodies_within_it() -> None:
-    """A triangle faces the eye if its corners appear counter-clockwise from the eye."""
+@pytest.mark.parametrize("radius_m", [0.0, 3.0])
+def test_cone_selects_triangles_that_face_a_point_near_its_apex(radius_m: float) -> None:
+    """A triangle faces a point if its corners appear counter-clockwise from there."""
     objects = _make_bodies()
-    eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 200.0])
-    result = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-3)
-    first, second, third = objects.triangles.transpose(1, 0, 2)
-    is_facing = np.einsum("ij,ij->i", np.cross(second - first, third - first), eye - first) > 0.0
-    is_in_cone = objects.body_of_triangle == 2
-    assert 20 < np.count_nonzero(is_facing & is_in_cone) < 60
-    assert set(np.flatnonzero(is_facing & is_in_cone)) <= set(result)
-    assert is_facing[result].all()
-    assert (np.diff(result) > 0).all()
-
-
-def test_cone_with_apex_radius_selects_triangles_that_face_a_point_near_the_apex() -> None:
-    objects, radius_m = _make_bodies(), 3.0
     eye = objects.spheres[2, :3] + np.array([0.0, 0.0, 20.0])
     first, second, third = objects.triangles.transpose(1, 0, 2)
     normals = np.cross(second - first, third - first)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # The point of the sphere that is most in front of a triangle.
+    # the point of the sphere around the apex that is most in front of a triangle
     is_facing = np.einsum("ij,ij->i", normals, eye + radius_m * normals - first) > 0.0
     is_candidate = objects.body_of_triangle == 2
-    axis = np.array([0.0, 0.0, -1.0])
-    result, exact = objects.in_cone(eye, axis, 1e-2, radius_m), objects.in_cone(eye, axis, 1e-2)
+    result = objects.in_cone(eye, np.array([0.0, 0.0, -1.0]), 1e-2, radius_m)
     np.testing.assert_array_equal(result[is_candidate[result]], np.flatnonzero(is_facing & is_candidate))
-    assert set(exact) < set(result)
+    assert is_facing[result].all()
+    assert 20 < np.count_nonzero(is_facing & is_candidate) < 80
+    # bodies that are tens of metres from the axis are not in the cone
+    assert not np.isin(objects.body_of_triangle[result], (0, 1)).all()
 
 
 @given(finest=st.floats(0.5, 20.0), stretch=st.floats(1.01, 1000.0), count=st.integers(8, 200).map(lambda n: 2 * n + 1))

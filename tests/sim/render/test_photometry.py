@@ -41,14 +41,14 @@ def _make_fisheye_camera() -> Cahvore:
 
 
 @pytest.mark.parametrize("is_fisheye", [False, True])
-def test_opposition_peak_is_at_the_antisolar_point(renderer: Renderer, flat: Surface, is_fisheye: bool) -> None:
+def test_opposition_peak_is_at_the_antisolar_point(renderer: Renderer, is_fisheye: bool) -> None:
     """The centroid of the peak is within half a pixel of the antisolar point."""
     camera = _make_fisheye_camera() if is_fisheye else descent_camera(512)
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
     pose = rigid(Rotation.from_euler("zx", [40.0, 8.0], degrees=True), np.array([0.0, 0.0, 800.0]))
     for antisolar_pixel in np.array([[150.3, 201.8], [330.6, 255.1]]):
         _, ray = camera.transform(pose).rays(antisolar_pixel)
-        frame = renderer.render(Scene(flat, (0.0, 0.0), Sun(-ray), law), PixelRays.from_camera(camera), pose)
+        frame = renderer.render(Scene(FLAT, (0.0, 0.0), Sun(-ray), law), PixelRays.from_camera(camera), pose)
         radiance = frame.radiance.astype(np.float64)
         weight = np.clip(radiance - radiance.max() + 0.1 * np.ptp(radiance), 0.0, None)
         v, u = np.mgrid[:512, :512]

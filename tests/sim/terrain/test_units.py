@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
@@ -162,14 +161,6 @@ def test_rock_forms_have_the_specified_fractions() -> None:
     assert ratio[is_slab].mean() == pytest.approx(0.35 * ratio[~is_slab].mean(), rel=0.05)
     assert rocks.albedo.mean() == pytest.approx(1.0, abs=0.02)
     assert np.log(rocks.albedo).std() == pytest.approx(0.3, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    "changes", [{"kinds": []}, {"elongation": 0.5}, {"kinds": [{"name": "plain", "fraction": 2.0}]}, {"boundary": 0.0}]
-)
-def test_invalid_units_are_rejected(changes: dict[str, Any]) -> None:
-    with pytest.raises(ValidationError):
-        _make_units(**changes)
 
 
 #: Spacing (m), samples per side and albedo of the ground; diameter, height and coordinates of the rock's centre, m.
