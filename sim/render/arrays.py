@@ -104,7 +104,7 @@ def to_host(values: Values) -> NDArray[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class PeriodicGrid:
     """A periodic grid of numbers, whose side is a power of two; y increases with the row."""
 
     values: Values
@@ -112,7 +112,7 @@ class Grid:
     per_metre: Values
 
     @classmethod
-    def of(cls, values: np.ndarray, per_metre: float, *, share: bool = False) -> Grid:
+    def of(cls, values: np.ndarray, per_metre: float, *, share: bool = False) -> PeriodicGrid:
         """Copy a grid, shape (side, side), to the device."""
         kind = UInt8 if values.dtype == np.uint8 else Float
         side = len(values)

@@ -14,7 +14,7 @@ from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
 from marsyard.sim.parameters import Parameters
-from marsyard.sim.render.arrays import Grid, Values, larger
+from marsyard.sim.render.arrays import PeriodicGrid, Values, larger
 from marsyard.sim.render.device import Float, Float64
 from marsyard.sim.render.sky import Sun
 
@@ -61,7 +61,7 @@ class CloudParameters(Parameters):
 class Clouds:
     """Clouds in a thin layer: cover on a periodic grid, height, displacement to east and north, metres, and opacity."""
 
-    cover: Grid
+    cover: PeriodicGrid
     height: Values
     east: Values
     north: Values
@@ -137,8 +137,8 @@ class CloudLayer:
         return Clouds(self._cover_grid, height, east, north, 1.0 - transmittance)
 
     @cached_property
-    def _cover_grid(self) -> Grid:
-        return Grid.of(self.cover, 1.0 / self.cell_m)
+    def _cover_grid(self) -> PeriodicGrid:
+        return PeriodicGrid.of(self.cover, 1.0 / self.cell_m)
 
     def transmittance(
         self, points: FloatArray[np.ndarray, "*batch 3"], sun: Sun, time_s: float

@@ -8,7 +8,7 @@ import cv2
 import drjit as dr
 import numpy as np
 
-from marsyard.sim.render.arrays import Grid, Values, clip, larger, smaller
+from marsyard.sim.render.arrays import PeriodicGrid, Values, clip, larger, smaller
 from marsyard.sim.render.cones import Bounds
 from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.kernels import CASTER_UNIT_ROWS, sweep_shadow
@@ -71,8 +71,8 @@ class GroundShadow:
     - max_height: upper bound of the ground's height, metres
     """
 
-    height: Grid
-    caster_distance: Grid
+    height: PeriodicGrid
+    caster_distance: PeriodicGrid
     along_x: bool
     spacing: Values
     level: Values
@@ -132,8 +132,8 @@ def compute_ground_shadow(
     shadow_height, caster_distance = (empty_aligned(height.shape, kind) for kind in (np.float32, np.uint8))
     sweep_shadow(height, float(np.sign(along)), drop, shift, max_rows, shadow_height, caster_distance)
     return GroundShadow(
-        Grid.of(shadow_height, 1.0 / spacing, share=True),
-        Grid.of(caster_distance, 1.0 / spacing, share=True),
+        PeriodicGrid.of(shadow_height, 1.0 / spacing, share=True),
+        PeriodicGrid.of(caster_distance, 1.0 / spacing, share=True),
         along_x,
         Float64(spacing),
         UInt32(level),

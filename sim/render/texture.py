@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from jaxtyping import Float64 as Float64Array
 from scipy.special import gamma, kv
 
-from marsyard.sim.render.arrays import Grid, Values, larger, smaller, to_device
+from marsyard.sim.render.arrays import PeriodicGrid, Values, larger, smaller, to_device
 from marsyard.sim.render.device import Float, Float64, UInt32
 from marsyard.sim.render.noise import noise_in_plane, noise_in_space
 from marsyard.sim.terrain.surface import ROUGHNESS, TEXTURE
@@ -129,15 +129,15 @@ class RoughGround:
 
     octaves: Octaves
     variance_from: Values
-    roughness: Grid
-    texture: Grid
+    roughness: PeriodicGrid
+    texture: PeriodicGrid
 
     @classmethod
     def of(cls, relief: MicroRelief) -> RoughGround | None:
         """Copy micro-relief to the device; None without octaves."""
         if len(relief.heights) == 0:
             return None
-        roughness, texture = (Grid.of(relief.factors[..., k], relief.per_metre) for k in (ROUGHNESS, TEXTURE))
+        roughness, texture = (PeriodicGrid.of(relief.factors[..., k], relief.per_metre) for k in (ROUGHNESS, TEXTURE))
         gains = relief.heights / (relief.coarsest * 0.5 ** np.arange(len(relief.heights)))
         variance_from = SLOPE_VARIANCE * np.cumsum([0.0, *gains[::-1] ** 2])[::-1]
         octaves = Octaves.of(relief.coarsest, relief.heights)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from marsyard.sim.terrain import TerrainParameters, synthesise
 from marsyard.sim.terrain.landforms.craters import (
     CLUSTER_RADIUS_M,
+    CRATER,
     DARK_EJECTA,
     DEGRADED_DEPTH,
     EJECTA_EXTENT_RADII,
@@ -23,6 +24,7 @@ from marsyard.sim.terrain.landforms.craters import (
     OUTLINE_RMS,
     SECONDARY_FRACTION,
     add_craters,
+    crater_rows,
     draw_craters,
     outline_tables,
 )
@@ -38,11 +40,10 @@ from marsyard.sim.terrain.landforms.kernels.shapes import (
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.surface import TEXTURE
 
-#: Columns of `stamp_craters` in their order, with the values of a bare bowl whose albedo does not wear.
-COLUMNS = {
-    "x": 64.0, "y": 64.0, "radius": 30.0, "depth": 3.0, "rim": 0.3, "rounding": 1.0, "filled": 0.0, "ejecta": 0.0,
-    "sand": 0.0, "sand_radius": 1.0, "lee_x": 0.0, "lee_y": 0.0, "outline": 0.0, "rotation": 0.0,
-    "extent": EJECTA_EXTENT_RADII, "opacity": EJECTA_OPACITY, "margin": FILL_MARGIN, "core": 0.0,
+#: Values of a bare bowl whose albedo does not wear; those of the other columns are 0.
+BOWL = {
+    "x": 64.0, "y": 64.0, "radius": 30.0, "depth": 3.0, "rim": 0.3, "rounding": 1.0, "fill_radius": 1.0,
+    "extent": EJECTA_EXTENT_RADII, "opacity": EJECTA_OPACITY, "margin": FILL_MARGIN,
 }  # fmt: skip
 #: Tables of a round outline without rays.
 ROUND = (np.zeros((1, 4)), np.zeros((1, 4)))
@@ -56,20 +57,24 @@ WORN = TerrainParameters(
 )
 
 
-def _row(**columns: Any) -> np.ndarray:
-    return np.array([list((COLUMNS | columns).values())])
+def _crater(**columns: float) -> np.ndarray:
+    """Return a table of one crater."""
+    crater = np.zeros(1, dtype=CRATER)
+    for name, value in (BOWL | columns).items():
+        crater[name] = value
+    return crater
 
 
 def _stamp(side: int, tables: tuple[np.ndarray, np.ndarray] = ROUND, **columns: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the height and the log albedo of level ground with one crater, on samples 1 m apart."""
     height, log_albedo = np.zeros((2, side, side), dtype=np.float32)
-    stamp_craters(height, log_albedo, 1.0, _row(**columns), *tables)
+    stamp_craters(height, log_albedo, 1.0, crater_rows(_crater(**columns)), *tables)
     return height, log_albedo
 
 
 def test_crater_depths_range_from_degraded_to_fresh() -> None:
     craters = draw_craters(TerrainParameters(craters_per_km2=100.0), np.random.default_rng(3))
-    depth_ratio = (craters[:, 3] + craters[:, 4]) / (2.0 * craters[:, 2])
+    depth_ratio = (craters["depth"] + craters["rim"]) / (2.0 * craters["radius"])
     assert depth_ratio.min() == pytest.approx(DEGRADED_DEPTH, rel=0.02)
     assert depth_ratio.max() == pytest.approx(FRESH_DEPTH, rel=0.02)
 
@@ -78,8 +83,8 @@ def test_large_craters_are_fresher_than_those_in_saturation() -> None:
     """Diffusion time in units of the squared diameter: uniform below the knee, up to a quarter at twice the knee."""
     p = TerrainParameters(craters_per_km2=300.0, crater_knee_m=40.0, crater_exponent=1.83)
     craters = draw_craters(p, np.random.default_rng(3))
-    diameter = 2.0 * craters[:, 2]
-    ratio = (craters[:, 3] + craters[:, 4]) / diameter
+    diameter = 2.0 * craters["radius"]
+    ratio = (craters["depth"] + craters["rim"]) / diameter
     oldest = FRESH_DEPTH / DEGRADED_DEPTH - 1.0
     assert np.median(ratio[diameter < 40.0]) == pytest.approx(FRESH_DEPTH / (1.0 + 0.5 * oldest), rel=0.05)
     assert ratio[diameter > 80.0].min() >= FRESH_DEPTH / (1.0 + 0.25 * oldest)
@@ -89,7 +94,7 @@ def test_crater_sizes_follow_saturation_and_production() -> None:
     """Cumulative numbers vary as D**-1.83 below the knee (saturation) and as D**-3.2 above it (production)."""
     sizes: dict[str, Any] = {"crater_diameter_min_m": 8.0, "crater_diameter_max_m": 2000.0, "crater_exponent": 1.83}
     parameters = TerrainParameters(samples=4096, spacing_m=3.0, craters_per_km2=600.0, crater_knee_m=60.0, **sizes)
-    diameters = 2.0 * draw_craters(parameters, np.random.default_rng(5))[:, 2]
+    diameters = 2.0 * draw_craters(parameters, np.random.default_rng(5))["radius"]
     expected = 600.0 * (4096 * 0.003) ** 2
     assert diameters.size == pytest.approx(expected, abs=4 * np.sqrt(expected))
     assert np.all(np.diff(diameters) <= 0.0)
@@ -110,10 +115,10 @@ def test_unordered_crater_sizes_are_rejected() -> None:
 def test_large_craters_are_equal_on_a_coarser_grid() -> None:
     """A crater with a radius of 150 samples, on a grid of every fourth sample: equal within 2 % of its depth."""
     columns = {"x": 200.0, "y": 260.0, "radius": 150.0, "depth": 24.0, "rim": 6.0, "rounding": 2.4}
-    columns |= {"ejecta": 0.1, "sand": -0.3, "sand_radius": 0.8}
+    columns |= {"ejecta_log_albedo": 0.1, "fill_log_albedo": -0.3, "fill_radius": 0.8}
     height, log_albedo = _stamp(512, outline_tables(), **columns)
     ground = TerrainGround(np.zeros_like(height), np.zeros_like(height), 1.0)
-    add_craters(ground, _row(**columns))
+    add_craters(ground, _crater(**columns))
     # the B-spline of the coarser grid smooths the crest over a sample
     assert np.sqrt(np.mean((ground.height - height) ** 2)) < 0.01 * 24.0
     assert np.abs(ground.height - height).max() < 0.05 * 24.0
@@ -143,7 +148,7 @@ def test_outlines_have_a_power_law_of_waves() -> None:
 
 def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
     # a crater with a sharp rim, centred on the corner of the grid
-    grids = _stamp(256, x=0.0, y=0.0, radius=20.0, depth=6.4, rim=1.6, rounding=0.0, ejecta=0.1)
+    grids = _stamp(256, x=0.0, y=0.0, radius=20.0, depth=6.4, rim=1.6, rounding=0.0, ejecta_log_albedo=0.1)
     height, log_albedo = (np.roll(grid, (128, 128), axis=(0, 1)) for grid in grids)
     assert height[128, 128] == height.min() == pytest.approx(-6.4)
     assert height[128, 128 + 20] == pytest.approx(1.6)
@@ -155,7 +160,7 @@ def test_fresh_crater_has_depth_rim_and_position_across_border() -> None:
 
 
 def test_filled_crater_has_a_flat_floor_at_its_depth() -> None:
-    height, log_albedo = _stamp(128, filled=0.4)
+    height, log_albedo = _stamp(128, fill=0.4)
     assert height[64, 64] == pytest.approx(-3.0, abs=0.05)
     assert np.ptp(height[64, 56:73]) < 0.15
     assert not log_albedo.any()
@@ -166,8 +171,8 @@ def test_ejecta_have_rays() -> None:
     radius, rim, extent = 12.0, 0.8, 4.0
     # one ray: its strength is linear along the square |x| + |y| = 1, and 1 where x = 1; a quarter of a turn from x
     tables = np.zeros((1, 4)), np.array([[1.0, 0.0, -1.0, 0.0]])
-    ejecta = {"ejecta": 0.2, "rotation": 0.25, "extent": extent, "opacity": 2.0}
-    height, log_albedo = _stamp(128, tables, radius=radius, rim=rim, rounding=0.1, filled=0.3, **ejecta)
+    ejecta = {"ejecta_log_albedo": 0.2, "rotation": 0.25, "extent": extent, "opacity": 2.0}
+    height, log_albedo = _stamp(128, tables, radius=radius, rim=rim, rounding=0.1, fill=0.3, **ejecta)
     y, x = np.mgrid[:128, :128] - 64.0
     r = np.hypot(x, y) / radius
     is_ejecta = (r > 1.1) & (r < extent)
@@ -182,7 +187,7 @@ def test_ejecta_have_rays() -> None:
 
 def test_sand_in_a_crater_has_the_specified_albedo_and_margin() -> None:
     """The sand ends at its radius, and is thicker downwind, which is along x."""
-    _, log_albedo = _stamp(128, sand=-0.5, sand_radius=0.8, lee_x=0.3)
+    _, log_albedo = _stamp(128, fill_log_albedo=-0.5, fill_radius=0.8, lee_x=0.3)
     assert log_albedo[64, 64] == pytest.approx(-0.5)
     assert log_albedo[64, 64 + 12] == pytest.approx(-0.5 * (1.0 + 0.3 * 0.4))
     assert log_albedo[64, 64 - 12] == pytest.approx(-0.5 * (1.0 - 0.3 * 0.4))
@@ -213,7 +218,7 @@ def test_wind_tails_lie_downwind_of_their_craters() -> None:
 def test_small_craters_have_less_sand_and_fainter_ejecta() -> None:
     p = TerrainParameters(crater_sand_fraction=0.8, crater_sand_log_albedo=-0.6, craters_per_km2=400.0)
     craters = draw_craters(p, np.random.default_rng(5))
-    diameter, ejecta, sand = 2.0 * craters[:, 2], craters[:, 7], craters[:, 8]
+    diameter, ejecta, sand = 2.0 * craters["radius"], craters["ejecta_log_albedo"], craters["fill_log_albedo"]
     large, small = diameter > FULL_CONTRAST_M, diameter < 0.25 * FULL_CONTRAST_M
     assert np.mean(sand[large] < -0.25) == pytest.approx(0.8, abs=0.06)
     assert np.mean(sand[small] < -0.25) == pytest.approx(0.8 * np.mean(diameter[small]) / FULL_CONTRAST_M, abs=0.02)
@@ -225,18 +230,18 @@ def test_small_craters_have_less_sand_and_fainter_ejecta() -> None:
 def test_sand_and_ejecta_fade_as_craters_wear() -> None:
     """Columns of `stamp_craters`; the depth below the rim is 0.4 radii for a fresh crater."""
     craters = draw_craters(WORN, np.random.default_rng(1))
-    diameter, freshness = 2.0 * craters[:, 2], (craters[:, 3] + craters[:, 4]) / craters[:, 2] / 0.4
-    assert (craters[:, 7] >= 0.0).all()
+    diameter, freshness = 2.0 * craters["radius"], (craters["depth"] + craters["rim"]) / craters["radius"] / 0.4
+    assert (craters["ejecta_log_albedo"] >= 0.0).all()
     # without the random factor of 0.7 to 1.3, at the size with the full contrast
     middle = (diameter > FULL_CONTRAST_M) & (diameter < 2.0 * FULL_CONTRAST_M)
-    ratio = craters[middle, 8] / freshness[middle] / -0.8
+    ratio = craters["fill_log_albedo"][middle] / freshness[middle] / -0.8
     assert ratio.min() >= 0.7 - 1e-9
     assert ratio.max() <= 1.3 + 1e-9
     # optical depth 3 of fresh ejecta
-    assert_allclose(craters[:, 15], 3.0 * freshness**1.5, rtol=1e-6)
-    assert craters[:, 14].min() >= 1.6
+    assert_allclose(craters["opacity"], 3.0 * freshness**1.5, rtol=1e-6)
+    assert craters["extent"].min() >= 1.6
     # the fill's border is 1.5 m wide in fresh craters, and up to 12 m wider in worn ones
-    margin_m, worn = craters[middle, 16] * craters[middle, 2], 1.0 - freshness[middle]
+    margin_m, worn = craters["margin"][middle] * craters["radius"][middle], 1.0 - freshness[middle]
     assert (margin_m >= 1.5 + 12.0 * 0.3 * worn - 1e-9).all()
     assert (margin_m <= 1.5 + 12.0 * worn + 1e-9).all()
 
@@ -245,8 +250,11 @@ def test_small_craters_gather_in_clusters() -> None:
     """Near a small crater are more small craters than near a large one."""
     craters = draw_craters(WORN, np.random.default_rng(1))
     period = WORN.samples * WORN.spacing_m
-    small = craters[2.0 * craters[:, 2] < LARGEST_SECONDARY_M, :2] % period
-    large = craters[2.0 * craters[:, 2] >= LARGEST_SECONDARY_M, :2] % period
+    positions, is_small = (
+        np.stack([craters["x"], craters["y"]], axis=1) % period,
+        2.0 * craters["radius"] < LARGEST_SECONDARY_M,
+    )
+    small, large = positions[is_small], positions[~is_small]
     tree = cKDTree(small, boxsize=np.full(2, period))
     radius = 2.0 * CLUSTER_RADIUS_M
     near_small = np.mean(tree.query_ball_point(small, radius, return_length=True)) - 1.0
@@ -263,8 +271,8 @@ def test_deposit_in_the_middle_has_ridges_and_less_sand() -> None:
         "radius": 60.0,
         "depth": 6.0,
         "rim": 1.0,
-        "filled": 0.4,
-        "sand": -0.5,
+        "fill": 0.4,
+        "fill_log_albedo": -0.5,
     }
     columns |= {"lee_x": 0.05, "margin": 0.1}
     (height, bright), (flat, dark) = (_stamp(256, **columns, core=core) for core in (0.8, 1e-9))
@@ -289,10 +297,10 @@ def test_unit_surrounds_craters_and_lies_downwind(preference: float) -> None:
     height, log_albedo = np.zeros((2, 1024, 1024), dtype=np.float32)
     ground = TerrainGround(height, log_albedo, 2.0)
     # 16 craters of 40 m radius, every 512 m: 64 samples of the factors
-    crater = np.zeros((16, 18))
-    crater[:, :2] = np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) * 512.0 + 256.0
-    crater[:, 2:7] = 40.0, 14.0, 2.0, 1.0, 0.0
-    factors = units.apply(ground, crater, np.random.default_rng(2))
+    craters = np.zeros(16, dtype=CRATER)
+    craters["x"], craters["y"] = 512.0 * np.mgrid[:4, :4].reshape(2, -1) + 256.0
+    craters["radius"], craters["depth"], craters["rim"], craters["rounding"] = 40.0, 14.0, 2.0, 1.0
+    factors = units.apply(ground, craters, np.random.default_rng(2))
     dust = (factors[..., TEXTURE] < 0.5).reshape(4, 64, 4, 64).mean(axis=(0, 2))
     # within 32 m of the axis, 64 to 160 m downwind, which is along x; far: 224 m and more to the sides
     excess = dust[28:37, 40:52].mean() - dust[:4].mean()

@@ -17,6 +17,7 @@ from marsyard.sim.terrain import (
     TerrainParameters,
     synthesise,
 )
+from marsyard.sim.terrain.landforms.craters import CRATER
 from marsyard.sim.terrain.landforms.ground import Spectrum, TerrainGround
 from marsyard.sim.terrain.landforms.units import SurfaceUnits
 from marsyard.sim.terrain.rocks.field import RockForms
@@ -33,8 +34,7 @@ KINDS: list[dict[str, Any]] = [
     {"name": "rubble", "fraction": 0.2, "log_albedo": -0.2, "roughness": 2.0, "texture": 1.5, "rocks": 3.0},
 ]
 PLAIN = [{"name": "plain", "fraction": 1.0}]
-#: An empty table of craters; columns: see `stamp_craters`.
-NO_CRATERS = np.empty((0, 18))
+NO_CRATERS = np.empty(0, dtype=CRATER)
 
 
 def _make_units(**changes: Any) -> SurfaceUnits:
