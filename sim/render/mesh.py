@@ -8,6 +8,7 @@ from scipy.optimize import brentq
 from scipy.spatial import ConvexHull
 
 from marsyard.sim.render.kernels import build_mesh, spans_in_hull
+from marsyard.sim.render.scene import Scene
 from marsyard.sim.terrain import Surface
 
 #: Number of terrain levels in a kernel call: kernels are compiled for a fixed number of arrays. A terrain with 2**15
@@ -16,6 +17,8 @@ LEVELS = 12
 #: Coordinates of grid lines, increasing, and first and end cell of each strip between two lines of y.
 Lines = Float64[np.ndarray, "lines"]
 Spans = Int[np.ndarray, "strips 2"]
+Vertices = Float64[np.ndarray, "vertices 3"]
+Faces = UInt32[np.ndarray, "faces 3"]
 
 
 def graded_offsets(half_width_m: float, finest_m: float, count: int) -> Lines:
@@ -49,9 +52,7 @@ def cell_spans_in_hull(x: Lines, y: Lines, points: Float64[np.ndarray, "points 2
     return np.asarray(spans_in_hull(x, y, points[ConvexHull(points).vertices]))
 
 
-def ground_mesh(
-    surface: Surface, x: Lines, y: Lines, spans: Spans | None = None
-) -> tuple[Float64[np.ndarray, "vertices 3"], UInt32[np.ndarray, "faces 3"]]:
+def ground_mesh(surface: Surface, x: Lines, y: Lines, spans: Spans | None = None) -> tuple[Vertices, Faces]:
     """Triangulate spans of cells (by default all) between grid lines at `x` and `y`, world coordinates in metres.
 
     Returns vertices, and the vertex numbers of the faces, counter-clockwise seen from above. To avoid aliasing, each
@@ -66,3 +67,25 @@ def ground_mesh(
     levels = surface.levels + surface.levels[-1:] * (LEVELS - len(surface.levels))
     vertices, faces = build_mesh(levels, surface.spacing_m, x, y, level_of_x, level_of_y, spans)
     return vertices, faces
+
+
+def visible_mesh(
+    scene: Scene, position: Float64[np.ndarray, "3"], directions: Float64[np.ndarray, "rays 3"]
+) -> tuple[Vertices, Faces]:
+    """Triangulate the ground that a camera at a position sees between rays in these directions, unit vectors."""
+    # the visible ground lies between two horizontal planes: a ray ends at the lower one, or at the mesh's border
+    low, high = scene.height_range_m
+    descent_rates = np.minimum(directions[:, 2], -1e-9)
+    plane_z = (low, max(high, position[2]))
+    end_distances = [np.clip((z - position[2]) / descent_rates, 0.0, 2.0 * scene.mesh_half_width_m) for z in plane_z]
+    points = np.concatenate([position[:2] + distance[:, None] * directions[:, :2] for distance in end_distances])
+    # between the rays the border of the visible ground deviates little from a straight line
+    margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
+    corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+    points = (points[:, None] + corners).reshape(-1, 2)
+    offsets = graded_offsets(scene.mesh_half_width_m, scene.mesh_finest_m, scene.mesh_lines)
+    x, y = (
+        lines_between(centre + offsets, first, last)
+        for centre, first, last in zip(scene.centre_m, points.min(axis=0), points.max(axis=0), strict=True)
+    )
+    return ground_mesh(scene.surface, x, y, cell_spans_in_hull(x, y, points))

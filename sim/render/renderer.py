@@ -32,7 +32,7 @@ from marsyard.sim.render.arrays import Values, to_device, to_host
 from marsyard.sim.render.backend import Backend, RenderingError
 from marsyard.sim.render.device import UInt32, description
 from marsyard.sim.render.edges import mark_edges, split_rays, trace_subpixel_rays
-from marsyard.sim.render.mesh import cell_spans_in_hull, graded_offsets, ground_mesh, lines_between
+from marsyard.sim.render.mesh import visible_mesh
 from marsyard.sim.render.pixel_rays import VIEW_SIDE_PX, PixelRays
 from marsyard.sim.render.primary import MAX_GRAZING_SINE, Hits, Views, trace_primary_rays
 from marsyard.sim.render.rays import Pose, Rays
@@ -142,13 +142,6 @@ class Renderer:
         radiance, body, range_m = (layer.reshape(rows, columns) for layer in (radiance, body, range_m))
         return Frame(radiance, range_m, body, to_host(image.normal).reshape(rows, columns, 3), world_from_body, rays)
 
-    def close(self) -> None:
-        """Delete the OpenGL contexts."""
-        for view in self._views.values():
-            view.close()
-        self._views.clear()
-        self._last_scene = None
-
     def _view_renderer(self, side_px: int) -> DepthRenderer:
         if side_px not in self._views:
             self._views[side_px] = create_depth_renderer(side_px, self._backend)
@@ -174,27 +167,10 @@ class Renderer:
             dr.flush_malloc_cache()
             if self._scene_count % _TRIM_INTERVAL_SCENES == 0:
                 return_freed_memory()
-        # the visible ground lies between two horizontal planes: a ray ends at the lower one, or at the mesh's border
         columns, rows = rays.size
         probes = np.ix_(np.linspace(0, rows - 1, _PROBES).astype(int), np.linspace(0, columns - 1, _PROBES).astype(int))
         directions = rays.directions.reshape(rows, columns, 3)[probes].reshape(-1, 3) @ rotation.T
-        low, high = scene.height_range_m
-        descent_rates = np.minimum(directions[:, 2], -1e-9)
-        plane_z = (low, max(high, position[2]))
-        end_distances = [
-            np.clip((z - position[2]) / descent_rates, 0.0, 2.0 * scene.mesh_half_width_m) for z in plane_z
-        ]
-        points = np.concatenate([position[:2] + distance[:, None] * directions[:, :2] for distance in end_distances])
-        # between the probe rays the border of the visible ground deviates little from a straight line
-        margin = 0.02 * (points.max(axis=0) - points.min(axis=0)) + 2.0 * scene.mesh_finest_m
-        corners = margin * np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
-        points = (points[:, None] + corners).reshape(-1, 2)
-        offsets = graded_offsets(scene.mesh_half_width_m, scene.mesh_finest_m, scene.mesh_lines)
-        x, y = (
-            lines_between(centre + offsets, first, last)
-            for centre, first, last in zip(scene.centre_m, points.min(axis=0), points.max(axis=0), strict=True)
-        )
-        vertices, faces = ground_mesh(scene.surface, x, y, cell_spans_in_hull(x, y, points))
+        vertices, faces = visible_mesh(scene, position, directions)
         renderer = self._view_renderer(rays.view_side_px)
         renderer.load(vertices, faces, scene.objects.triangles[numbers], numbers)
         images = []
