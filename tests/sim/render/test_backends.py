@@ -208,26 +208,22 @@ def test_too_many_vertices_are_reported(small_renderer: DepthRenderer, monkeypat
     small_renderer.load(*ground, triangle, np.array([0]))
 
 
-def test_second_backend_in_one_process_is_rejected() -> None:
+@pytest.mark.parametrize(
+    ("options", "backend", "message"),
+    [
+        ((), "egl", "already uses OpenGL through osmesa"),
+        pytest.param(("-O",), "osmesa", "without -O", marks=pytest.mark.slow),
+    ],
+)
+def test_second_backend_and_python_without_assertions_are_rejected(
+    options: tuple[str, ...], backend: str, message: str
+) -> None:
     program = (
-        "from marsyard.sim.render.backend import RenderingError\n"
-        "from marsyard.sim.render.renderer import create_depth_renderer\n"
         "import OpenGL\n"
-        "try:\n    create_depth_renderer(64, 'egl')\nexcept RenderingError as error:\n    print(error)\n"
-    )
-    environment = os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
-    run = subprocess.run(
-        [sys.executable, "-c", program], check=True, env=environment, capture_output=True, text=True, timeout=60
-    )
-    assert "already uses OpenGL through osmesa" in run.stdout
-
-
-@pytest.mark.slow
-def test_python_without_assertions_is_rejected() -> None:
-    program = (
         "from marsyard.sim.render.backend import RenderingError\n"
         "from marsyard.sim.render.renderer import create_depth_renderer\n"
-        "try:\n    create_depth_renderer(64, 'osmesa')\nexcept RenderingError as error:\n    print(error)\n"
+        f"try:\n    create_depth_renderer(64, '{backend}')\nexcept RenderingError as error:\n    print(error)\n"
     )
-    run = subprocess.run([sys.executable, "-O", "-c", program], check=True, capture_output=True, text=True, timeout=60)
-    assert "without -O" in run.stdout
+    command, environment = [sys.executable, *options, "-c", program], os.environ | {"PYOPENGL_PLATFORM": "osmesa"}
+    run = subprocess.run(command, check=True, env=environment, capture_output=True, text=True, timeout=60)
+    assert message in run.stdout
