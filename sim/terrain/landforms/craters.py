@@ -178,7 +178,7 @@ def crater_freshness(craters: np.ndarray) -> Float64[np.ndarray, "craters"]:
 
 def crater_rows(craters: np.ndarray) -> Float64[np.ndarray, "craters columns"]:
     """Return a table of craters as rows of numbers for `kernels.stamp_craters`."""
-    return craters.view(np.float64).reshape(craters.size, -1)
+    return craters.view(np.float64).reshape(craters.size, CRATER.itemsize // 8)
 
 
 def add_craters(ground: TerrainGround, craters: np.ndarray) -> None:

@@ -236,6 +236,16 @@ def test_ground_less_steep_than_the_sun_has_no_shadow(terrain: Surface, azimuth_
     assert below.edge_rays == 2
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_slopes_are_bounded_across_the_border_of_the_period(axis: int) -> None:
+    """A ramp of 0.1 m per sample falls back by 6.3 m at the border."""
+    ramp = 0.1 * np.arange(64.0)
+    surface = make_ground(np.broadcast_to(ramp if axis == 0 else ramp[:, None], (64, 64)), 2.0)
+    slopes = slope_bounds(surface, Sun(direction(0.25 * np.pi, np.radians(85.0))))
+    expected = (6.3 / 2.0, 0.0) if axis == 0 else (0.0, 6.3 / 2.0)
+    assert slopes == pytest.approx(expected, rel=1e-6)
+
+
 def test_bounds_contain_all_ground_in_a_cone() -> None:
     """The ground is not below -0.4 m. Random positions are in the cone, most of them near that height."""
     lowest_m = -0.4
