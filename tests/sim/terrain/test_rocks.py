@@ -168,6 +168,7 @@ def test_placed_rock_has_its_name_and_position(ground: Surface, field: RockField
     mesh = field.rock(number)
     body = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert body.is_watertight
+    assert body.volume > 0.0, "faces point outwards"
     # Along the local vertical its height is half its diameter.
     heights_m = (mesh.vertices - field.position_m[number]) @ field.up[number]
     assert heights_m.max() == pytest.approx(0.75)
