@@ -33,7 +33,7 @@ from marsyard.scenarios.systems import Ingested
 from marsyard.scenarios.template import toml_environment
 from marsyard.scenarios.user_tables import format_problems
 from marsyard.sim.camera import CameraModel, LabelFrame, mount_looking_down, read_framed_cameras, read_pds3_product
-from marsyard.sim.camera.pds3_label import is_pds3
+from marsyard.sim.camera.pds3 import is_pds3
 from marsyard.sim.frames import compose
 
 #: Columns of a position.

@@ -56,7 +56,7 @@ from tests.scenarios.test_terrain_files import write_tif
 from tests.sim.camera.test_calibrations import KALIBR, OPENCV
 from tests.sim.camera.test_files import CMOD_TEXT, LABEL
 from tests.sim.camera.test_pds4 import LABEL as PDS4_LABEL
-from tests.sim.sensor.test_datasheet import DATASHEET
+from tests.sim.sensor.test_datasheets import DATASHEET
 
 ROWS: list[dict[str, Any]] = [
     {"case": case, "outcome": "VALID", "answered": True, "velocity_error_m_s": 0.1 * case, "site": "gusev",

@@ -6,8 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from marsyard.sim.sensor.companding import compand, compression_table, expand, expansion_table
-from marsyard.sim.sensor.compression import compress_and_decompress
+from marsyard.sim.sensor.image_coding import (
+    compand,
+    compress_and_decompress,
+    compression_table,
+    expand,
+    expansion_table,
+)
 
 #: Smooth random relief, and its image in counts of 12 bits.
 SCENE = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(256, 384)), (0, 0), 2.0)

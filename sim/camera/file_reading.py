@@ -1,7 +1,9 @@
-"""Camera files: reading of their bytes, error messages, and creation of cameras from the vectors of a model."""
+"""Common parts of the readers of camera files: bytes, XML, errors, and the camera of a model's vectors."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -25,6 +27,17 @@ FORMATS = (
 SUBFRAME = "of a part of the detector or of averaged pixels"
 #: Names of the models; each letter of a name is the name of one of the model's vectors.
 MODELS = ("CAHV", "CAHVOR", "CAHVORE")
+#: Names of which a CSM ISD (image support data in JSON) contains at least one.
+_ISD_NAMES = (
+    b'"name_model"', b'"m_modelName"', b'"isis_camera_version"', b'"name_sensor"', b"USGS_ASTRO", b'"image_lines"',
+    b'"detector_sample_summing"', b'"center_ephemeris_time"', b'"body_rotation"',
+)  # fmt: skip
+#: Root elements of XML files that are not read.
+_FOREIGN_ROOTS = {"document": "a Metashape project", "calibration": "a Metashape calibration", "isd": "a CSM ISD"}
+#: Start of an XML file, and the first element: an optional declaration, comments, and a name with an optional prefix.
+_XML_START = re.compile(rb"\A(\xef\xbb\xbf)?\s*<(\?xml|!--|!DOCTYPE|[A-Za-z_][\w:.-]*[\s>/])")
+_XML_ROOT = re.compile(rb"<(?:[A-Za-z_][\w.-]*:)?(?P<root>[A-Za-z_][\w.-]*)")
+_XML_PROLOGUE = re.compile(rb"<\?.*?\?>|<!--.*?-->", re.DOTALL)
 
 
 class CameraFileError(ValueError):
@@ -58,6 +71,41 @@ class Source:
         if not first_bytes:
             raise self.error("file", "is empty (0 bytes)", "a camera file")
         return first_bytes
+
+
+def is_xml(head: bytes) -> bool:
+    """Return whether the first bytes of a file are XML."""
+    return _XML_START.match(head) is not None
+
+
+def xml_root(head: bytes) -> str:
+    """Return the name of the first element in the first bytes of an XML file; empty if there is none."""
+    match = _XML_ROOT.search(_XML_PROLOGUE.sub(b"", head))
+    return "" if match is None else match["root"].decode()
+
+
+def parse_xml(source: Source, allowed: str) -> ElementTree.Element:
+    """Parse an XML file. Raises CameraFileError; `allowed` describes the file."""
+    text = source.read_text()
+    if "<!ENTITY" in text:  # camera files do not need entities, and nested entities can fill the memory
+        raise source.error("label", "declares entities", f"{allowed}, which has none")
+    try:
+        return ElementTree.fromstring(text.encode("latin-1"))  # noqa: S314  (entities are refused above)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise source.error("label", f"cannot be parsed ({error})", f"{allowed}, which is XML") from error
+
+
+def refuse_foreign(source: Source, head: bytes) -> None:
+    """Raise CameraFileError for a known format that is not read; the message lists the supported ones."""
+    name = None
+    if head.startswith(b"LBLSIZE="):
+        name = "a VICAR file without a PDS label"
+    elif is_xml(head):
+        name = _FOREIGN_ROOTS.get(xml_root(head))
+    elif head.lstrip().startswith(b"{") and any(name in head for name in _ISD_NAMES):
+        name = "a CSM ISD"
+    if name is not None:
+        raise source.error("file", f"is {name}, which is not supported", FORMATS)
 
 
 def linearity_of_type(kind: Number | None, parameter: float | None, field: str, source: Source) -> float:
