@@ -33,8 +33,7 @@ def nightly(
     from marsyard.cli import nightly_run
     from marsyard.cli.nightly_plan import PLAN_FILE, read_plan
     from marsyard.cli.progress import campaign_progress
-    from marsyard.reports.history import FINISHED, INTERRUPTED, History, list_comparisons
-    from marsyard.reports.history_changes import find_changes
+    from marsyard.reports.nightly import FINISHED, INTERRUPTED, History, find_changes, list_comparisons
 
     path = plan or PLAN_FILE
     plan_definition, executor = read_plan(path), make_executor(jobs, None)

@@ -48,7 +48,7 @@ def replay(
     from marsyard.campaigns.store.packed_products import pack_products, replace_files, unpack_products, write_packed
     from marsyard.campaigns.store.products import case_directory
     from marsyard.campaigns.store.stages import write_stages
-    from marsyard.reports.case_views import write_case_figures
+    from marsyard.reports.presentation import write_case_figures
 
     exports = list_exports(rerun, glb, rosbag)
     if trust:

@@ -19,7 +19,7 @@ from marsyard.cli.terrain_image import write_terrain_image
 if TYPE_CHECKING:
     from marsyard.sim.terrain.imported import RealExtent
     from marsyard.sim.terrain.parameters import TerrainParameters
-    from marsyard.sim.terrain.surface import TerrainStatistics
+    from marsyard.sim.terrain.statistics import TerrainStatistics
 
 
 app = typer.Typer(no_args_is_help=True, help="List sites and print statistics of their terrain.")
@@ -68,10 +68,9 @@ def stats(
     import numpy as np
 
     from marsyard.scenarios.terrain_files import MAX_HOLE_FRACTION, grid_north_deg, load_site
-    from marsyard.sim.terrain.bank import synthesise
     from marsyard.sim.terrain.imported import embed
-    from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
-    from marsyard.sim.terrain.surface import terrain_statistics
+    from marsyard.sim.terrain.statistics import PUBLISHED_SITES, terrain_statistics
+    from marsyard.sim.terrain.synthesis import synthesise
 
     try:
         definition = load_site(site, MAX_HOLE_FRACTION if max_holes is None else max_holes)
@@ -117,8 +116,7 @@ def _print_statistics(
 ) -> None:
     from rich.table import Table
 
-    from marsyard.sim.terrain.published_sites import PUBLISHED_SITES
-    from marsyard.sim.terrain.surface import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG
+    from marsyard.sim.terrain.statistics import CONTRAST_PIXEL_M, CONTRAST_SUN_ELEVATION_DEG, PUBLISHED_SITES
 
     side_m, paper = parameters.samples * parameters.spacing_m, PUBLISHED_SITES.get(site)
     albedo, slope, relief, contrast = "", "", "", ""

@@ -22,7 +22,7 @@ def write_terrain_image(path: Path, surface: Surface, dtm: EmbeddedDtm | None) -
     import cv2
     import numpy as np
 
-    from marsyard.sim.terrain.surface import CONTRAST_SUN_ELEVATION_DEG, render_nadir_image
+    from marsyard.sim.terrain.statistics import CONTRAST_SUN_ELEVATION_DEG, render_nadir_image
 
     if path.suffix.lower() != ".png":
         raise ValueError(f"--image {path}: the file name must end in .png")

@@ -20,7 +20,7 @@ from marsyard.scenarios.landing.parameters import LandingScenarioParameters
 from marsyard.scenarios.landing.score import motion_row, times_row
 from marsyard.scenarios.landing.simulation import RenderedFlight, measure
 from marsyard.scenarios.landing.touchdown import simulate_touchdown
-from marsyard.scenarios.landing_site import LANDING
+from marsyard.scenarios.landing_task import LANDING
 from marsyard.scenarios.parts.scores import ScoredLanding
 from marsyard.scenarios.terrain_scenario import TerrainScenario
 from marsyard.sim.streams import Streams

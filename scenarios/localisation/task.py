@@ -19,8 +19,8 @@ from marsyard.algorithms.localisation.estimator import MapRelativeEstimator
 from marsyard.algorithms.localisation.exchange import POSITION_FORM, POSITION_STREAM, read_map, write_map
 from marsyard.algorithms.localisation.interface import PositionEstimate, PositionEstimator, PositionOutcome
 from marsyard.algorithms.localisation.options import LvsOptions
-from marsyard.scenarios.answer_tables import AnswerFormat
 from marsyard.scenarios.localisation.measurements import LocalisationMeasurements
+from marsyard.scenarios.offline_algorithms import AnswerFormat
 from marsyard.scenarios.streamed import StreamAnswers
 from marsyard.scenarios.tasks import Task
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from marsyard.algorithms.dimes.binning import binned_size_for
+from marsyard.algorithms.dimes.views import binned_size_for
 from marsyard.algorithms.exchange.files import write_counts
 from marsyard.scenarios.measured import store
 from marsyard.scenarios.measured.image_files import lossy_bits_per_pixel, read_counts, read_flat_field, read_header

@@ -12,7 +12,7 @@ from scipy.spatial.transform import RigidTransform
 
 from marsyard.algorithms.interface import TargetUpdate
 from marsyard.algorithms.vtt import VttDetails
-from marsyard.algorithms.vtt.placement import Placement
+from marsyard.algorithms.vtt.arm import Placement
 from marsyard.scenarios.rover.designation import DesignatedTarget
 from marsyard.scenarios.rover.flight_software import Navigator, TargetEstimate
 from marsyard.scenarios.rover.navigation_cameras import NavigationCameras

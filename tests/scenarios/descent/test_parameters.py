@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from marsyard.algorithms.dimes.binning import binned_size_for
+from marsyard.algorithms.dimes.views import binned_size_for
 from marsyard.scenarios.descent.parameters import DescentScenarioParameters
 from marsyard.scenarios.descent.world import DescentWorld
 from marsyard.sim.terrain import site
