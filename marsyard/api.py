@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from marsyard.campaigns.definition import loading
-from marsyard.campaigns.definition.algorithm_replacement import replace_algorithms
 from marsyard.campaigns.definition.campaign import Campaign as Campaign
 from marsyard.campaigns.errors import CampaignError
 from marsyard.scenarios import systems
@@ -132,7 +131,7 @@ def run(
     if compare and algorithm is None:
         raise CampaignError("compare needs an algorithm under test: the argument 'algorithm'")
     if isinstance(campaign, Campaign):
-        selected = replace_algorithms(campaign, specs)
+        selected = loading.replace_algorithms(campaign, specs)
     else:
         selected = load_campaign(campaign, changes, cases=cases, seed=seed, algorithms=specs)
     run_campaign(selected, folder, jobs=jobs)
@@ -186,8 +185,7 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
     from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.running.engine import run_campaign as run
     from marsyard.cli.outcome import evaluate_and_store
-    from marsyard.cli.progress import campaign_progress
-    from marsyard.cli.run_log import RunLog
+    from marsyard.cli.progress import RunLog, campaign_progress
 
     folder = Path(directory)
     with campaign_progress(Console(stderr=True)) as progress, RunLog(folder, progress) as log:

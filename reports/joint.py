@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from marsyard.campaigns.definition.claims import requirement_key
-from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.claims import Confirmation, requirement_key
 from marsyard.campaigns.definition.evidence import Evidence
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.confirmation_record import (

@@ -10,7 +10,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from marsyard.campaigns.definition.confirmation import Confirmation
+from marsyard.campaigns.definition.claims import Confirmation
 from marsyard.reports.requirement_wording import requirement_text
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import NOTHING, percent

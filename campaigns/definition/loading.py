@@ -78,6 +78,18 @@ def create_campaign(tables: Mapping[str, Any], source: str) -> Campaign:
     return _validate(source, dict(tables), {})
 
 
+def replace_algorithms(campaign: Campaign, algorithms: Sequence[str]) -> Campaign:
+    """Return a campaign with other algorithms: the first is under test, the others are compared.
+
+    Raises DefinitionError if the scenario has no selectable algorithms, or rejects them.
+    """
+    if not algorithms:
+        return campaign
+    source = f"campaign '{campaign.definition.name}'"
+    tables = select_algorithms(campaign.definition.model_dump(mode="json", exclude_none=True), algorithms, source, {})
+    return replace(campaign, definition=create_campaign(tables, source).definition)
+
+
 def _validate(source: str, tables: Mapping[str, Any], options_by_key: Mapping[tuple[str, ...], str]) -> Campaign:
     """Create a campaign from the tables of a file; missing parameters have default values."""
     problems: list[Problem] = []

@@ -20,8 +20,8 @@ from marsyard.campaigns.execution.case_rows import list_draws, make_finished_row
 from marsyard.campaigns.execution.work import Executor, TaskResult, Work, WorkLimits
 from marsyard.campaigns.outcomes import CRASHED, OUT_OF_MEMORY, WorkerExitError
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
-from marsyard.campaigns.store.packed_products import PackedProducts, pack_products
 from marsyard.campaigns.store.product_selection import ProductSelection
+from marsyard.campaigns.store.products import PackedProducts, pack_products
 from marsyard.campaigns.store.rows import Row
 from marsyard.scenarios.systems import scenario
 from marsyard.scenarios.timeline_recording import recording_timelines

@@ -8,17 +8,22 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
-from marsyard.campaigns.definition.calibration_terrains import calibration_overlap, uses_imported_terrain
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.claims import (
+    Confirmation,
     bank_seeds,
     confirmation_bank_seeds,
     confirmation_seed,
     freeze_algorithm,
     requirement_key,
 )
-from marsyard.campaigns.definition.confirmation import Confirmation
-from marsyard.campaigns.definition.evidence import Evidence, EvidenceKind, classify_evidence
+from marsyard.campaigns.definition.evidence import (
+    Evidence,
+    EvidenceKind,
+    calibration_overlap,
+    classify_evidence,
+    uses_imported_terrain,
+)
 from marsyard.campaigns.definition.parameter_paths import find_value, replace_values
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store.confirmation_record import ConfirmationRecord, find_own_entry, parse_record, read_record

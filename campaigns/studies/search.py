@@ -8,21 +8,26 @@
    same random streams.
 4. Violations that are close to a reduced one in its remaining dispersions have the same cause. Step 3 is repeated with
    the other violations.
+
+`write_regression_campaigns` writes the reduced violations as campaigns.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cma
 import numpy as np
+import tomli_w
 from scipy.special import ndtri
 from scipy.stats import qmc
 
 from marsyard.campaigns.definition.campaign import Campaign
 from marsyard.campaigns.definition.campaign_file import Requirement
 from marsyard.campaigns.definition.margins import compute_margin, describe_margin
+from marsyard.campaigns.errors import report_write_errors
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
@@ -281,3 +286,43 @@ def _replace_infinite(margins: np.ndarray) -> np.ndarray:
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     width = max(high - low, 1.0)
     return np.asarray(np.clip(margins, low - width, high + width))
+
+
+def write_regression_campaigns(campaign: Campaign, result: SearchResult, directory: Path) -> list[Path]:
+    """Write one campaign file per reduced violation into DIR/failures, and a plan of nightly runs with all of them.
+
+    Each file has the parameters of the reduced case, no dispersions, and new random streams for each of its cases.
+    """
+    folder, paths = directory / "failures", list[Path]()
+    definition = campaign.definition
+    requirement = find_requirement(campaign, SEARCH.read_parameters(directory).requirement)
+    with report_write_errors(folder):
+        folder.mkdir(exist_ok=True)
+        for number, failure in enumerate(result.failures, start=1):
+            name = f"{definition.name}-failure-{number}"
+            values_text = ", ".join(f"{path} = {_short_text(value)}" for path, value in failure.values.items())
+            tables = {
+                "name": name,
+                "scenario": definition.scenario,
+                "description": f"Violation of {requirement.id} with {values_text or 'the parameters of the campaign'}.",
+                "cases": max(failure.repetitions, 1),
+                "seed": definition.seed,
+                "parameters": campaign.with_values(failure.values).model_dump(mode="json"),
+                "requirements": [requirement.model_dump(mode="json")],
+            }
+            paths.append(folder / f"{name}.toml")
+            paths[-1].write_text(tomli_w.dumps(_without_none(tables)), encoding="utf-8")
+        plan = {"campaigns": [{"campaign": path.name} for path in paths]}
+        (folder / "nightly.toml").write_text(tomli_w.dumps(plan), encoding="utf-8")
+    return paths
+
+
+def _short_text(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _without_none(value: Any) -> Any:
+    """Remove keys without a value, which TOML cannot represent; they have their default."""
+    if isinstance(value, dict):
+        return {name: _without_none(inner) for name, inner in value.items() if inner is not None}
+    return [_without_none(inner) for inner in value] if isinstance(value, list | tuple) else value

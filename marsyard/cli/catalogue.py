@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 from typer import Option
 
-from marsyard.cli.console import create_console
 from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.options import CampaignArgument, JsonOption, SetOption
+from marsyard.cli.terminal import create_console
 
 
 @handle_user_errors

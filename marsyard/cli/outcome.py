@@ -15,7 +15,7 @@ from marsyard.campaigns.store import record
 from marsyard.campaigns.store.lock import is_locked
 from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
 from marsyard.cli.errors import Exit
-from marsyard.cli.tables import grid_table
+from marsyard.cli.terminal import grid_table
 from marsyard.reports.campaign import write_evaluation
 from marsyard.reports.column_selection import primary_metric
 from marsyard.reports.comparison import compare_algorithms, comparison_grids

@@ -4,74 +4,51 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from typer import Option
 
 from marsyard.cli import options
 from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, show_progress
-from marsyard.cli.option_classes import with_options
 from marsyard.cli.study_results import finish_robust, finish_search, finish_study
 
-if TYPE_CHECKING:
-    from marsyard.campaigns.definition.campaign import Campaign
-    from marsyard.campaigns.execution.executors import ExecutorConfig
-
 MaxCasesOption = Annotated[int, Option(metavar="N", min=100, help="Maximum number of cases of the study.")]
+RequirementOption = Annotated[str, Option(metavar="ID", help="Requirement of the campaign that is analysed.")]
+StudyAlgorithmOption = Annotated[
+    list[str] | None,
+    Option(
+        "--algorithm",
+        metavar="NAME",
+        help="The algorithm that the study analyses: a name, module:Class, exec:PROGRAM (started per case) or "
+        "serve:PROGRAM (one process for all cases). Further algorithms run on the same cases; their results are "
+        "stored, but do not influence the study.",
+    ),
+]
 
 
-@dataclass(frozen=True, kw_only=True)
-class StudyOptions:
-    """Arguments and options of all studies."""
-
-    campaign: options.CampaignArgument
-    requirement: Annotated[str, Option(metavar="ID", help="Requirement of the campaign that is analysed.")]
-    seed: options.SeedOption = None
-    jobs: options.JobsOption = None
-    cluster: options.ClusterOption = None
-    out: options.OutOption = None
-    override: options.SetOption = None
-    algorithm: Annotated[
-        list[str] | None,
-        Option(
-            metavar="NAME",
-            help="The algorithm that the study analyses: a name, module:Class, exec:PROGRAM (started per case) or "
-            "serve:PROGRAM (one process for all cases). Further algorithms run on the same cases; their results are "
-            "stored, but do not influence the study.",
-        ),
-    ] = None
-
-
-def prepare_study(arguments: StudyOptions, kind: str) -> tuple[Campaign, ExecutorConfig, Path]:
-    """Return campaign, executor and folder of a study; `kind` is part of the default folder's name."""
-    from marsyard.campaigns.definition.loading import load_campaign
-
-    campaign = load_campaign(
-        arguments.campaign, arguments.override or [], None, arguments.seed, arguments.algorithm or []
-    )
-    default = default_directory(f"{campaign.definition.name}-{kind}")
-    return campaign, make_executor(arguments.jobs, arguments.cluster), arguments.out or default
-
-
-@dataclass(frozen=True, kw_only=True)
-class RareOptions(StudyOptions):
-    """Arguments and options of `marsyard rare`."""
-
+@handle_user_errors
+def rare(
+    campaign: options.CampaignArgument,
+    requirement: RequirementOption,
+    seed: options.SeedOption = None,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    out: options.OutOption = None,
+    override: options.SetOption = None,
+    algorithm: StudyAlgorithmOption = None,
     max_probability: Annotated[
         float, Option(metavar="P", help="Maximum probability of a violation per case, such as 1e-4.")
-    ] = 1e-4
+    ] = 1e-4,
     method: Annotated[
         str,
         Option(
             metavar="METHOD",
             help="`subset`: subset simulation. `importance`: the same, followed by importance sampling.",
         ),
-    ] = "subset"
-    samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200
-    replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6
+    ] = "subset",
+    samples: Annotated[int, Option(metavar="N", help="Cases per level of a subset simulation.")] = 200,
+    replicates: Annotated[int, Option(metavar="N", help="Number of independent subset simulations, at least 2.")] = 6,
     random_cases: Annotated[
         int,
         Option(
@@ -79,46 +56,50 @@ class RareOptions(StudyOptions):
             help="Independent random cases. PASS rests on them and on the first level of each replicate. They do not "
             "count for --max-cases.",
         ),
-    ] = 600
+    ] = 600,
     importance_cases: Annotated[
         int, Option(metavar="N", help="Cases of importance sampling, for --method importance.")
-    ] = 600
+    ] = 600,
     confidence: Annotated[
         float, Option(metavar="C", help="Two-sided confidence: PASS and FAIL are each wrong at most with (1 - C) / 2.")
-    ] = 0.9
-    max_cases: MaxCasesOption = 20_000
-
-
-@handle_user_errors
-@with_options(RareOptions)
-def rare(arguments: RareOptions) -> None:
+    ] = 0.9,
+    max_cases: MaxCasesOption = 20_000,
+) -> None:
     """Compare the probability of a rare violation of a requirement with a limit, by counting and by subset simulation.
 
     Exit status: 0 if the probability is below the limit by counting, 1 if it is above, 3 if undecided.
     """
+    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.rare import start_rare
     from marsyard.campaigns.studies.results import RareParameters
 
     parameters = RareParameters(
-        requirement=arguments.requirement,
-        max_probability=arguments.max_probability,
-        method=arguments.method,
-        samples=arguments.samples,
-        replicates=(arguments.replicates,),
-        random_cases=(arguments.random_cases,),
-        importance_cases=arguments.importance_cases,
-        confidence=arguments.confidence,
+        requirement=requirement,
+        max_probability=max_probability,
+        method=method,
+        samples=samples,
+        replicates=(replicates,),
+        random_cases=(random_cases,),
+        importance_cases=importance_cases,
+        confidence=confidence,
     )
-    campaign, executor, directory = prepare_study(arguments, "rare")
+    studied = load_campaign(campaign, override or [], None, seed, algorithm or [])
+    executor, directory = make_executor(jobs, cluster), out or default_directory(f"{studied.definition.name}-rare")
     with show_progress(directory) as progress:
-        result = start_rare(campaign, parameters, arguments.max_cases, directory, executor, progress)
+        result = start_rare(studied, parameters, max_cases, directory, executor, progress)
     finish_study(directory, result.exit_code)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SearchOptions(StudyOptions):
-    """Arguments and options of `marsyard search`."""
-
+@handle_user_errors
+def search(
+    campaign: options.CampaignArgument,
+    requirement: RequirementOption,
+    seed: options.SeedOption = None,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    out: options.OutOption = None,
+    override: options.SetOption = None,
+    algorithm: StudyAlgorithmOption = None,
     cases: Annotated[
         int,
         Option(
@@ -127,45 +108,44 @@ class SearchOptions(StudyOptions):
             metavar="N",
             help="Cases of the search; the reduction of each violation takes further cases.",
         ),
-    ] = 300
+    ] = 300,
     restarts: Annotated[
         int, Option(metavar="N", help="Number of optimizer (CMA-ES) runs from different starting cases.")
-    ] = 3
+    ] = 3,
     failures: Annotated[
         int, Option(metavar="N", help="Maximum number of violations whose causes are reduced to a few parameters.")
-    ] = 5
-    max_cases: MaxCasesOption = 5_000
-
-
-@handle_user_errors
-@with_options(SearchOptions)
-def search(arguments: SearchOptions) -> None:
+    ] = 5,
+    max_cases: MaxCasesOption = 5_000,
+) -> None:
     """Search for violations of a requirement, and reduce each to the few parameters that cause it.
 
     Exit status: 1 if violations are found, otherwise 0.
     """
+    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.results import SearchParameters
     from marsyard.campaigns.studies.search import start_search
 
-    parameters = SearchParameters(
-        requirement=arguments.requirement,
-        cases=arguments.cases,
-        restarts=arguments.restarts,
-        max_failures=arguments.failures,
-    )
-    campaign, executor, directory = prepare_study(arguments, "search")
+    parameters = SearchParameters(requirement=requirement, cases=cases, restarts=restarts, max_failures=failures)
+    studied = load_campaign(campaign, override or [], None, seed, algorithm or [])
+    executor, directory = make_executor(jobs, cluster), out or default_directory(f"{studied.definition.name}-search")
     with show_progress(directory) as progress:
-        result = start_search(campaign, parameters, arguments.max_cases, directory, executor, progress)
+        result = start_search(studied, parameters, max_cases, directory, executor, progress)
     finish_search(directory, result)
 
 
-@dataclass(frozen=True, kw_only=True)
-class BudgetOptions(StudyOptions):
-    """Arguments and options of `marsyard budget`."""
-
+@handle_user_errors
+def budget(
+    campaign: options.CampaignArgument,
+    requirement: RequirementOption,
+    seed: options.SeedOption = None,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+    out: options.OutOption = None,
+    override: options.SetOption = None,
+    algorithm: StudyAlgorithmOption = None,
     cases: Annotated[
         int, Option("-n", "--cases", metavar="N", help="Base cases. Each runs 2 k + 2 times for k sources of error.")
-    ] = 100
+    ] = 100,
     sobol: Annotated[
         int,
         Option(
@@ -173,55 +153,45 @@ class BudgetOptions(StudyOptions):
             help="Base samples for Sobol indices of d dispersions and the random streams, a power of 2: N (d + 3) "
             "more cases. 0: none.",
         ),
-    ] = 0
-    confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9
-
-
-@handle_user_errors
-@with_options(BudgetOptions)
-def budget(arguments: BudgetOptions) -> None:
+    ] = 0,
+    confidence: Annotated[float, Option(metavar="C", help="Two-sided confidence of the intervals.")] = 0.9,
+) -> None:
     """Compute the error budget: run the same cases without each source of error, and with each one alone.
 
     Sources of error are those of the scenario, such as attitude, altitude or detector noise (docs/error-budget.md).
     """
+    from marsyard.campaigns.definition.loading import load_campaign
     from marsyard.campaigns.studies.budget import start_budget
     from marsyard.campaigns.studies.results import BudgetParameters
 
-    parameters = BudgetParameters(
-        requirement=arguments.requirement, cases=arguments.cases, sobol=arguments.sobol, confidence=arguments.confidence
-    )
-    campaign, executor, directory = prepare_study(arguments, "budget")
+    parameters = BudgetParameters(requirement=requirement, cases=cases, sobol=sobol, confidence=confidence)
+    studied = load_campaign(campaign, override or [], None, seed, algorithm or [])
+    executor, directory = make_executor(jobs, cluster), out or default_directory(f"{studied.definition.name}-budget")
     with show_progress(directory) as progress:
-        result = start_budget(campaign, parameters, directory, executor, progress)
+        result = start_budget(studied, parameters, directory, executor, progress)
     finish_study(directory, result.exit_code)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobustOptions:
-    """Arguments and options of `marsyard robust`."""
-
-    directory: options.DirectoryArgument
+@handle_user_errors
+def robust(
+    directory: options.DirectoryArgument,
     parameter: Annotated[
         list[str] | None,
         Option(
             metavar="PATH=VALUE",
             help="Run cases with other values of a parameter that the campaign does not disperse, up to VALUE.",
         ),
-    ] = None
+    ] = None,
     variant: Annotated[
         list[str] | None,
         Option(metavar="NAME", help="Run cases with an alternative model of the system; `all`: with each of them."),
-    ] = None
+    ] = None,
     cases: Annotated[
         int, Option("-n", "--cases", metavar="N", help="Cases of the run, at least 60, for each value and model.")
-    ] = 100
-    jobs: options.JobsOption = None
-    cluster: options.ClusterOption = None
-
-
-@handle_user_errors
-@with_options(RobustOptions)
-def robust(arguments: RobustOptions) -> None:
+    ] = 100,
+    jobs: options.JobsOption = None,
+    cluster: options.ClusterOption = None,
+) -> None:
     """Show which changes of the assumptions turn PASS into FAIL, from the stored cases of a campaign.
 
     Cases are run only for parameters that the campaign does not disperse, and for other models.
@@ -232,17 +202,17 @@ def robust(arguments: RobustOptions) -> None:
     from marsyard.campaigns.studies.results import ROBUST_FOLDER
     from marsyard.campaigns.studies.robust import start_robust
 
-    run, farthest = arguments.directory, _read_farthest(arguments.parameter or [])
+    run, farthest = directory, _read_farthest(parameter or [])
     available = {item.name: item for item in system_variants(stored_definition(run).scenario)}
-    for name in arguments.variant or ():
+    for name in variant or ():
         if name not in available and name != "all":
             raise CampaignError(f"--variant: {unknown_name_message('variant', name, ['all', *available])}")
-    variants = [item for name, item in available.items() if {name, "all"} & {*(arguments.variant or ())}]
-    if farthest or arguments.variant:
+    variants = [item for name, item in available.items() if {name, "all"} & {*(variant or ())}]
+    if farthest or variant:
         directory = default_directory(ROBUST_FOLDER, run / ROBUST_FOLDER)
-        executor = make_executor(arguments.jobs, arguments.cluster)
+        executor = make_executor(jobs, cluster)
         with show_progress(directory) as progress:
-            start_robust(run, farthest, variants, arguments.cases, directory, executor, progress)
+            start_robust(run, farthest, variants, cases, directory, executor, progress)
     finish_robust(run)
 
 

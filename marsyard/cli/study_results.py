@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import typer
 
-from marsyard.cli.console import create_console
 from marsyard.cli.execution import make_executor, show_progress
+from marsyard.cli.terminal import create_console
 
 if TYPE_CHECKING:
     from marsyard.campaigns.studies.results import SearchResult
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def finish_robust(run: Path) -> NoReturn:
     """Write the report of a run, print its robustness, and exit."""
     from marsyard.cli.outcome import evaluate_and_store
-    from marsyard.cli.tables import grid_table
+    from marsyard.cli.terminal import grid_table
     from marsyard.reports.robustness_section import change_grid, variant_grid
     from marsyard.reports.robustness_sentences import robustness_text
 
@@ -89,10 +89,9 @@ def finish_search(directory: Path, result: SearchResult) -> NoReturn:
     """Store files and images of the reduced violations, write the report, print the result, and exit."""
     from marsyard.campaigns.running.replay import replay
     from marsyard.campaigns.running.stored_campaign import load_stored_campaign
-    from marsyard.campaigns.store.packed_products import save_packed
-    from marsyard.campaigns.store.products import case_directory
+    from marsyard.campaigns.store.products import case_directory, save_packed
     from marsyard.campaigns.store.record import stored_definition
-    from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
+    from marsyard.campaigns.studies.search import write_regression_campaigns
 
     campaign = load_stored_campaign(directory, stored_definition(directory))
     files = write_regression_campaigns(campaign, result, directory)

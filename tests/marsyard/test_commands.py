@@ -23,7 +23,8 @@ WRITING = {
 
 
 def walk_commands(group: TyperGroup, prefix: str = "") -> Iterator[tuple[str, TyperCommand]]:
-    for name, command in group.commands.items():
+    for name in group.list_commands(typer.Context(group)):
+        command = group.get_command(typer.Context(group), name)
         if isinstance(command, TyperGroup):
             yield from walk_commands(command, f"{prefix}{name} ")
         elif isinstance(command, TyperCommand):

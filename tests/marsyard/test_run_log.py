@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from marsyard.cli.run_log import LOG_FILE, RunLog
+from marsyard.cli.progress import LOG_FILE, RunLog
 
 
 class CallRecorder:

@@ -16,10 +16,9 @@ from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
 from marsyard.campaigns.studies.budget import active_sources
 from marsyard.campaigns.studies.counting import count_violations, find_units_needed
 from marsyard.campaigns.studies.point_runner import Candidate
-from marsyard.campaigns.studies.regression_campaigns import write_regression_campaigns
 from marsyard.campaigns.studies.results import SearchParameters
 from marsyard.campaigns.studies.runner import prepare_campaign
-from marsyard.campaigns.studies.search import start_search
+from marsyard.campaigns.studies.search import start_search, write_regression_campaigns
 from marsyard.campaigns.studies.subset import NEW_STREAM
 from marsyard.scenarios.systems import systems
 from tests.campaigns.fake_campaign import REQUIREMENT, RecordingWatch, read_case_rows, write_campaign

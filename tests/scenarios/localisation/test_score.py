@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from marsyard.algorithms.localisation.details import LocalisationDetails
 from marsyard.algorithms.localisation.interface import InitialState, MapProduct, PositionEstimate, PositionOutcome
-from marsyard.campaigns.store.packed_products import pack_products
+from marsyard.campaigns.store.products import pack_products
 from marsyard.scenarios.declared_columns import row_columns
 from marsyard.scenarios.localisation.estimate_errors import EstimateErrors, compute_errors
 from marsyard.scenarios.localisation.fields import SmoothField
