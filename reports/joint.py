@@ -20,7 +20,7 @@ from marsyard.campaigns.store.confirmation_record import (
     list_related_claims,
     read_record,
 )
-from marsyard.campaigns.store.git_registration import UNKNOWN, find_registration_problem
+from marsyard.campaigns.store.git_history import UNKNOWN, find_registration_problem
 from marsyard.reports.case_evidence import RequirementEvidence
 from marsyard.reports.verdicts import Status, Verdict
 from marsyard.reports.wording import count

@@ -66,7 +66,7 @@ def load_campaign(
             command += [option, str(value)]
     for option, values in (("--algorithm", algorithms), ("--set", overrides)):
         command += [word for value in values for word in (option, value)]
-    return replace(_validate(str(path), tables, options_by_key), command=tuple(command))
+    return replace(_validate(str(path), tables, options_by_key), command=tuple(command), file=path)
 
 
 def create_campaign(tables: Mapping[str, Any], source: str) -> Campaign:

@@ -27,8 +27,7 @@ from marsyard.campaigns.definition.evidence import (
 from marsyard.campaigns.definition.parameter_paths import find_value, replace_values
 from marsyard.campaigns.errors import CampaignError, StoreError, report_write_errors
 from marsyard.campaigns.store.confirmation_record import ConfirmationRecord, find_own_entry, parse_record, read_record
-from marsyard.campaigns.store.git_registration import find_campaign_file_problem, find_registration_problem
-from marsyard.campaigns.store.machine import git_commit
+from marsyard.campaigns.store.git_history import find_campaign_file_problem, find_registration_problem, git_commit
 from marsyard.campaigns.store.record import utc_now
 from marsyard.scenarios.interface import HasAlgorithms
 
@@ -96,7 +95,7 @@ def reserve_confirmation(campaign: Campaign, directory: Path) -> Evidence:
     CampaignError if the run repeats an unfinished confirmation with another number of cases.
     """
     path, frozen, definition = campaign.confirmations, freeze_algorithm(campaign), campaign.definition
-    registration = find_registration_problem(path) or find_campaign_file_problem(path, campaign.command)
+    registration = find_registration_problem(path) or find_campaign_file_problem(path, campaign.file)
     with _open_locked(path) as file:
         record = _start_chain(file, path)
         seeds = _derive_seeds(campaign, frozen.claim, record)

@@ -31,7 +31,7 @@ from marsyard.campaigns.errors import report_write_errors
 from marsyard.campaigns.execution.executors import ExecutorConfig
 from marsyard.campaigns.running.progress import ProgressObserver
 from marsyard.campaigns.sampling.study_points import POINT_COLUMN, StudyPoint
-from marsyard.campaigns.studies.point_runner import Candidate, CaseLimitError, PointRunner
+from marsyard.campaigns.studies.point_runner import CaseLimitError, PointRunner
 from marsyard.campaigns.studies.results import SEARCH, FoundFailure, SearchParameters, SearchResult
 from marsyard.campaigns.studies.runner import StudySession, find_requirement, start_study
 from marsyard.sim.streams import Streams
@@ -116,10 +116,10 @@ class SearchStudy:
             reason,
         )
 
-    def _evaluate(self, candidates: Sequence[Candidate]) -> list[_EvaluatedPoint]:
+    def _evaluate(self, points: Sequence[StudyPoint]) -> list[_EvaluatedPoint]:
         """Run cases, and add them to the evaluated cases of the study."""
         first = self.runner.n_cases
-        rows = self.runner.run(candidates)
+        rows = self.runner.run(points)
         new_cases = [
             _EvaluatedPoint(
                 first + index,
@@ -144,7 +144,7 @@ class SearchStudy:
         exponent = int(math.log2(max(_EXPLORATION_FRACTION * self.parameters.cases, 2.0)))
         sequence = qmc.Sobol(dimension, rng=np.random.default_rng(self._seed("exploration"))).random_base2(exponent)
         coordinates = np.clip(ndtri(sequence), -_MAX_COORDINATE, _MAX_COORDINATE)
-        self._evaluate([Candidate(tuple(point.tolist())) for point in coordinates])
+        self._evaluate([StudyPoint(tuple(point.tolist())) for point in coordinates])
 
     def _evolve(self) -> None:
         """Run evolution strategies in parallel until the cases are used."""
@@ -169,7 +169,7 @@ class SearchStudy:
         size = strategies[0].popsize
         while self.runner.n_cases + size * len(strategies) <= parameters.cases:
             populations = [strategy.ask() for strategy in strategies]
-            candidates = [Candidate(tuple(map(float, point))) for points in populations for point in points]
+            candidates = [StudyPoint(tuple(map(float, point))) for points in populations for point in points]
             margins = _replace_infinite(np.array([item.margin for item in self._evaluate(candidates)]))
             for number, (strategy, points) in enumerate(zip(strategies, populations, strict=True)):
                 strategy.tell(points, margins[number * size : (number + 1) * size].tolist())
@@ -218,7 +218,7 @@ class SearchStudy:
                 )
                 continue
             reduced_points.append((paths, reduced_coordinates))
-            repetition = Candidate(reduction.point.coordinates, None, reduction.point.nominal)
+            repetition = StudyPoint(reduction.point.coordinates, nominal=reduction.point.nominal)
             repetitions = self._evaluate([repetition] * self.parameters.repetitions)
             failures.append(
                 FoundFailure(
@@ -242,7 +242,7 @@ class SearchStudy:
             size = math.ceil(len(paths) / group_count)
             groups = [paths[start : start + size] for start in range(0, len(paths), size)]
             candidates = [
-                Candidate(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *group))
+                StudyPoint(failure.point.coordinates, failure.point.stream, (*failure.point.nominal, *group))
                 for group in groups
             ]
             trials = self._evaluate(candidates)
@@ -267,7 +267,7 @@ class SearchStudy:
                 middle = 0.5 * (low + high)
                 coordinates = list(failure.point.coordinates)
                 coordinates[index] = middle
-                (trial,) = self._evaluate([Candidate(tuple(coordinates), failure.point.stream, failure.point.nominal)])
+                (trial,) = self._evaluate([StudyPoint(tuple(coordinates), failure.point.stream, failure.point.nominal)])
                 if trial.margin < 0.0:
                     failure, high = trial, middle
                 else:

@@ -101,14 +101,14 @@ def _import_command(name: str) -> Any:
     panel, path = next((panel, commands[name]) for panel, commands in PANELS.items() if name in commands)
     module, _, attribute = path.partition(":")
     target = getattr(importlib.import_module(f"marsyard.cli.{module}"), attribute)
-    owner = typer.Typer()
+    owner = typer.Typer(add_completion=False)
     if isinstance(target, typer.Typer):
         for registered in target.registered_commands:
             registered.cls = _Command
         owner.add_typer(target, name=name, cls=_Group, rich_help_panel=panel)
-    else:
-        owner.command(name=name, cls=_Command, rich_help_panel=panel)(target)
-    return typer.main.get_group(owner).commands[name]
+        return typer.main.get_group(owner).commands[name]
+    owner.command(name=name, cls=_Command, rich_help_panel=panel)(target)
+    return typer.main.get_command(owner)
 
 
 app = typer.Typer(

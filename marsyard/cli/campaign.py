@@ -130,7 +130,7 @@ def resume(
     from marsyard.campaigns.outcomes import RETRYABLE
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
-    from marsyard.cli.study_results import contains_study, continue_study_and_exit
+    from marsyard.cli.studies import contains_study, continue_study_and_exit
     from marsyard.cli.until_decided import continue_until_decided
 
     if trust:
@@ -173,7 +173,7 @@ def append(
     from marsyard.campaigns.store.origin import adopt
     from marsyard.campaigns.store.record import stored_definition
     from marsyard.cli.estimate import print_limits
-    from marsyard.cli.study_results import contains_study, continue_study_and_exit
+    from marsyard.cli.studies import contains_study, continue_study_and_exit
 
     if trust:
         adopt(directory)

@@ -1,7 +1,6 @@
 """Commands `marsyard list` and `show`: the built-in campaigns, and the contents of one."""
 
 import json
-import tomllib
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +15,8 @@ from marsyard.cli.terminal import create_console
 @handle_user_errors
 def list_campaigns(as_json: JsonOption = False) -> None:
     """List the built-in campaigns."""
+    import tomllib
+
     from rich.table import Table
     from rich.text import Text
 

@@ -28,8 +28,8 @@ def nightly(
     run; otherwise 3 if a requirement is undecided; otherwise 0.
     """
     from marsyard.campaigns.errors import report_write_errors
+    from marsyard.campaigns.store.git_history import git_commit
     from marsyard.campaigns.store.lock import folder_lock
-    from marsyard.campaigns.store.machine import git_commit
     from marsyard.cli import nightly_run
     from marsyard.cli.progress import campaign_progress
     from marsyard.reports.history import FINISHED, INTERRUPTED, History, list_comparisons

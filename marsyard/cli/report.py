@@ -141,7 +141,7 @@ def confirmations(
     from marsyard.campaigns.errors import CampaignError
     from marsyard.campaigns.store.confirmation_record import read_record
     from marsyard.campaigns.store.confirmations import create_record
-    from marsyard.campaigns.store.git_registration import find_registration_problem
+    from marsyard.campaigns.store.git_history import find_registration_problem
     from marsyard.reports.terminal_tables import confirmations_table
 
     if create:

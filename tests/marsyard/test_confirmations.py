@@ -15,7 +15,7 @@ from marsyard.campaigns.definition.loading import load_campaign
 from marsyard.campaigns.errors import StoreError
 from marsyard.campaigns.store.confirmation_record import read_record
 from marsyard.campaigns.store.confirmations import create_record
-from marsyard.campaigns.store.git_registration import find_registration_problem
+from marsyard.campaigns.store.git_history import find_registration_problem
 from marsyard.sim.terrain.bank import TerrainBank
 from tests.marsyard.confirmation_project import (
     BAD_LUCK,
