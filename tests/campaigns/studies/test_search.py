@@ -114,15 +114,6 @@ def test_killed_search_resumes_with_the_same_result(campaign_path: Path, tmp_pat
     assert "Reduced violations" in (killed_run / "report.html").read_text()
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [({"cases": 5}, "--cases 5"), ({"restarts": 0}, "--restarts 0"), ({"max_failures": 0}, "--failures 0")],
-)
-def test_invalid_settings_are_reported(parameters: dict[str, int], message: str) -> None:
-    with pytest.raises(CampaignError, match=message):
-        SearchParameters("VELOCITY", **parameters)
-
-
 def test_search_has_no_replicates_and_no_rates(campaign_path: Path, tmp_path: Path) -> None:
     run_search(campaign_path, tmp_path / "run", SearchParameters("VELOCITY", 20))
     with pytest.raises(CampaignError, match="does not contain a study of rare violations"):
