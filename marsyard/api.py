@@ -196,11 +196,16 @@ def run_campaign(campaign: Campaign, directory: str | Path, *, jobs: int = 1) ->
 
 def results(directory: str | Path) -> pd.DataFrame:
     """Return the stored results of a campaign: outcome, errors and drawn values, one row per case."""
-    from marsyard.campaigns.store.table import refresh_table
-    from marsyard.cli.outcome import read_frame
+    import pandas as pd
+
+    from marsyard.campaigns.errors import StoreError
+    from marsyard.campaigns.store.table import TABLE_FILE, refresh_table
+    from marsyard.sim.files import report_damage
 
     refresh_table(Path(directory))
-    return read_frame(Path(directory))
+    path = Path(directory) / TABLE_FILE
+    with report_damage(path, StoreError, "is not a valid table of cases"):
+        return pd.read_parquet(path)
 
 
 def verdicts(directory: str | Path) -> Sequence[Verdict]:

@@ -59,7 +59,7 @@ def write_first_record(
     command: Sequence[str] = (),
     algorithms: Sequence[Mapping[str, Any]] = (),
     evidence: Mapping[str, Any] | None = None,
-    origin: Mapping[str, Any] | None = None,
+    origin: Mapping[str, Any],
 ) -> None:
     """Write the record of a new campaign.
 
@@ -91,7 +91,7 @@ def write_first_record(
             else None,
             "algorithms": list(algorithms),
             "evidence": None if evidence is None else dict(evidence),
-            "origin": None if origin is None else dict(origin),
+            "origin": dict(origin),
             "sessions": [describe_session("run", executor, 0)],
             "changes": [],
             "showcase": None,

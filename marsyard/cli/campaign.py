@@ -14,6 +14,8 @@ from marsyard.cli.errors import handle_user_errors
 from marsyard.cli.execution import default_directory, make_executor, run_and_evaluate, show_progress
 
 if TYPE_CHECKING:
+    from marsyard.campaigns.definition.campaign import Campaign
+    from marsyard.campaigns.execution.executors import ExecutorConfig
     from marsyard.campaigns.running.progress import ProgressObserver
 
 
@@ -68,7 +70,6 @@ def run(
     from marsyard.campaigns.store.confirmations import select_confirmation_seed
     from marsyard.cli.estimate import print_estimate, print_limits
     from marsyard.cli.progress import RunLog
-    from marsyard.cli.until_decided import run_until_decided
 
     if confirm:
         selected = select_confirmation_seed(selected)
@@ -86,6 +87,57 @@ def run(
         return
     run_cases = run_until_decided if until_decided else run_campaign
     run_and_evaluate(directory, lambda observer: run_cases(selected, directory, executor, observer))
+
+
+def run_until_decided(
+    campaign: Campaign, directory: Path, executor: ExecutorConfig, observer: ProgressObserver
+) -> None:
+    """Run a campaign until its verdicts are decided, with at most the configured number of cases.
+
+    See `marsyard.reports.statistics.sequential`. Raises CampaignError for dependent draws, or if no requirement has a
+    confidence level.
+    """
+    from marsyard.campaigns.errors import CampaignError
+    from marsyard.campaigns.running.engine import run_campaign
+    from marsyard.reports.sampling_design import read_sampling_design
+    from marsyard.reports.statistics.sequential import planned_looks
+    from marsyard.reports.verdicts import ESTIMATE
+
+    definition = campaign.definition
+    design = read_sampling_design(definition.model_dump(mode="json"))
+    if not design.independent:
+        raise CampaignError(f"--until-decided: {design.no_probability_reason}")
+    if all(requirement.decide_by == ESTIMATE for requirement in definition.requirements):
+        raise CampaignError("--until-decided: the campaign has no requirement with a confidence level")
+    max_cases = definition.total_cases
+    first_block = definition.model_copy(
+        update={"cases": planned_looks(max_cases)[0].cases, "appended": (), "max_cases": max_cases}
+    )
+    command = (*campaign.command, "--until-decided")
+    run_campaign(replace(campaign, definition=first_block, command=command), directory, executor, observer)
+    _continue_until_decided(directory, executor, observer)
+
+
+def _continue_until_decided(directory: Path, executor: ExecutorConfig, observer: ProgressObserver) -> None:
+    """Append cases at the planned interim evaluations until the campaign is decided."""
+    from marsyard.campaigns.running.engine import append_cases
+    from marsyard.campaigns.store.record import stored_definition
+    from marsyard.reports.evaluation import evaluate_run
+    from marsyard.reports.looks import next_look
+    from marsyard.reports.wording import count
+
+    while True:
+        definition = stored_definition(directory)
+        if definition.max_cases is None:
+            return
+        evaluation, cases = evaluate_run(directory), definition.total_cases
+        # a decided verdict that is withheld for its kind of evidence needs no further cases
+        verdicts = [replace(item, status=item.withheld_status or item.status) for item in evaluation.verdicts]
+        next_cases = next_look(verdicts, evaluation.sampling, cases)
+        if next_cases is None:
+            observer.note(f"stopped after {cases} of at most {count(definition.max_cases, 'case')}")
+            return
+        append_cases(directory, next_cases - cases, executor, observer)
 
 
 @handle_user_errors
@@ -131,7 +183,6 @@ def resume(
     from marsyard.campaigns.running.engine import resume_campaign
     from marsyard.campaigns.store.origin import adopt
     from marsyard.cli.studies import contains_study, continue_study_and_exit
-    from marsyard.cli.until_decided import continue_until_decided
 
     if trust:
         adopt(directory)
@@ -147,7 +198,7 @@ def resume(
         resume_campaign(
             directory, executor, observer, retry=outcomes, case_time_s=case_time, allow_changed=allow_changed
         )
-        continue_until_decided(directory, executor, observer)
+        _continue_until_decided(directory, executor, observer)
 
     run_and_evaluate(directory, continue_campaign)
 

@@ -27,7 +27,6 @@ from tests.command import run_command
 PARAMETERS = RareParameters("LOAD", 5e-2, samples=100, replicates=(4,), random_cases=(50,), confidence=0.99)
 #: Columns that differ between repeated runs.
 TIMES = ("wall_time_s", "cpu_time_s")
-WATCH = RecordingWatch()
 
 
 campaign_path = campaign_fixture(CAMPAIGN)
@@ -184,11 +183,11 @@ def test_invalid_parameters_of_studies_are_reported(kind: type, values: dict[str
 def test_unsuitable_requirement_is_reported(
     campaign_path: Path, tmp_path: Path, requirement: str, message: str
 ) -> None:
-    for start, kind in ((start_rare, RareParameters), (start_budget, BudgetParameters)):
-        values = (requirement, 1e-2) if kind is RareParameters else (requirement,)
-        limits = (5000,) if kind is RareParameters else ()
-        with pytest.raises(CampaignError, match=message):
-            start(load_campaign(str(campaign_path)), kind(*values), *limits, tmp_path / "run", ExecutorConfig(1), WATCH)
+    campaign, executor = load_campaign(str(campaign_path)), ExecutorConfig(1)
+    with pytest.raises(CampaignError, match=message):
+        start_rare(campaign, RareParameters(requirement, 1e-2), 5000, tmp_path / "run", executor, RecordingWatch())
+    with pytest.raises(CampaignError, match=message):
+        start_budget(campaign, BudgetParameters(requirement), tmp_path / "run", executor, RecordingWatch())
     assert not (tmp_path / "run").exists()
 
 
