@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.validation import (
+    air_checks,
     campaign_checks,
     controls,
     difference_checks,
@@ -40,6 +41,7 @@ CHECKS = (
     *geometry_checks.CHECKS,
     *motion_checks.CHECKS,
     *light_checks.CHECKS,
+    *air_checks.CHECKS,
     *sky_checks.CHECKS,
     *reference_checks.CHECKS,
     *flight_checks.CHECKS,

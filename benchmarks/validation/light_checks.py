@@ -44,7 +44,7 @@ LAWS = {
 }
 
 
-def _make_flat_surface(albedo: float = FLAT_ALBEDO) -> Surface:
+def make_flat_surface(albedo: float = FLAT_ALBEDO) -> Surface:
     """Create level ground with uniform albedo."""
     samples = np.zeros((64, 64, 2), dtype=np.float32)
     samples[..., 1] = albedo
@@ -55,7 +55,7 @@ def run_opposition(quick: bool) -> Iterator[Measure]:
     """Compare the centre of the opposition peak in images with the antisolar point."""
     law = Photometry(lunar_fraction=0.0, surge_amplitude=1.0, surge_width=0.02, sky_fraction=0.0)
     rng = np.random.default_rng(3)
-    surface = _make_flat_surface()
+    surface = make_flat_surface()
     for name, camera in cameras().items():
         errors = []
         for _ in range(3 if quick else 10):
@@ -169,7 +169,7 @@ def _render_brightness(law: Photometry, to_sun: np.ndarray, to_eye: np.ndarray) 
     """Render flat ground in direct sunlight; return the brightness of the central pixel."""
     attitude = Rotation.align_vectors(-to_eye[None], np.array([[0.0, 0.0, -1.0]]))[0]
     view = View(
-        Scene(_make_flat_surface(), (0.0, 0.0), Sun(to_sun), law), _make_nadir_camera(), rigid(attitude, 100.0 * to_eye)
+        Scene(make_flat_surface(), (0.0, 0.0), Sun(to_sun), law), _make_nadir_camera(), rigid(attitude, 100.0 * to_eye)
     )
     return float(render(renderer(), view).radiance[4, 4])
 
@@ -239,7 +239,7 @@ def run_clouds(quick: bool) -> Iterator[Measure]:
     covers, motion_errors = [], []
     for seed in range(2 if quick else 8):
         layer = CloudLayer.draw(parameters, np.random.default_rng(seed))
-        scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, clouds=layer, edge_rays=1)
+        scene = Scene(make_flat_surface(), (0.0, 0.0), sun, law, clouds=layer, edge_rays=1)
         rng = np.random.default_rng(100 + seed)
         sky_light = FLAT_ALBEDO * parameters.sky_light(sun)
         for position in rng.uniform(0.0, 12800.0, (4, 2)):
@@ -280,7 +280,7 @@ def run_sun(quick: bool) -> Iterator[Measure]:
         sun = Sun(direction(np.radians(azimuth_deg), np.radians(elevation_deg)))
         law = Photometry(sky_fraction=0.3, sky=DustySky(0.5, 0.95, 0.65))
         pose = rigid(Rotation.identity(), np.array([0.0, 0.0, 1.5]))
-        scene = Scene(_make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_half_width_m=2000.0)
+        scene = Scene(make_flat_surface(), (0.0, 0.0), sun, law, mesh_finest_m=0.5, mesh_half_width_m=2000.0)
         rays = PixelRays.from_camera(camera)
         radiance = renderer().render(scene, rays, pose).radiance.astype(np.float64)
         # only the sun's disc is brighter
