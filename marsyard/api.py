@@ -232,8 +232,7 @@ def render_view(site: str, camera: str = "mer-navcam", *, detector: bool = True,
     - pose: options of `marsyard render`: scale, altitude_m, east_m, north_m, azimuth_deg, elevation_deg,
       sun_azimuth_deg, sun_elevation_deg, seed, max_hole_fraction
     """
-    from marsyard.image_request import ImageRequest
-    from marsyard.site_images import render_images
+    from marsyard.site_images import ImageRequest, render_images
 
     return render_images(ImageRequest.from_defaults(site, camera, **pose), detector=detector)
 

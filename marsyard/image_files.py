@@ -13,12 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from marsyard.image_request import ImageRequest
 from marsyard.sim import sensor
 from marsyard.sim.camera import BODY_FRAME, write_cahvor
 from marsyard.sim.render import process_renderer
 from marsyard.sim.render.backend import default_backend
-from marsyard.site_images import FULL_SCALE_RADIANCE_FACTOR, RenderedImage
+from marsyard.site_images import FULL_SCALE_RADIANCE_FACTOR, ImageRequest, RenderedImage
 
 #: Files of an image: 16-bit image, truth layers, camera model, and metadata.
 SUFFIXES = (".png", ".npz", ".cahvor", ".json")

@@ -14,10 +14,9 @@ import typer
 from jaxtyping import Bool, Float64, UInt8
 
 from marsyard.image_files import encode_image
-from marsyard.image_request import ImageRequest
 from marsyard.reports.page_environment import page_environment
 from marsyard.scenarios.terrain_model_sites import SUFFIXES, is_terrain_file, load_site
-from marsyard.site_images import render_images
+from marsyard.site_images import ImageRequest, render_images
 
 Grey: TypeAlias = UInt8[np.ndarray, "rows columns"]
 

@@ -1,4 +1,4 @@
-"""Claims, the content of a campaign and its algorithms without their names, and the confirmations of claims.
+"""Claims (the content of a campaign and its algorithms, without their names), and confirmations of a claim.
 
 A claim is "this algorithm meets these requirements in these cases". Its identity is a hash of the parameters,
 dispersions and sampling design, the requirements, the options and sources of the algorithms, the code of the simulation

@@ -61,9 +61,8 @@ def render(
     A stereo camera adds -left and -right to PREFIX.
     """
     from marsyard.image_files import check_files, write_image
-    from marsyard.image_request import ImageRequest
     from marsyard.sim.kernel_cache import mark_ready
-    from marsyard.site_images import render_images
+    from marsyard.site_images import ImageRequest, render_images
 
     with report_image_errors(out):
         request = ImageRequest.from_defaults(

@@ -185,7 +185,7 @@ def test_definition_error_precedes_failed_cases(tmp_path: Path) -> None:
         (["append", "{folder}", "3"], "does not contain a campaign"),
         (["run"], "Missing argument"),
         (["run", "{file}", "--job", "1"], "No such option"),
-        (["fly"], "No such command 'fly'"),
+        (["rnu"], "No such command 'rnu'. Did you mean 'run'?"),
         (["show", "dimes-smok"], "unknown campaign 'dimes-smok'"),
         (["report", "{folder}/none"], "none: no such folder"),
         (["report", "{folder}"], "does not contain a campaign"),

@@ -95,6 +95,7 @@ def test_terrain_follows_the_number_of_the_streams(tmp_path: Path) -> None:
         point.with_numbers(17) for point in (StudyPoint((0.0,)), StudyPoint((0.0,), blend=BLEND), StudyPoint((0.0,), 3))
     )
     assert [campaign.draws_at(point)["terrain"] for point in (first, blended, repeated)] == [17, 17, 3]
+    assert blended.blend == ((5, 0.8), (17, 0.6))
 
 
 def test_reduced_violation_keeps_its_terrain(tmp_path: Path) -> None:

@@ -222,7 +222,7 @@ def test_verdict_on_a_calibration_seed_cannot_be_pass(campaign_path: Path, tmp_p
     run = '[[calibration.runs]]\noptions = ["beta"]\ncampaign = "limit-state"\nseed = 3'
     campaign_path.write_text(f"{CAMPAIGN}\n[calibration]\n\n{run}\n")
     result = run_study(campaign_path, tmp_path / "run")
-    assert result.verdict is RareVerdict.INSUFFICIENT
+    assert (result.verdict, result.exit_code) == (RareVerdict.INSUFFICIENT, 3)
     assert result.decision.reason.startswith("The verdict would be PASS. Calibrated on these cases")
 
 
