@@ -89,7 +89,7 @@ def run_case(
         if point is not None:
             campaign = campaign.at(point)
         values = campaign.draws(case) if point is None else campaign.draws_at(point)
-        draws = _list_draws(values)
+        draws = list_draws(values)
         with recording_timelines(selection.timelines):
             parameters = campaign.with_values(values, () if point is None else point.removed)
             streams = campaign.streams(case) if point is None else campaign.streams_at(point)
@@ -165,7 +165,7 @@ def _build_terminated_row(definition: CampaignDefinition, result: TaskResult[Any
     case, error, draws = result.item, result.error, {}
     campaign = Campaign(definition, scenario(definition.scenario))
     with suppress(ValueError):  # an undefined formula also ends the case in its worker
-        draws = _list_draws(campaign.draws(case) if point is None else campaign.at(point).draws_at(point))
+        draws = list_draws(campaign.draws(case) if point is None else campaign.at(point).draws_at(point))
     if not isinstance(error, WorkerExitError):
         return make_unfinished_row(case, CRASHED, describe_error(error), "", draws)
     trace = error.trace
@@ -196,7 +196,7 @@ def _describe_changes(result: TaskResult[Any], note_counts: Counter[str]) -> Ite
             yield f"{text} (further cases of this kind are not listed)" if note_counts[kind] == _MAX_NOTES else text
 
 
-def _list_draws(values: Mapping[str, Any]) -> dict[str, Scalar]:
+def list_draws(values: Mapping[str, Any]) -> dict[str, Scalar]:
     """List the sampled values of a case by parameter path, the values of a table by their own paths."""
     return _convert_columns({path: value for path, value in leaves(dict(values)) if value is not None and value != []})
 
